@@ -1,0 +1,114 @@
+"""Soft actor-critic, through Tianshou's experiment builder."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from tianshou.highlevel.config import OffPolicyTrainingConfig
+from tianshou.highlevel.experiment import ExperimentConfig, SACExperimentBuilder
+from tianshou.highlevel.params.algorithm_params import SACParams
+from tianshou.highlevel.params.alpha import AutoAlphaFactoryDefault
+
+from armscan.agents.networks import Network
+from armscan.agents.protocols import LearningSetup
+from armscan.agents.tianshou_learner import ArmscanEnvFactory, TianshouLearner
+from armscan.checks import check_float, check_int
+from armscan.errors import InvalidValueError
+
+
+@dataclass(frozen=True, kw_only=True)
+class SAC:
+    """Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) with a learned entropy coefficient."""
+
+    network: Network
+    """Of the actor and of both critics."""
+
+    lr: float = 1e-3
+    """Learning rate of the actor and the critics."""
+
+    initial_entropy_coefficient: float = 0.1
+    """What the entropy coefficient is at first; rewards here are small, so that 1 would drown them for long."""
+
+    entropy_lr: float = 3e-4
+    """Learning rate of the entropy coefficient."""
+
+    target_entropy_per_dim: float = -1.0
+    """The policy's wanted entropy for each action component; lower where it oscillates instead of settling."""
+
+    gamma: float = 0.99
+    """Discount."""
+
+    tau: float = 0.005
+    """How far the target critics move towards the critics at each update."""
+
+    batch_size: int = 256
+    """Transitions of one update."""
+
+    buffer_size: int = 100_000
+    """Transitions that the replay buffer holds; never more than the whole training takes."""
+
+    num_envs: int = 16
+    """Training environments that are stepped side by side."""
+
+    random_env_steps: int = 2_000
+    """Steps with random actions before the first update."""
+
+    env_steps_per_collection: int = 16
+    """Environment steps between two rounds of updates; raised to `num_envs`, each of which takes one at least."""
+
+    updates_per_env_step: float = 0.25
+    """Gradient steps for each environment step; they are what training costs."""
+
+    def __post_init__(self) -> None:
+        for name in ("lr", "entropy_lr", "initial_entropy_coefficient"):
+            check_float(f"agent.{name}", getattr(self, name), above=0.0)
+        check_float("agent.updates_per_env_step", self.updates_per_env_step, above=0.0)
+        check_float("agent.target_entropy_per_dim", self.target_entropy_per_dim)
+        for name in ("gamma", "tau"):
+            check_float(f"agent.{name}", getattr(self, name), at_least=0.0, at_most=1.0)
+        for field in fields(self):
+            if field.type == "int":
+                check_int(f"agent.{field.name}", getattr(self, field.name), at_least=1)
+
+    def learner(self, setup: LearningSetup) -> TianshouLearner:
+        """Makes an agent that has learned nothing yet.
+
+        Raises:
+            InvalidValueError: if the training takes no more steps than the random ones.
+        """
+        if self.random_env_steps >= setup.total_env_steps:
+            raise InvalidValueError(
+                f"agent.random_env_steps is {self.random_env_steps}, but it must be below training.env_steps = "
+                f"{setup.total_env_steps}, or nothing is learned"
+            )
+        builder = SACExperimentBuilder(
+            ArmscanEnvFactory(setup.make_env),
+            ExperimentConfig(seed=setup.seed, device=setup.device, watch=False, persistence_enabled=False),
+            OffPolicyTrainingConfig(
+                num_training_envs=self.num_envs,
+                num_test_envs=1,
+                buffer_size=min(self.buffer_size, setup.total_env_steps + self.num_envs),
+                collection_step_num_env_steps=max(self.env_steps_per_collection, self.num_envs),
+                update_step_num_gradient_steps_per_sample=self.updates_per_env_step,
+                batch_size=self.batch_size,
+            ),
+        )
+        builder.with_sac_params(
+            SACParams(
+                deterministic_eval=True,
+                gamma=self.gamma,
+                tau=self.tau,
+                actor_lr=self.lr,
+                critic1_lr=self.lr,
+                critic2_lr=self.lr,
+                alpha=AutoAlphaFactoryDefault(
+                    lr=self.entropy_lr,
+                    target_entropy_coefficient=self.target_entropy_per_dim,
+                    log_alpha=math.log(self.initial_entropy_coefficient),
+                ),
+            )
+        )
+        builder.with_actor_factory(self.network.actor_factory())
+        builder.with_common_critic_factory(self.network.critic_factory())
+        return TianshouLearner(builder.build(), random_env_steps=self.random_env_steps)

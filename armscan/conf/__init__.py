@@ -1,0 +1,1 @@
+"""Hydra's configuration groups; they travel in the wheel."""

@@ -1,0 +1,119 @@
+"""What a person sees in the terminal: progress while a run goes on, tables of results at its end."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from armscan.multirun import Outcome
+from armscan.training import HELD_OUT, Callback, EpochReport, Evaluation
+
+RESULT_ROWS = (
+    ("success rate", "success_rate", "{:.1%}"),
+    ("mean steps", "mean_steps", "{:.2f}"),
+    ("mean final reward", "mean_final_reward", "{:.3f}"),
+    ("mean distance to the plane", "mean_distance_mm", "{:.1f} mm"),
+    ("mean angle to the plane", "mean_distance_deg", "{:.1f}°"),
+    ("episodes", "episodes", "{:.0f}"),
+    ("... of which started solved", "episodes_started_solved", "{:.0f}"),
+    ("success rate of the others", "success_rate_not_started_solved", "{:.1%}"),
+    ("mean steps of the others", "mean_steps_not_started_solved", "{:.2f}"),
+)
+
+
+def progress_reporter(label: str | None = None) -> Callback:
+    """Returns a progress bar on a terminal; a line an epoch elsewhere, or where `label` names one job of many."""
+    if label is None and sys.stdout.isatty():
+        return ProgressBar()
+    return ProgressLines(label)
+
+
+class ProgressBar:
+    """A bar with steps, return, success rate and time left."""
+
+    def __init__(self) -> None:
+        self._progress = Progress(
+            TextColumn("training"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("steps  {task.fields[figures]}"),
+            TimeRemainingColumn(),
+        )
+
+    def on_start(self, total_env_steps: int) -> None:
+        """Shows the empty bar."""
+        self._task = self._progress.add_task("training", total=total_env_steps, figures="")
+        self._progress.start()
+
+    def on_epoch(self, report: EpochReport) -> None:
+        """Moves the bar."""
+        self._progress.update(self._task, completed=report.n_env_steps, figures=_figures(report))
+
+    def on_end(self) -> None:
+        """Leaves the bar as it is."""
+        self._progress.stop()
+
+
+class ProgressLines:
+    """A line an epoch, for logs and for jobs side by side.
+
+    Args:
+        label: before each line, None for none.
+    """
+
+    def __init__(self, label: str | None) -> None:
+        self._label = f"[{label}] " if label else ""
+
+    def on_start(self, total_env_steps: int) -> None:
+        """Says that training begins."""
+        self._total = total_env_steps
+        self._start_s = time.perf_counter()
+        print(f"{self._label}training for at most {total_env_steps} environment steps", flush=True)
+
+    def on_epoch(self, report: EpochReport) -> None:
+        """Writes the epoch's line."""
+        elapsed_s = time.perf_counter() - self._start_s
+        left_s = elapsed_s * (self._total / report.n_env_steps - 1)
+        minutes, seconds = divmod(round(max(0.0, left_s)), 60)
+        line = f"{report.n_env_steps:>{len(str(self._total))}}/{self._total} steps  {_figures(report)}"
+        print(f"{self._label}{line}  {minutes}:{seconds:02d} left", flush=True)
+
+    def on_end(self) -> None:
+        """Has said everything."""
+
+
+def _figures(report: EpochReport) -> str:
+    metrics = report.evaluation.metrics()
+    return (
+        f"return {metrics['mean_return']:6.2f}  success {metrics['success_rate']:4.0%}  "
+        f"{metrics['mean_steps']:5.2f} steps an episode"
+    )
+
+
+def print_results(title: str, evaluations: Mapping[str, Evaluation]) -> None:
+    """Prints a table with a column for each evaluation, by the name of its volumes."""
+    figures = {name: evaluation.metrics() for name, evaluation in evaluations.items()}
+    table = Table(title=title, title_justify="left")
+    table.add_column("")
+    for name in figures:
+        table.add_column(name, justify="right")
+    for text, key, form in RESULT_ROWS:
+        table.add_row(text, *("-" if f[key] != f[key] else form.format(f[key]) for f in figures.values()))
+    Console().print(table)
+
+
+def print_jobs(outcomes: Mapping[str, Outcome]) -> None:
+    """Prints the table of a multirun's jobs, by their numbers."""
+    table = Table(title="jobs (held-out volumes)", title_justify="left")
+    for heading in ("job", "overrides", "outcome", "success rate", "mean steps"):
+        table.add_column(heading)
+    for number, outcome in outcomes.items():
+        held_out = outcome.figures.get(HELD_OUT, {})
+        figures = [f"{held_out['success_rate']:.1%}", f"{held_out['mean_steps']:.2f}"] if held_out else ["-", "-"]
+        table.add_row(number, outcome.overrides, "failed" if outcome.failure else "done", *figures)
+    Console().print(table)

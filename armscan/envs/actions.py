@@ -1,0 +1,81 @@
+"""Normalised actions: bounds of the four components, and projections to the free ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.checks import check_float
+from armscan.errors import InvalidValueError, listed
+from armscan.volumes.plane import FloatArray, ManipulatorAction
+
+COMPONENTS = ("rz", "rx", "tx", "ty")
+PROJECTIONS: dict[str, tuple[str, ...]] = {
+    "x": ("tx",),
+    "y": ("ty",),
+    "xy": ("tx", "ty"),
+    "zy": ("rz", "ty"),
+    "full": COMPONENTS,
+}
+
+
+@dataclass(frozen=True)
+class ActionBounds:
+    """What the normalised vector (rz, rx, tx, ty) in [-1, 1]^4 stands for.
+
+    Rotation is a * bound, translation (a + 1) / 2 * bound; a zero bound fixes its component at 0.
+
+    Args:
+        rotation_deg: bounds of rz and rx, each in [0, 180].
+        translation_mm: bounds of tx and ty, each at least 0.
+    """
+
+    rotation_deg: tuple[float, float]
+    translation_mm: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        for name, bound in zip(("rz", "rx"), self.rotation_deg, strict=True):
+            check_float(f"rotation bound of {name} in degrees", bound, at_least=0.0, at_most=180.0)
+        for name, bound in zip(("tx", "ty"), self.translation_mm, strict=True):
+            check_float(f"translation bound of {name} in mm", bound, at_least=0.0)
+
+    def denormalised(self, normalised: FloatArray) -> ManipulatorAction:
+        """Returns the plane of a normalised vector, shape (4,)."""
+        rotation = normalised[:2] * self.rotation_deg
+        translation = (normalised[2:] + 1.0) / 2.0 * self.translation_mm
+        return ManipulatorAction((rotation[0], rotation[1]), (translation[0], translation[1]))
+
+    def normalised(self, action: ManipulatorAction) -> FloatArray:
+        """Returns the normalised vector of a plane, shape (4,); 0 (a translation: -1) where the bound is zero."""
+        rotation = np.divide(action.rotation, self.rotation_deg, out=np.zeros(2), where=np.array(self.rotation_deg) > 0)
+        translation = np.divide(
+            action.translation, self.translation_mm, out=np.zeros(2), where=np.array(self.translation_mm) > 0
+        )
+        return np.concatenate([rotation, 2.0 * translation - 1.0])
+
+
+def free_components(projection: str | Sequence[str]) -> tuple[int, ...]:
+    """Returns the indices into (rz, rx, tx, ty) of the components that a projection leaves free, in that order.
+
+    Args:
+        projection: one of the names in `PROJECTIONS`, or the components themselves.
+
+    Raises:
+        InvalidValueError: if the name or a component is unknown, none is given, or one is given twice.
+    """
+    if isinstance(projection, str):
+        if projection not in PROJECTIONS:
+            raise InvalidValueError(
+                f"projection is {projection!r}, but it must be {listed(PROJECTIONS)}, or a list of {listed(COMPONENTS)}"
+            )
+        names: tuple[str, ...] = PROJECTIONS[projection]
+    else:
+        names = tuple(projection)
+    if not names or len(set(names)) != len(names) or not set(names) <= set(COMPONENTS):
+        raise InvalidValueError(
+            f"projection is {list(names)!r}, but it must be {listed(PROJECTIONS)}, "
+            f"or a list of different ones of {listed(COMPONENTS)}"
+        )
+    return tuple(index for index, name in enumerate(COMPONENTS) if name in names)

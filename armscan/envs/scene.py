@@ -1,0 +1,163 @@
+"""What one episode is played on: a volume, how it is moved, and where its optimal plane then lies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from armscan.anatomy import TissueClusters, landmark_reward
+from armscan.checks import check_choice, check_float
+from armscan.envs.actions import ActionBounds
+from armscan.envs.observations import SliceGeometry
+from armscan.errors import OptimalPlaneError
+from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, plane_distance, slid_into
+from armscan.volumes.volume import LabelVolume
+
+MAX_DRAWS = 1000
+CENTRES = ("middle", "first_voxel")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomTransform:
+    """The rigid motions that a volume is moved by at reset, each component drawn uniformly.
+
+    Args:
+        rz_deg: rotation about Z within +- this.
+        rx_deg: rotation about X within +- this.
+        tx_mm: translation along X within +- this.
+        ty_mm: translation along Y within +- this.
+        centre: what the rotation leaves in place: `middle` of the volume, or `first_voxel`, as published, which pushes
+            the hand out of the picture.
+    """
+
+    rz_deg: float = 10.0
+    rx_deg: float = 0.0
+    tx_mm: float = 10.0
+    ty_mm: float = 10.0
+    centre: str = "middle"
+
+    def __post_init__(self) -> None:
+        for name in ("rz_deg", "rx_deg"):
+            check_float(f"transform {name}", getattr(self, name), at_least=0.0, at_most=180.0)
+        for name in ("tx_mm", "ty_mm"):
+            check_float(f"transform {name}", getattr(self, name), at_least=0.0)
+        check_choice("transform centre", self.centre, CENTRES)
+
+    def draw(self, volume: LabelVolume, rng: np.random.Generator) -> RigidTransform:
+        """Draws one motion of a volume."""
+        limits = np.array([self.rz_deg, self.rx_deg, self.tx_mm, self.ty_mm])
+        rz, rx, tx, ty = rng.uniform(-limits, limits)
+        centre_mm = volume.centre_mm if self.centre == "middle" else (0.0, 0.0, 0.0)
+        return RigidTransform((rz, rx), (tx, ty), centre_mm)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A volume as it lies in one episode.
+
+    Args:
+        volume: the volume.
+        transform: how it is moved, None where it is as it is.
+        optimum: its optimal plane, in the moved volume's frame, within the bounds.
+        bounds: of the actions.
+    """
+
+    volume: LabelVolume
+    transform: RigidTransform | None
+    optimum: ManipulatorAction
+    bounds: ActionBounds
+
+    @cached_property
+    def optimum_normalised(self) -> FloatArray:
+        """The optimal plane as a normalised vector, shape (4,)."""
+        return self.bounds.normalised(self.optimum)
+
+    def distance(self, action: ManipulatorAction) -> tuple[float, float]:
+        """Returns how far a plane is from the optimal one, as `plane_distance` does: (mm, degrees)."""
+        centre_mm = self.volume.centre_mm
+        return plane_distance(action, self.optimum, (centre_mm[0], centre_mm[2]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSampler:
+    """Draws the scenes of an environment.
+
+    Args:
+        rotation_bounds_deg: bounds of rz and rx.
+        translation_bounds_mm: bounds of tx and ty, None for each volume's own size.
+        transform: the motions to draw from, None for none.
+        delta: the optimal plane of every scene scores above -delta.
+        targets: of the reward.
+    """
+
+    rotation_bounds_deg: tuple[float, float]
+    translation_bounds_mm: tuple[float, float] | None
+    transform: RandomTransform | None
+    delta: float
+    targets: Sequence[int]
+
+    def bounds(self, volume: LabelVolume) -> ActionBounds:
+        """Returns the bounds that hold for every scene of a volume."""
+        size_mm = volume.size_mm
+        return ActionBounds(self.rotation_bounds_deg, self.translation_bounds_mm or (size_mm[0], size_mm[1]))
+
+    def check(self, volume: LabelVolume) -> None:
+        """Raises `OptimalPlaneError` unless scenes of this volume can be drawn."""
+        if volume.optimal_action is None:
+            raise OptimalPlaneError(f"{volume.name}: has no labelled optimal plane, which an environment needs")
+        turns = (0.0, 0.0) if self.transform is None else (self.transform.rz_deg, self.transform.rx_deg)
+        for name, angle, turn, bound in zip(
+            ("rz", "rx"), volume.optimal_action.rotation, turns, self.rotation_bounds_deg, strict=True
+        ):
+            if bound < 180.0 and abs(angle) + turn > bound:
+                raise OptimalPlaneError(
+                    f"{volume.name}: the optimal plane has {name} = {angle:g} degrees and can be turned by {turn:g} "
+                    f"more, but the rotation bound is {bound:g}; it must be at least {abs(angle) + turn:g}"
+                )
+        scene = self._scene(volume, None)
+        if scene is None:
+            raise OptimalPlaneError(
+                f"{volume.name}: the optimal plane, {volume.optimal_action}, misses the volume or its translation "
+                f"bounds {self.bounds(volume).translation_mm} mm"
+            )
+        reward, counts = self._seen_at_optimum(scene)
+        if reward <= -self.delta:
+            raise OptimalPlaneError(
+                f"{volume.name}: the labelled optimal plane scores {reward:.3f} (bones, tendons, artery: {counts}), "
+                f"but it must score above -delta = {-self.delta:g}"
+            )
+
+    def draw(self, volume: LabelVolume, rng: np.random.Generator) -> Scene:
+        """Draws a scene of a volume that passes `check`.
+
+        Raises:
+            OptimalPlaneError: if no transform in a thousand leaves the optimal plane within the bounds and rewarded.
+        """
+        for _ in range(MAX_DRAWS):
+            scene = self._scene(volume, self.transform.draw(volume, rng) if self.transform else None)
+            if scene is not None and self._seen_at_optimum(scene)[0] > -self.delta:
+                return scene
+        raise OptimalPlaneError(
+            f"{volume.name}: no transform of {MAX_DRAWS} drawn from {self.transform} keeps the optimal plane within "
+            f"the bounds {self.bounds(volume)} and its reward above -delta = {-self.delta:g}"
+        )
+
+    def _scene(self, volume: LabelVolume, transform: RigidTransform | None) -> Scene | None:
+        """Places the optimal plane; None where it falls outside the bounds."""
+        assert volume.optimal_action is not None
+        bounds = self.bounds(volume)
+        optimum = volume.optimal_action if transform is None else transform.inverse_plane(volume.optimal_action)
+        within = slid_into(optimum, bounds.translation_mm)
+        return None if within is None else Scene(volume, transform, within, bounds)
+
+    def _seen_at_optimum(self, scene: Scene) -> tuple[float, tuple[int, int, int]]:
+        clusters = TissueClusters.from_slice(scene.volume.slice(scene.optimum, transform=scene.transform))
+        return landmark_reward(clusters, self.targets), clusters.counts
+
+
+def slice_geometry(volume: LabelVolume) -> SliceGeometry:
+    """Returns the geometry of a volume's slices."""
+    return SliceGeometry(volume.slice_shape, volume.pixel_mm)

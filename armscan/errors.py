@@ -1,0 +1,46 @@
+"""The errors armscan raises for a caller's mistake, in one small hierarchy.
+
+Each message is one line that names the value received, what is allowed, and where the value came from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class ArmscanError(Exception):
+    """Base of every error that armscan raises on purpose."""
+
+
+class InvalidValueError(ArmscanError, ValueError):
+    """An argument or configuration value is outside what is allowed."""
+
+
+class VolumeError(ArmscanError, ValueError):
+    """A file or array cannot serve as a labelmap volume."""
+
+
+class ManifestError(ArmscanError, ValueError):
+    """The manifest of a dataset is damaged or disagrees with the files beside it."""
+
+
+class OptimalPlaneError(ArmscanError, ValueError):
+    """A volume's labelled optimal plane is missing, out of bounds, or does not show the landmarks."""
+
+
+class ResetNeededError(ArmscanError, RuntimeError):
+    """An environment was stepped or rendered without a running episode."""
+
+
+class CheckpointError(ArmscanError, ValueError):
+    """A checkpoint cannot be read, or belongs to another agent."""
+
+
+class TrackingError(ArmscanError, RuntimeError):
+    """The tracking store cannot be reached or used."""
+
+
+def listed(allowed: Iterable[object]) -> str:
+    """Returns the allowed values as they are written in a message: 'a, b or c'."""
+    names = [str(value) for value in allowed]
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + f" or {names[-1]}"

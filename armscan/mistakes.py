@@ -1,0 +1,113 @@
+"""A user's mistake, answered in one line that names what is allowed."""
+
+from __future__ import annotations
+
+import logging
+import re
+import sys
+import warnings
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    InstantiationException,
+    MissingConfigException,
+    OverrideParseException,
+)
+from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from armscan.errors import ArmscanError, listed
+
+CONFIG_MODULE, CONFIG_NAME = "armscan.conf", "config"
+
+
+def mistake_in_one_line(error: BaseException) -> str | None:
+    """Returns what a user did wrong and what is allowed instead; None where the error is no user's mistake."""
+    ours = next((cause for cause in _causes(error) if isinstance(cause, ArmscanError)), None)
+    if ours is not None:
+        return str(ours)
+    match error:
+        case MissingConfigException(options=options) if options:
+            group, _, choice = str(error.missing_cfg_file).rpartition("/")
+            return f"{group} is {choice!r}, but it must be {listed(options)}"
+        case ConfigCompositionException():
+            return _composition_mistake(error)
+        case OverrideParseException():
+            return f"{error.override!r} cannot be read: what follows the options must be key=value"
+        case MissingMandatoryValue():
+            return f"{error.full_key} is not set, but it must be: give {error.full_key}=VALUE"
+        case InstantiationException():
+            return _instantiation_mistake(error)
+        case HydraException() | OmegaConfBaseException():
+            return " ".join(str(error).split())
+        case OSError() if error.filename is not None:
+            return f"{error.filename}: {error.strerror}"
+    return None
+
+
+def quieten_libraries() -> None:
+    """Keeps warnings of libraries that a user can do nothing about off the screen."""
+    for message in (
+        "Gym has been unmaintained",
+        ".*Deprecat.*",
+        ".*is not divisible by the number of test environments.*",
+    ):
+        warnings.filterwarnings("ignore", message=message)
+    for category in (DeprecationWarning, FutureWarning, PendingDeprecationWarning):
+        warnings.filterwarnings("ignore", category=category)
+    logging.getLogger("tianshou").setLevel(logging.ERROR)
+    logging.getLogger("sensai").setLevel(logging.ERROR)
+
+
+def _causes(error: BaseException | None) -> list[BaseException]:
+    causes = []
+    while error is not None:
+        causes.append(error)
+        error = error.__cause__
+    return causes
+
+
+def _composition_mistake(error: ConfigCompositionException) -> str:
+    text = " ".join(str(error).split())
+    if ambiguous := re.match(r"Ambiguous value for argument '(.*?)'", text):
+        return (
+            f"{ambiguous.group(1)} gives several values, which needs -m: python -m armscan.run -m {ambiguous.group(1)}"
+        )
+    if unknown := re.match(r"Could not override '(.*?)'", text):
+        key = unknown.group(1)
+        parent, _, name = key.rpartition(".")
+        allowed = _keys_under(parent)
+        where = f"in {parent}" if parent else "at the top"
+        return f"there is no key {name!r} {where}" + (f", but only {listed(allowed)}" if allowed else "")
+    return text
+
+
+def _instantiation_mistake(error: InstantiationException) -> str | None:
+    text = " ".join(str(error).split())
+    if unexpected := re.search(r"unexpected keyword argument '(\w+)'.*full_key: (\S+)", text):
+        key, parent = unexpected.groups()
+        allowed = _keys_under(parent)
+        return f"there is no key {key!r} in {parent}" + (f", but only {listed(allowed)}" if allowed else "")
+    return text if error.__cause__ is None or isinstance(error.__cause__, ImportError) else None
+
+
+def _keys_under(parent: str) -> list[str]:
+    """The keys that the configuration has under a parent, with the groups chosen as on the command line."""
+    choices = [word for word in sys.argv[1:] if re.fullmatch(r"[a-z_/]+=[a-z_0-9]+", word)]
+    GlobalHydra.instance().clear()
+    for overrides in (choices, []):
+        try:
+            with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
+                node = (
+                    OmegaConf.select(compose(CONFIG_NAME, overrides), parent)
+                    if parent
+                    else compose(CONFIG_NAME, overrides)
+                )
+        except (HydraException, OmegaConfBaseException):
+            continue
+        if isinstance(node, DictConfig):
+            return [str(key) for key in node if not str(key).startswith("_")]
+    return []

@@ -1,0 +1,128 @@
+"""Several jobs side by side: their common parent run, and what became of each."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from armscan.errors import ArmscanError
+
+PARENT_FILE = "parent_run.json"
+OUTCOME_FOLDER = "outcomes"
+NO_OUTCOME = "it ended without a word: killed, or out of memory"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a job.
+
+    Args:
+        overrides: what distinguishes the job.
+        failure: why it failed, None where it did not.
+        figures: of its evaluations, by the name of their volumes.
+    """
+
+    overrides: str
+    failure: str | None = None
+    figures: dict[str, dict[str, float]] = field(default_factory=dict)
+
+
+class Multirun(Callback):
+    """Starts the parent run before the first job; Hydra calls it in the process that launches the jobs.
+
+    The parent also makes the store's tables, so that jobs starting side by side find them there.
+    """
+
+    folder: Path | None = None
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Opens the store, starts the parent run, and leaves word of it for the jobs."""
+        from armscan.tracking import open_store, source_tags
+
+        folder = Path(config.hydra.sweep.dir)
+        tracking: dict[str, str] = OmegaConf.to_container(config.tracking, resolve=True)  # type: ignore[assignment]
+        overrides = " ".join(config.hydra.overrides.task)
+        try:
+            client, experiment_id = open_store(**tracking)
+        except ArmscanError as error:
+            # Hydra turns an exception of a callback into a warning and goes on.
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2) from error
+        tags = {**source_tags(), "overrides": overrides}
+        parent = client.create_run(experiment_id, run_name=f"multirun {overrides}"[:250], tags=tags)
+        (folder / OUTCOME_FOLDER).mkdir(parents=True)
+        (folder / PARENT_FILE).write_text(json.dumps({"run_id": parent.info.run_id, "tracking": tracking}))
+        Multirun.folder = folder
+
+
+def parent_run_id() -> str | None:
+    """Returns the run that this job's run is a child of, None outside a multirun."""
+    if HydraConfig.get().mode != RunMode.MULTIRUN:
+        return None
+    file = Path(HydraConfig.get().sweep.dir) / PARENT_FILE
+    return str(json.loads(file.read_text())["run_id"])
+
+
+def write_outcome(outcome: Outcome) -> None:
+    """Leaves word of this job's outcome for the process that launched it."""
+    hydra_config = HydraConfig.get()
+    file = Path(hydra_config.sweep.dir) / OUTCOME_FOLDER / f"{hydra_config.job.num}.json"
+    file.write_text(json.dumps(asdict(outcome)))
+
+
+def end_multirun() -> int:
+    """Closes the parent run and shows what became of the jobs.
+
+    Returns:
+        The exit code: 0 where every job succeeded, or where this was no multirun; 1 otherwise.
+    """
+    if Multirun.folder is None:
+        return 0
+    files = sorted((Multirun.folder / OUTCOME_FOLDER).glob("*.json"), key=lambda file: int(file.stem))
+    outcomes = {file.stem: Outcome(**json.loads(file.read_text())) for file in files}
+    failed = {number: outcome for number, outcome in outcomes.items() if outcome.failure is not None}
+    has_runs = _close_parent(Multirun.folder, is_failed=bool(failed) or not outcomes)
+    if outcomes:
+        from armscan.console import print_jobs
+
+        print_jobs(outcomes)
+    for number, outcome in failed.items():
+        print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
+        print(f"  again alone: python -m armscan.run {outcome.overrides}", file=sys.stderr)
+    if not has_runs:
+        remove_run_folder(Multirun.folder)
+    return 1 if failed or not outcomes else 0
+
+
+def _close_parent(folder: Path, *, is_failed: bool) -> bool:
+    """Closes the parent run and what a killed job left open; deletes it where no job got as far as a run of its own."""
+    from armscan.tracking import open_store
+
+    word = json.loads((folder / PARENT_FILE).read_text())
+    client, experiment_id = open_store(**word["tracking"])
+    children = client.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
+    for child in children:
+        if child.info.status == "RUNNING":
+            client.set_tag(child.info.run_id, "failure", NO_OUTCOME)
+            client.set_terminated(child.info.run_id, "FAILED")
+    client.set_terminated(word["run_id"], "FAILED" if is_failed else "FINISHED")
+    if not children:
+        client.delete_run(word["run_id"])
+    return bool(children)
+
+
+def remove_run_folder(folder: Path) -> None:
+    """Removes the folder of a run that came to nothing, and the folder of its day where nothing else is in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for above in (folder.parent, folder.parent.parent):
+        if above.is_dir() and above != Path.cwd() and not any(above.iterdir()):
+            above.rmdir()

@@ -1,0 +1,195 @@
+"""The command `python -m armscan.run`: one run, or with -m several side by side.
+
+This is the one place that reads the configuration: everything is built from it here, and no part of it goes further.
+"""
+
+from __future__ import annotations
+
+import os
+
+# One compute thread a process, set before any library starts its pool: small networks are fastest so, and jobs side by
+# side never claim more threads than there are cores.
+for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
+import sys
+import traceback
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from armscan.checks import check_int
+from armscan.mistakes import mistake_in_one_line, quieten_libraries
+from armscan.multirun import NO_OUTCOME, Outcome, end_multirun, parent_run_id, remove_run_folder, write_outcome
+
+if TYPE_CHECKING:
+    from armscan.tracking import TrackedRun
+
+WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
+# First seeds of the episodes that are played for each purpose, so that none is played for two.
+TEST_SEED, TRAINING_VOLUMES_SEED, HELD_OUT_VOLUMES_SEED, FILM_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
+
+
+def run_experiment(config: DictConfig) -> dict[str, Any]:
+    """Trains, evaluates and tracks one agent.
+
+    Args:
+        config: the composed configuration.
+
+    Returns:
+        The figures of the final evaluations, by the name of their volumes.
+    """
+    # Deferred: a mistake on the command line should be answered before these are loaded.
+    import torch
+
+    from armscan.agents import LearningSetup, checked_device
+    from armscan.console import print_results, progress_reporter
+    from armscan.training import HELD_OUT, TRAINED_ON, evaluate, film_episode, train
+
+    quieten_libraries()
+    torch.set_num_threads(1)
+    folder, label, seed = (
+        Path(HydraConfig.get().runtime.output_dir),
+        job_label(),
+        check_int("seed", config.seed, at_least=0),
+    )
+    n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
+
+    # Everything is built, and so checked, before anything is tracked.
+    split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
+    make_env = instantiate(config.env, _convert_="object")
+    training_env, held_out_env = make_env(split.training), make_env(split.held_out)
+    film_env = make_env(split.held_out, render_mode="rgb_array")
+    setup = LearningSetup(
+        make_env=partial(make_env, split.training),
+        total_env_steps=budget.env_steps,
+        seed=seed,
+        device=checked_device(config.device),
+    )
+    learner = instantiate(config.agent, _convert_="object").learner(setup)
+
+    def on_held_out_volumes(n_episodes: int, first_seed: int) -> Any:
+        return evaluate(learner, held_out_env, split.held_out, n_episodes=n_episodes, seed=first_seed + seed)
+
+    with tracked_run(config) as tracked:
+        test = partial(on_held_out_volumes, budget.test_episodes, TEST_SEED)
+        result = train(learner, budget, test, folder, callbacks=[progress_reporter(label), tracked])
+        evaluations = {
+            TRAINED_ON: evaluate(
+                learner, training_env, split.training, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed
+            ),
+            HELD_OUT: on_held_out_volumes(n_episodes, HELD_OUT_VOLUMES_SEED),
+        }
+        film_episode(
+            learner, film_env, folder / "episode.gif", volume_name=next(iter(split.held_out)), seed=FILM_SEED + seed
+        )
+        tracked.keep_results(result.reports, evaluations, folder)
+    if label is None:
+        print_results("results (deterministic policy of the best epoch)", evaluations)
+        print_where_to_look(config, folder)
+    return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
+
+
+def tracked_run(config: DictConfig) -> TrackedRun:
+    """Opens the tracking store and starts a run in it."""
+    from armscan.tracking import TrackedRun, open_store
+
+    resolved: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
+    choices: Mapping[str, str] = HydraConfig.get().runtime.choices
+    overrides = list(HydraConfig.get().overrides.task)
+    client, experiment_id = open_store(**resolved["tracking"])
+    return TrackedRun(
+        client,
+        experiment_id,
+        name=f"{choices['agent']}-{choices['obs']}-{resolved['projection']}-seed{resolved['seed']}",
+        config=resolved,
+        tags={
+            "overrides": " ".join(overrides),
+            **{f"choice.{group}": str(choices[group]) for group in ("data", "obs")},
+        },
+        parent_id=parent_run_id(),
+    )
+
+
+def job_label() -> str | None:
+    """Returns what tells this job of a multirun from the others: its number and overrides; None for a single run."""
+    hydra_config = HydraConfig.get()
+    if hydra_config.mode != RunMode.MULTIRUN:
+        return None
+    return f"{hydra_config.job.num} {hydra_config.job.override_dirname}"
+
+
+def print_where_to_look(config: DictConfig, folder: Path) -> None:
+    """Prints where the results are, and the command that opens the UI."""
+    here = Path.cwd()
+    shown = folder.relative_to(here) if folder.is_relative_to(here) else folder
+    program = Path(sys.executable)
+    command = program.relative_to(here) if program.is_relative_to(here) else program
+    print(f"learning curve   {shown / 'learning_curve.png'}")
+    print(f"film             {shown / 'episode.gif'}")
+    print(f"all runs         {command} -m mlflow ui --backend-store-uri {config.tracking.uri}")
+
+
+def job(config: DictConfig) -> None:
+    """What Hydra calls: one run, or one job of a multirun, where a failure is noted and does not stop the others."""
+    folder, label = Path(HydraConfig.get().runtime.output_dir), job_label()
+    overrides = " ".join(HydraConfig.get().overrides.task)
+    if label is not None:
+        write_outcome(Outcome(overrides, failure=NO_OUTCOME))
+    try:
+        figures = run_experiment(config)
+    except Exception as error:
+        line = mistake_in_one_line(error)
+        if all(entry.name == ".hydra" for entry in folder.iterdir()):
+            remove_run_folder(folder)
+        if label is None:
+            raise_or_exit(error)
+        if line is None:
+            traceback.print_exc()
+        print(f"[{label}] failed: {line or repr(error)}", file=sys.stderr, flush=True)
+        write_outcome(Outcome(overrides, failure=line or repr(error)))
+    else:
+        if label is not None:
+            write_outcome(Outcome(overrides, figures=figures))
+
+
+def raise_or_exit(error: Exception) -> NoReturn:
+    """Answers a user's mistake in one line and leaves; raises any other error, or all where tracebacks are wanted."""
+    line = mistake_in_one_line(error)
+    if line is None or os.environ.get(WANTS_TRACEBACKS):
+        raise error
+    print(f"error: {line}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def main() -> int:
+    """Runs what the command line asks for; returns the exit code."""
+    if os.environ.get("HYDRA_FULL_ERROR") == "1":
+        os.environ[WANTS_TRACEBACKS] = "1"
+    # Hydra raises, so that its errors are answered here and not by Hydra.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    quieten_libraries()
+    try:
+        hydra.main(version_base="1.3", config_path="pkg://armscan.conf", config_name="config")(job)()
+    except KeyboardInterrupt:
+        end_multirun()
+        print("interrupted", file=sys.stderr)
+        return 130
+    except Exception as error:
+        end_multirun()
+        raise_or_exit(error)
+    return end_multirun()
+
+
+if __name__ == "__main__":
+    # The module under its own name: jobs in other processes find their function there.
+    from armscan.run import main as run_main
+
+    sys.exit(run_main())

@@ -1,0 +1,24 @@
+"""Which state of the code a run was made with."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+
+def source_tags() -> dict[str, str]:
+    """Returns the git commit of the code and whether its tree was dirty; 'unknown' where the code is under no git."""
+    folder = Path(__file__).parent
+    commit = _git("rev-parse", "HEAD", folder=folder)
+    if commit is None:
+        return {"git.commit": "unknown", "git.dirty": "unknown"}
+    changes = _git("status", "--porcelain", folder=folder)
+    return {"git.commit": commit, "mlflow.source.git.commit": commit, "git.dirty": str(changes != "").lower()}
+
+
+def _git(*arguments: str, folder: Path) -> str | None:
+    try:
+        answer = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=30, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip()

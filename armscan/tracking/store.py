@@ -1,0 +1,64 @@
+"""The MLflow store: opened once, by one process at a time."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+
+from filelock import FileLock
+from mlflow import MlflowClient
+from mlflow.exceptions import MlflowException
+from sqlalchemy.exc import SQLAlchemyError
+
+from armscan.errors import TrackingError
+
+SQLITE_PREFIX = "sqlite:///"
+LOCK_TIMEOUT_S = 120
+# A server that is away should be said to be away within seconds, not after minutes of retries.
+HTTP_DEFAULTS = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2", "MLFLOW_HTTP_REQUEST_TIMEOUT": "20"}
+
+
+def open_store(uri: str, *, experiment: str, artifacts: str) -> tuple[MlflowClient, str]:
+    """Opens a tracking store and makes the experiment where it does not exist yet.
+
+    Args:
+        uri: of the store, such as `sqlite:///mlruns.db` or the address of an MLflow server.
+        experiment: the experiment's name.
+        artifacts: folder of its artifacts where the store is a database; a server has its own place for them.
+
+    Returns:
+        A client of the store, and the experiment's id.
+
+    Raises:
+        TrackingError: if the store cannot be reached or used.
+    """
+    for name, value in HTTP_DEFAULTS.items():
+        os.environ.setdefault(name, value)
+    # The making of a new database is told table by table.
+    for library in ("alembic", "mlflow"):
+        logging.getLogger(library).setLevel(logging.WARNING)
+    try:
+        if not uri.startswith(SQLITE_PREFIX):
+            return _open(uri, experiment, None if uri.startswith("http") else artifacts)
+        # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
+        database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
+        database.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
+            return _open(f"{SQLITE_PREFIX}{database}", experiment, artifacts)
+    except (MlflowException, SQLAlchemyError, OSError, ModuleNotFoundError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise TrackingError(f"tracking.uri is {uri!r}, but this store cannot be used: {reason}") from error
+
+
+def _open(uri: str, experiment: str, artifacts: str | None) -> tuple[MlflowClient, str]:
+    client = MlflowClient(tracking_uri=uri)
+    found = client.get_experiment_by_name(experiment)
+    if found is not None:
+        if found.lifecycle_stage != "active":
+            raise TrackingError(
+                f"tracking.experiment is {experiment!r}, but it was deleted; restore it, or name another"
+            )
+        return client, found.experiment_id
+    location = Path(artifacts).absolute().as_uri() if artifacts else None
+    return client, client.create_experiment(experiment, artifact_location=location)

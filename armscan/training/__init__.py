@@ -1,0 +1,30 @@
+"""One run: which volumes, how long to train, how to judge, what to keep."""
+
+from armscan.training.callbacks import Callback, EpochReport
+from armscan.training.checkpoint import load_checkpoint, save_checkpoint
+from armscan.training.data import Split, nifti_data, phantom_data
+from armscan.training.evaluation import HELD_OUT, TRAINED_ON, Episode, Evaluation, evaluate
+from armscan.training.film import film_episode
+from armscan.training.train import BEST_CHECKPOINT, LAST_CHECKPOINT, Budget, SolvedCriterion, TrainingResult, train
+
+__all__ = [
+    "BEST_CHECKPOINT",
+    "HELD_OUT",
+    "LAST_CHECKPOINT",
+    "TRAINED_ON",
+    "Budget",
+    "Callback",
+    "Episode",
+    "EpochReport",
+    "Evaluation",
+    "SolvedCriterion",
+    "Split",
+    "TrainingResult",
+    "evaluate",
+    "film_episode",
+    "load_checkpoint",
+    "nifti_data",
+    "phantom_data",
+    "save_checkpoint",
+    "train",
+]

@@ -1,0 +1,131 @@
+"""How good an agent is: whole episodes on given volumes, played without exploration."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import gymnasium as gym
+
+from armscan.agents.protocols import Agent
+from armscan.checks import check_int
+from armscan.envs.observations import FloatVector
+from armscan.volumes.plane import FloatArray
+
+# What evaluations are called by, after the volumes that they are on.
+TRAINED_ON, HELD_OUT = "training volumes", "held-out volumes"
+
+Env = gym.Env[FloatVector, FloatArray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """How one episode went.
+
+    Args:
+        volume: name of its volume.
+        seed: it was reset with.
+        n_steps: steps taken.
+        is_success: whether it ended on a rewarded plane.
+        starts_solved: whether it also began on one.
+        episode_return: sum of the rewards.
+        final_reward: of the last plane.
+        distance_mm: of the last plane from the optimal one.
+        distance_deg: likewise.
+    """
+
+    volume: str
+    seed: int
+    n_steps: int
+    is_success: bool
+    starts_solved: bool
+    episode_return: float
+    final_reward: float
+    distance_mm: float
+    distance_deg: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes and what they add up to; every mean is over all episodes unless its name says otherwise."""
+
+    episodes: tuple[Episode, ...]
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the episodes that ended on a rewarded plane."""
+        return self._mean(lambda episode: episode.is_success)
+
+    @property
+    def mean_steps(self) -> float:
+        """Mean number of steps, episodes without success included."""
+        return self._mean(lambda episode: episode.n_steps)
+
+    @property
+    def score(self) -> tuple[float, float]:
+        """What evaluations are compared by: first the success rate, then the fewest steps."""
+        return self.success_rate, -self.mean_steps
+
+    def metrics(self) -> dict[str, float]:
+        """Returns the figures by name; those of episodes that did not start solved stand beside those of all."""
+        unsolved = Evaluation(tuple(episode for episode in self.episodes if not episode.starts_solved))
+        return {
+            "success_rate": self.success_rate,
+            "mean_steps": self.mean_steps,
+            "mean_return": self._mean(lambda episode: episode.episode_return),
+            "mean_final_reward": self._mean(lambda episode: episode.final_reward),
+            "mean_distance_mm": self._mean(lambda episode: episode.distance_mm),
+            "mean_distance_deg": self._mean(lambda episode: episode.distance_deg),
+            "episodes": len(self.episodes),
+            "episodes_started_solved": len(self.episodes) - len(unsolved.episodes),
+            "success_rate_not_started_solved": unsolved.success_rate,
+            "mean_steps_not_started_solved": unsolved.mean_steps,
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the figures and every episode, ready for JSON."""
+        return {"metrics": self.metrics(), "episodes": [asdict(episode) for episode in self.episodes]}
+
+    def _mean(self, figure: Callable[[Episode], float]) -> float:
+        return statistics.fmean(map(figure, self.episodes)) if self.episodes else float("nan")
+
+
+def evaluate(agent: Agent, env: Env, volume_names: Iterable[str], *, n_episodes: int, seed: int) -> Evaluation:
+    """Plays episodes on each volume in turn.
+
+    Args:
+        agent: plays them.
+        env: holds the volumes.
+        volume_names: which volumes.
+        n_episodes: how many episodes; a multiple of the number of volumes treats them alike.
+        seed: of the first episode, the next has the next seed: the same seed gives the same episodes to every agent.
+
+    Returns:
+        The episodes.
+    """
+    names = list(volume_names)
+    count = check_int("episodes", n_episodes, at_least=1)
+    return Evaluation(tuple(_play(agent, env, names[i % len(names)], seed + i) for i in range(count)))
+
+
+def _play(agent: Agent, env: Env, volume_name: str, seed: int) -> Episode:
+    observation, info = env.reset(seed=seed, options={"volume": volume_name})
+    n_steps, episode_return, ended = 0, 0.0, False
+    while not ended:
+        observation, reward, terminated, truncated, info = env.step(agent.act(observation))
+        n_steps += 1
+        episode_return += float(reward)
+        ended = terminated or truncated
+    return Episode(
+        volume=volume_name,
+        seed=seed,
+        n_steps=n_steps,
+        is_success=bool(info["is_success"]),
+        starts_solved=bool(info["starts_solved"]),
+        episode_return=episode_return,
+        final_reward=float(info["reward"]),
+        distance_mm=float(info["distance_mm"]),
+        distance_deg=float(info["distance_deg"]),
+    )

@@ -1,0 +1,44 @@
+"""A film of one episode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from PIL import Image
+
+from armscan.agents.protocols import Agent
+from armscan.training.evaluation import Env
+
+FRAME_MS = 600
+LAST_FRAME_MS = 2400
+MAX_COLOURS = 64
+MAX_ATTEMPTS = 20
+
+
+def film_episode(agent: Agent, env: Env, path: Path, *, volume_name: str, seed: int) -> None:
+    """Plays one episode that does not start solved and writes it as an animated GIF, its last frame held longer.
+
+    Args:
+        agent: plays it.
+        env: made with `render_mode="rgb_array"`.
+        path: the file, ending in `.gif`.
+        volume_name: which volume.
+        seed: of the episode; the next one is tried where its episode starts solved, a few times.
+    """
+    for attempt in range(MAX_ATTEMPTS):
+        observation, info = env.reset(seed=seed + attempt, options={"volume": volume_name})
+        if not info["starts_solved"]:
+            break
+    frames = [_picture(env)]
+    ended = False
+    while not ended:
+        observation, _, terminated, truncated, _ = env.step(agent.act(observation))
+        frames.append(_picture(env))
+        ended = terminated or truncated
+    durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+
+
+def _picture(env: Env) -> Image.Image:
+    picture = Image.fromarray(env.render())  # type: ignore[arg-type]
+    return picture.quantize(MAX_COLOURS, dither=Image.Dither.NONE)

@@ -1,0 +1,144 @@
+"""One training: epochs of learning, each followed by a test, until the budget is spent or the task is solved."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from armscan.agents.protocols import Learner
+from armscan.checks import check_float, check_int
+from armscan.errors import InvalidValueError
+from armscan.training.callbacks import Callback, EpochReport
+from armscan.training.checkpoint import load_checkpoint, save_checkpoint
+from armscan.training.evaluation import Evaluation
+
+BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolvedCriterion:
+    """When training may stop before its budget is spent.
+
+    Args:
+        success_rate: at least this share of the test episodes succeeds,
+        mean_steps: in at most this many steps on average,
+        n_epochs: in this many epochs one after another.
+    """
+
+    success_rate: float = 1.0
+    mean_steps: float = 1.2
+    n_epochs: int = 2
+
+    def __post_init__(self) -> None:
+        check_float("training.solved.success_rate", self.success_rate, at_least=0.0, at_most=1.0)
+        check_float("training.solved.mean_steps", self.mean_steps, at_least=1.0)
+        check_int("training.solved.n_epochs", self.n_epochs, at_least=1)
+
+    def holds(self, reports: Sequence[EpochReport]) -> bool:
+        """Whether the last epochs fulfil it."""
+        last = reports[-self.n_epochs :]
+        return len(last) == self.n_epochs and all(
+            report.evaluation.success_rate >= self.success_rate and report.evaluation.mean_steps <= self.mean_steps
+            for report in last
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """How long to train, and how often to test.
+
+    Args:
+        env_steps: environment steps to take at most, all of them counted.
+        epoch_env_steps: environment steps between two tests.
+        test_episodes: episodes of a test.
+        solved: stop as soon as this holds; None to spend the whole budget.
+    """
+
+    env_steps: int
+    epoch_env_steps: int
+    test_episodes: int
+    solved: SolvedCriterion | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("env_steps", "epoch_env_steps", "test_episodes"):
+            check_int(f"training.{name}", getattr(self, name), at_least=1)
+        if self.epoch_env_steps > self.env_steps:
+            raise InvalidValueError(
+                f"training.epoch_env_steps is {self.epoch_env_steps}, but it must be at most training.env_steps = "
+                f"{self.env_steps}"
+            )
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a training leaves; the learner holds its best weights again.
+
+    Args:
+        reports: one an epoch.
+        is_solved: whether it stopped because the task was solved.
+        wall_s: seconds of learning and testing.
+    """
+
+    reports: tuple[EpochReport, ...]
+    is_solved: bool
+    wall_s: float
+
+
+def train(
+    learner: Learner,
+    budget: Budget,
+    test: Callable[[], Evaluation],
+    folder: Path,
+    callbacks: Sequence[Callback] = (),
+) -> TrainingResult:
+    """Trains a learner and leaves it with the weights of its best epoch.
+
+    Args:
+        learner: to train.
+        budget: how long.
+        test: evaluates the learner on the test volumes.
+        folder: where `best.pt` and `last.pt` are kept.
+        callbacks: who is told.
+
+    Returns:
+        The course of the training.
+    """
+    start_s = time.perf_counter()
+    reports: list[EpochReport] = []
+    is_solved = False
+    for callback in callbacks:
+        callback.on_start(budget.env_steps)
+    try:
+        learner.warm_up()
+        while learner.n_env_steps < budget.env_steps and not is_solved:
+            metrics = learner.learn(min(budget.epoch_env_steps, budget.env_steps - learner.n_env_steps))
+            evaluation = test()
+            report = EpochReport(
+                epoch=len(reports) + 1,
+                n_env_steps=learner.n_env_steps,
+                wall_s=time.perf_counter() - start_s,
+                metrics=metrics,
+                evaluation=evaluation,
+                is_best=all(evaluation.score > earlier.evaluation.score for earlier in reports),
+            )
+            reports.append(report)
+            _keep(learner, report, folder)
+            for callback in callbacks:
+                callback.on_epoch(report)
+            is_solved = budget.solved is not None and budget.solved.holds(reports)
+    finally:
+        for callback in callbacks:
+            callback.on_end()
+    learner.load_state(load_checkpoint(folder / BEST_CHECKPOINT)[0])
+    return TrainingResult(tuple(reports), is_solved, time.perf_counter() - start_s)
+
+
+def _keep(learner: Learner, report: EpochReport, folder: Path) -> None:
+    """Writes the last checkpoint, and the best one where it is better than all before."""
+    facts = {"n_env_steps": report.n_env_steps, "epoch": report.epoch, **report.evaluation.metrics()}
+    state = learner.state()
+    save_checkpoint(folder / LAST_CHECKPOINT, state, facts)
+    if report.is_best:
+        save_checkpoint(folder / BEST_CHECKPOINT, state, facts)

@@ -1,0 +1,104 @@
+"""What an image file's own header says, where the reading library would mend it in silence.
+
+SimpleITK replaces a NaN, zero or negative spacing by another one and fills the missing end of a truncated NIfTI file
+with zeros. Both would end in wrong figures, so they are looked for here before the file is read.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+from armscan.errors import VolumeError
+
+TEXT_HEADER_BYTES = 65536
+
+
+def check_nifti(path: Path) -> None:
+    """Raises `VolumeError` if a NIfTI file is cut off or its spacing is not finite and positive."""
+    try:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            header = file.read(540)
+            n_bytes = len(header) + _count_bytes(file)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise VolumeError(f"{path}: the file is truncated or damaged ({error})") from error
+    for order in "<>":
+        if len(header) >= 348 and struct.unpack_from(f"{order}i", header)[0] == 348:
+            dims = struct.unpack_from(f"{order}8h", header, 40)
+            bits_per_voxel = struct.unpack_from(f"{order}h", header, 72)[0]
+            spacing = struct.unpack_from(f"{order}8f", header, 76)[1:4]
+            offset = struct.unpack_from(f"{order}f", header, 108)[0]
+            break
+        if len(header) >= 540 and struct.unpack_from(f"{order}i", header)[0] == 540:
+            dims = struct.unpack_from(f"{order}8q", header, 16)
+            bits_per_voxel = struct.unpack_from(f"{order}h", header, 14)[0]
+            spacing = struct.unpack_from(f"{order}8d", header, 104)[1:4]
+            offset = struct.unpack_from(f"{order}q", header, 168)[0]
+            break
+    else:
+        raise VolumeError(f"{path}: the file does not begin with a NIfTI header")
+    expected = offset + math.prod(dims[1 : 1 + dims[0]]) * bits_per_voxel // 8
+    if not n_bytes >= expected:
+        raise VolumeError(
+            f"{path}: the file is truncated: it holds {n_bytes} bytes, but its header promises {expected:g}"
+        )
+    # Spacings of axes that the image does not have are often 0, and mean nothing.
+    _check_spacing(path, spacing[: dims[0]])
+
+
+def check_nrrd(path: Path) -> None:
+    """Raises `VolumeError` if a NRRD header gives a spacing that is not finite and positive."""
+    given = re.search(rb"^spacings:(.*)$", _text_header(path), re.MULTILINE)
+    if given:
+        _check_spacing(path, [_number(word) for word in given.group(1).split()])
+    directions = re.search(rb"^space directions:(.*)$", _text_header(path), re.MULTILINE)
+    if directions:
+        vectors = re.findall(rb"\(([^)]*)\)|(none)", directions.group(1))
+        _check_spacing(path, [math.hypot(*map(_number, v.split(b","))) if v else math.nan for v, _ in vectors])
+
+
+def check_metaimage(path: Path) -> None:
+    """Raises `VolumeError` if a MetaImage header gives a spacing that is not finite and positive."""
+    given = re.search(rb"^Element(?:Spacing|Size)\s*=(.*)$", _text_header(path), re.MULTILINE)
+    if given:
+        _check_spacing(path, [_number(word) for word in given.group(1).split()])
+
+
+CHECKS: dict[str, Callable[[Path], None]] = {
+    ".nii.gz": check_nifti,
+    ".nii": check_nifti,
+    ".nrrd": check_nrrd,
+    ".mha": check_metaimage,
+    ".mhd": check_metaimage,
+}
+
+
+def _count_bytes(file: BinaryIO | gzip.GzipFile) -> int:
+    n_bytes = 0
+    while chunk := file.read(1 << 20):
+        n_bytes += len(chunk)
+    return n_bytes
+
+
+def _text_header(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(TEXT_HEADER_BYTES)
+
+
+def _number(word: bytes) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
+
+
+def _check_spacing(path: Path, spacing: tuple[float, ...] | list[float]) -> None:
+    if not all(math.isfinite(step) and step > 0 for step in spacing):
+        received = ", ".join(f"{step:g}" for step in spacing)
+        raise VolumeError(f"{path}: the spacing in the file is ({received}) mm, but each must be finite and above 0")

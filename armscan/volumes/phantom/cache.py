@@ -1,0 +1,79 @@
+"""Phantoms kept on disk, so that each is made once a machine."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+
+from armscan.files import write_whole
+from armscan.volumes.phantom import generate, tube, wrist
+from armscan.volumes.plane import ManipulatorAction
+from armscan.volumes.volume import LabelVolume
+
+
+def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None) -> dict[str, LabelVolume]:
+    """Returns the phantoms of the given seeds by name; see `load_phantom`."""
+    return {volume.name: volume for volume in (load_phantom(seed, cache_dir) for seed in seeds)}
+
+
+def load_phantom(seed: int, cache_dir: Path | None = None) -> LabelVolume:
+    """Returns the phantom of a seed, from the cache where it is there, made and kept otherwise.
+
+    Args:
+        seed: as in `make_phantom`.
+        cache_dir: where phantoms are kept; `$ARMSCAN_CACHE`, or else the user's cache folder, where it is None.
+
+    Returns:
+        The same volume as `make_phantom(seed)`.
+    """
+    path = (cache_dir or default_cache_dir()) / f"phantom-{_generator_version()}-{seed}.npz"
+    try:
+        return _read(path, seed)
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+        # Not there, or damaged: a cached phantom can always be made again.
+        volume = generate.make_phantom(seed)
+        _write(path, volume)
+        return volume
+
+
+def default_cache_dir() -> Path:
+    """Returns the folder that phantoms are kept in."""
+    named = os.environ.get("ARMSCAN_CACHE")
+    return Path(named) if named else Path(platformdirs.user_cache_dir("armscan"))
+
+
+@cache
+def _generator_version() -> str:
+    """Fingerprint of the generator's sources, so that a changed generator never meets its old phantoms."""
+    digest = hashlib.sha256()
+    for module in (generate, tube, wrist):
+        digest.update(Path(str(module.__file__)).read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _read(path: Path, seed: int) -> LabelVolume:
+    with np.load(path, allow_pickle=False) as arrays:
+        return LabelVolume(
+            arrays["labels"],
+            tuple(arrays["spacing"].tolist()),
+            f"phantom-{seed}",
+            optimal_action=ManipulatorAction.from_array(arrays["optimal_action"]),
+        )
+
+
+def _write(path: Path, volume: LabelVolume) -> None:
+    assert volume.optimal_action is not None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    arrays = {
+        "labels": volume.labels,
+        "spacing": np.array(volume.spacing),
+        "optimal_action": volume.optimal_action.to_array(),
+    }
+    write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))

@@ -1,0 +1,98 @@
+"""From a seed to a phantom volume: draws a wrist, poses it in the field of view, and labels the voxels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.checks import check_int
+from armscan.volumes.phantom.tube import Tube, fill_tube
+from armscan.volumes.phantom.wrist import draw_wrist
+from armscan.volumes.plane import FloatArray, ManipulatorAction, slid_into
+from armscan.volumes.volume import LabelVolume
+
+SHAPE = (360, 800, 80)
+SPACING_MM = (0.27, 0.27, 0.55)
+N_STRAY_VOXELS = (150, 450)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """How a wrist lies in the field of view.
+
+    Args:
+        rotation: (rz, rx) in degrees of the wrist's frame in the volume's.
+        origin_mm: where the middle of the tunnel lies in the volume, shape (3,).
+        size: scale of the anatomy, 1 for a usual hand.
+        left: whether it is a left hand.
+    """
+
+    rotation: tuple[float, float]
+    origin_mm: FloatArray
+    size: float
+    left: bool
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> Pose:
+        """Draws a pose in which the whole wrist is in the field of view."""
+        across_mm, along_mm, depth_mm = np.multiply(SHAPE, SPACING_MM)
+        return cls(
+            rotation=(rng.uniform(-15.0, 15.0), rng.uniform(-2.0, 2.0)),
+            origin_mm=np.array(
+                [
+                    across_mm * rng.uniform(0.46, 0.54),
+                    along_mm * rng.uniform(0.38, 0.72),
+                    depth_mm * 0.36 + rng.normal(0.0, 0.5),
+                ]
+            ),
+            size=rng.uniform(0.92, 1.06),
+            left=bool(rng.random() < 0.5),
+        )
+
+    def placed(self, tube: Tube) -> Tube:
+        """Returns the tube of a usual right hand as this hand has it."""
+        return (tube.mirrored() if self.left else tube).scaled(self.size)
+
+    def optimal_action(self) -> ManipulatorAction:
+        """Returns the plane y = 0 of the wrist in the volume's frame, with its origin at the volume's side."""
+        plane = ManipulatorAction(self.rotation, (0.0, 0.0))
+        across, in_depth = plane.matrix[:, 0], plane.matrix[:, 2]
+        at_floor_mm = self.origin_mm - self.origin_mm[2] / in_depth[2] * in_depth
+        at_side_mm = at_floor_mm - at_floor_mm[0] / across[0] * across
+        action = ManipulatorAction(self.rotation, (0.0, at_side_mm[1]))
+        bounds_mm = (SHAPE[0] * SPACING_MM[0], SHAPE[1] * SPACING_MM[1])
+        slid = slid_into(action, bounds_mm)
+        assert slid is not None, "a pose keeps its plane inside the field of view"
+        return slid
+
+
+def make_phantom(seed: int) -> LabelVolume:
+    """Makes the phantom wrist of a seed, 360 x 800 x 80 voxels of 0.27 x 0.27 x 0.55 mm.
+
+    Args:
+        seed: of everything drawn: anatomy, size, pose, left or right, stray voxels.
+
+    Returns:
+        The volume, named `phantom-SEED`, with its optimal plane.
+
+    Raises:
+        InvalidValueError: if the seed is not a whole number of at least 0.
+    """
+    rng = np.random.default_rng(check_int("seed", seed, at_least=0))
+    pose = Pose.draw(rng)
+    action = pose.optimal_action()
+    plane = ManipulatorAction(pose.rotation, (0.0, 0.0))
+    labels = np.zeros(SHAPE, dtype=np.uint8)
+    for tube in draw_wrist(rng):
+        fill_tube(labels, SPACING_MM, plane.matrix, pose.origin_mm, pose.placed(tube).nodes, tube.label)
+    _scatter_strays(labels, rng)
+    return LabelVolume(labels, SPACING_MM, f"phantom-{seed}", optimal_action=action)
+
+
+def _scatter_strays(labels: np.ndarray, rng: np.random.Generator) -> None:
+    """Labels single background voxels at random, as slips of a segmenting hand do."""
+    n_strays = rng.integers(*N_STRAY_VOXELS)
+    where = tuple(rng.integers(0, n, n_strays) for n in labels.shape)
+    strays = rng.integers(1, 4, n_strays).astype(np.uint8)
+    labels[where] = np.where(labels[where] == 0, strays, labels[where])

@@ -1,0 +1,144 @@
+"""A labelmap volume: what the agent moves its plane through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.checks import check_numbers
+from armscan.errors import InvalidValueError, VolumeError
+from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
+from armscan.volumes.slicing import sample_plane
+
+LABEL_NAMES = {0: "background", 1: "bones", 2: "tendons", 3: "artery", 4: "nerve"}
+LANDMARK_LABELS = (1, 2, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class LabelVolume:
+    """An integer labelmap of an arm with its spacing and, where one is known, the plane to find.
+
+    Args:
+        labels: integers over (x, y, z), shape (nx, ny, nz): X across the palm, Y along the arm, Z through the depth;
+            0 background, 1 bones, 2 flexor tendons, 3 ulnar artery, 4 median nerve. Kept as C-contiguous uint8.
+        spacing: (sx, sy, sz) in mm.
+        name: what errors, `info` and tables call it.
+        optimal_action: the labelled plane, in the volume's own frame.
+        origin: world coordinates of voxel (0, 0, 0) in mm, for the way back.
+        direction: 3 x 3 direction cosines, columns are the world directions of the array's axes, for the way back.
+
+    Raises:
+        VolumeError: naming the volume, if the labels are not a 3-D array of the labels above, a landmark is missing,
+            or the geometry is not finite and positive.
+    """
+
+    labels: NDArray[np.uint8]
+    spacing: tuple[float, float, float]
+    name: str
+    optimal_action: ManipulatorAction | None = None
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    direction: FloatArray = field(default_factory=lambda: np.eye(3))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "labels", _checked_labels(self.labels, self.name))
+        object.__setattr__(self, "spacing", _checked_spacing(self.spacing, self.name))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(nx, ny, nz) in voxels."""
+        n_x, n_y, n_z = self.labels.shape
+        return n_x, n_y, n_z
+
+    @property
+    def size_mm(self) -> tuple[float, float, float]:
+        """Physical size n * s along each axis."""
+        n_x, n_y, n_z = (n * s for n, s in zip(self.shape, self.spacing, strict=True))
+        return n_x, n_y, n_z
+
+    @property
+    def centre_mm(self) -> tuple[float, float, float]:
+        """The middle between the first and the last voxel's centres."""
+        c_x, c_y, c_z = ((n - 1) * s / 2 for n, s in zip(self.shape, self.spacing, strict=True))
+        return c_x, c_y, c_z
+
+    @property
+    def slice_shape(self) -> tuple[int, int]:
+        """Shape of a slice where none is asked for: (nx, nz)."""
+        return self.shape[0], self.shape[2]
+
+    @property
+    def pixel_mm(self) -> tuple[float, float]:
+        """Size of a slice's pixel: (sx, sz)."""
+        return self.spacing[0], self.spacing[2]
+
+    def slice(
+        self,
+        action: ManipulatorAction,
+        shape: tuple[int, int] | None = None,
+        *,
+        transform: RigidTransform | None = None,
+    ) -> NDArray[np.uint8]:
+        """Looks up the labels on a plane; nothing is resampled.
+
+        Args:
+            action: the plane.
+            shape: pixels (across, depth); (nx, nz) where it is None.
+            transform: slice the volume moved by it, V'(q) = V(T(q)), instead of the volume as it is.
+
+        Returns:
+            The slice, indexed [across, depth], uint8; 0 where the plane is outside the volume.
+
+        Raises:
+            InvalidValueError: if `shape` is not two whole numbers of at least 1.
+        """
+        if shape is None:
+            shape = self.slice_shape
+        elif len(shape) != 2 or not all(isinstance(n, int | np.integer) and n >= 1 for n in shape):
+            raise InvalidValueError(f"shape is {shape!r}, but it must be 2 whole numbers of at least 1 (across, depth)")
+        if transform is None:
+            matrix, offset_mm = action.matrix, action.offset_mm
+        else:
+            matrix, offset_mm = transform.plane_map(action)
+        slice_xz = np.empty(shape, dtype=np.uint8)
+        sample_plane(self.labels, self.spacing, matrix, offset_mm, slice_xz)
+        return slice_xz
+
+
+def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]:
+    labels = np.asarray(labels)
+    if labels.ndim != 3 or 0 in labels.shape:
+        raise VolumeError(f"{name}: the image has shape {labels.shape}, but a labelmap must be 3-D and not empty")
+    allowed = ", ".join(f"{label} {tissue}" for label, tissue in LABEL_NAMES.items())
+    whole = np.issubdtype(labels.dtype, np.integer) or (
+        np.issubdtype(labels.dtype, np.floating) and bool((labels == np.floor(labels)).all())
+    )
+    if not whole:
+        raise VolumeError(
+            f"{name}: holds {labels.dtype} values between {labels.min():g} and {labels.max():g} that are not whole "
+            f"numbers: grey values? A labelmap holds {allowed}"
+        )
+    if labels.min() < 0 or labels.max() > max(LABEL_NAMES):
+        present = np.unique(labels)
+        received = ", ".join(f"{value:g}" for value in present[:8]) + (", ..." if present.size > 8 else "")
+        raise VolumeError(f"{name}: holds the values {received}, but a labelmap holds {allowed} only")
+    checked = np.ascontiguousarray(labels, dtype=np.uint8)
+    present = np.flatnonzero(np.bincount(checked.ravel(), minlength=len(LABEL_NAMES)))
+    for label in LANDMARK_LABELS:
+        if label not in present:
+            raise VolumeError(
+                f"{name}: no voxel is labelled {label} ({LABEL_NAMES[label]}), but every landmark must be there"
+            )
+    checked.flags.writeable = False
+    return checked
+
+
+def _checked_spacing(spacing: tuple[float, float, float], name: str) -> tuple[float, float, float]:
+    try:
+        s_x, s_y, s_z = check_numbers("spacing", spacing, 3, "(sx, sy, sz) in mm")
+    except InvalidValueError as error:
+        raise VolumeError(f"{name}: {error}") from error
+    if min(s_x, s_y, s_z) <= 0:
+        raise VolumeError(f"{name}: spacing is {(s_x, s_y, s_z)}, but each must be above 0 mm")
+    return s_x, s_y, s_z
