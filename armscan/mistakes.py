@@ -43,6 +43,8 @@ def mistake_in_one_line(error: BaseException) -> str | None:
             return _instantiation_mistake(error)
         case HydraException() | OmegaConfBaseException():
             return " ".join(str(error).split())
+        case ValueError() if _is_raised_by_hydra(error):
+            return " ".join(str(error).split())
         case OSError() if error.filename is not None:
             return f"{error.filename}: {error.strerror}"
     return None
@@ -68,6 +70,14 @@ def _causes(error: BaseException | None) -> list[BaseException]:
         causes.append(error)
         error = error.__cause__
     return causes
+
+
+def _is_raised_by_hydra(error: BaseException) -> bool:
+    """Whether Hydra itself raised it, as it does for an override like `obs=null`."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace is not None and str(trace.tb_frame.f_globals.get("__name__")).startswith("hydra.")
 
 
 def _composition_mistake(error: ConfigCompositionException) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
@@ -15,10 +16,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from armscan.errors import ArmscanError
+from armscan.files import write_whole
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
-NO_OUTCOME = "it ended without a word: killed, or out of memory"
+NO_OUTCOME = "ended without a word"
 
 
 @dataclass(frozen=True)
@@ -26,12 +28,14 @@ class Outcome:
     """What became of a job.
 
     Args:
-        overrides: what distinguishes the job.
+        overrides: all of its overrides.
+        varied: those that tell it from the other jobs.
         failure: why it failed, None where it did not.
         figures: of its evaluations, by the name of their volumes.
     """
 
     overrides: str
+    varied: str
     failure: str | None = None
     figures: dict[str, dict[str, float]] = field(default_factory=dict)
 
@@ -50,33 +54,62 @@ class Multirun(Callback):
 
         folder = Path(config.hydra.sweep.dir)
         tracking: dict[str, str] = OmegaConf.to_container(config.tracking, resolve=True)  # type: ignore[assignment]
-        overrides = " ".join(config.hydra.overrides.task)
+        overrides = list(config.hydra.overrides.task)
         try:
             client, experiment_id = open_store(**tracking)
         except ArmscanError as error:
             # Hydra turns an exception of a callback into a warning and goes on.
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(2) from error
-        tags = {**source_tags(), "overrides": overrides}
-        parent = client.create_run(experiment_id, run_name=f"multirun {overrides}"[:250], tags=tags)
+        command = " ".join(overrides)
+        tags = {**source_tags(), "overrides": command}
+        parent = client.create_run(experiment_id, run_name=f"multirun {command}"[:250], tags=tags)
         (folder / OUTCOME_FOLDER).mkdir(parents=True)
-        (folder / PARENT_FILE).write_text(json.dumps({"run_id": parent.info.run_id, "tracking": tracking}))
+        word = {"run_id": parent.info.run_id, "tracking": tracking, "overrides": overrides}
+        (folder / PARENT_FILE).write_text(json.dumps(word))
         Multirun.folder = folder
 
 
-def parent_run_id() -> str | None:
-    """Returns the run that this job's run is a child of, None outside a multirun."""
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
-        return None
-    file = Path(HydraConfig.get().sweep.dir) / PARENT_FILE
-    return str(json.loads(file.read_text())["run_id"])
+@dataclass(frozen=True)
+class Job:
+    """One job of a multirun, as its own process sees it.
 
+    Args:
+        number: from 0.
+        overrides: all of its overrides, as one would write them to run it alone.
+        varied: those among them that tell it from the other jobs.
+        parent_run_id: the run that its run is a child of.
+        folder: of the multirun.
+    """
 
-def write_outcome(outcome: Outcome) -> None:
-    """Leaves word of this job's outcome for the process that launched it."""
-    hydra_config = HydraConfig.get()
-    file = Path(hydra_config.sweep.dir) / OUTCOME_FOLDER / f"{hydra_config.job.num}.json"
-    file.write_text(json.dumps(asdict(outcome)))
+    number: int
+    overrides: str
+    varied: str
+    parent_run_id: str
+    folder: Path
+
+    @classmethod
+    def current(cls) -> Self | None:
+        """Returns the job that this process is running, None outside a multirun."""
+        hydra_config = HydraConfig.get()
+        if hydra_config.mode != RunMode.MULTIRUN:
+            return None
+        folder = Path(hydra_config.sweep.dir)
+        word = json.loads((folder / PARENT_FILE).read_text())
+        overrides = list(hydra_config.overrides.task)
+        varied = [override for override in overrides if override not in word["overrides"]]
+        return cls(hydra_config.job.num, shlex.join(overrides), " ".join(varied), word["run_id"], folder)
+
+    @property
+    def label(self) -> str:
+        """What stands before the lines it prints."""
+        return f"{self.number} {self.varied}".strip()
+
+    def write_outcome(self, *, failure: str | None = None, figures: dict[str, dict[str, float]] | None = None) -> None:
+        """Leaves word of the outcome for the process that launched the job."""
+        outcome = Outcome(self.overrides, self.varied, failure, figures or {})
+        file = self.folder / OUTCOME_FOLDER / f"{self.number}.json"
+        write_whole(file, lambda opened: opened.write(json.dumps(asdict(outcome)).encode()))
 
 
 def end_multirun() -> int:

@@ -12,36 +12,68 @@ import os
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
+import pickle
+import signal
+import subprocess
 import sys
 import traceback
-from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from armscan.checks import check_int
 from armscan.mistakes import mistake_in_one_line, quieten_libraries
-from armscan.multirun import NO_OUTCOME, Outcome, end_multirun, parent_run_id, remove_run_folder, write_outcome
+from armscan.multirun import NO_OUTCOME, Job, end_multirun, remove_run_folder
 
 if TYPE_CHECKING:
     from armscan.tracking import TrackedRun
 
+CHOICES_IN_TAGS = ("data", "obs", "agent", "network")
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
 # First seeds of the episodes that are played for each purpose, so that none is played for two.
 TEST_SEED, TRAINING_VOLUMES_SEED, HELD_OUT_VOLUMES_SEED, FILM_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
 
 
-def run_experiment(config: DictConfig) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Invocation:
+    """How a run was asked for.
+
+    Args:
+        folder: where it leaves its files.
+        overrides: of the command line.
+        choices: what was chosen of each configuration group.
+        job: which one of a multirun it is, None for a single run.
+    """
+
+    folder: Path
+    overrides: list[str]
+    choices: dict[str, str]
+    job: Job | None
+
+    @classmethod
+    def current(cls) -> Invocation:
+        """Returns how Hydra is running this process."""
+        hydra_config = HydraConfig.get()
+        return cls(
+            folder=Path(hydra_config.runtime.output_dir),
+            overrides=list(hydra_config.overrides.task),
+            choices={str(group): str(choice) for group, choice in hydra_config.runtime.choices.items()},
+            job=Job.current(),
+        )
+
+
+def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict[str, float]]:
     """Trains, evaluates and tracks one agent.
 
     Args:
         config: the composed configuration.
+        invocation: how it was asked for.
 
     Returns:
         The figures of the final evaluations, by the name of their volumes.
@@ -55,11 +87,8 @@ def run_experiment(config: DictConfig) -> dict[str, Any]:
 
     quieten_libraries()
     torch.set_num_threads(1)
-    folder, label, seed = (
-        Path(HydraConfig.get().runtime.output_dir),
-        job_label(),
-        check_int("seed", config.seed, at_least=0),
-    )
+    folder, job = invocation.folder, invocation.job
+    seed = check_int("seed", config.seed, at_least=0)
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
 
     # Everything is built, and so checked, before anything is tracked.
@@ -74,56 +103,41 @@ def run_experiment(config: DictConfig) -> dict[str, Any]:
         device=checked_device(config.device),
     )
     learner = instantiate(config.agent, _convert_="object").learner(setup)
+    test = partial(evaluate, learner, held_out_env, n_episodes=budget.test_episodes, seed=TEST_SEED + seed)
 
-    def on_held_out_volumes(n_episodes: int, first_seed: int) -> Any:
-        return evaluate(learner, held_out_env, split.held_out, n_episodes=n_episodes, seed=first_seed + seed)
-
-    with tracked_run(config) as tracked:
-        test = partial(on_held_out_volumes, budget.test_episodes, TEST_SEED)
-        result = train(learner, budget, test, folder, callbacks=[progress_reporter(label), tracked])
+    with tracked_run(config, invocation) as tracked:
+        progress = progress_reporter(job.label if job else None)
+        result = train(learner, budget, test, folder, callbacks=[progress, tracked])
         evaluations = {
-            TRAINED_ON: evaluate(
-                learner, training_env, split.training, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed
-            ),
-            HELD_OUT: on_held_out_volumes(n_episodes, HELD_OUT_VOLUMES_SEED),
+            TRAINED_ON: evaluate(learner, training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),
+            HELD_OUT: evaluate(learner, held_out_env, n_episodes=n_episodes, seed=HELD_OUT_VOLUMES_SEED + seed),
         }
-        film_episode(
-            learner, film_env, folder / "episode.gif", volume_name=next(iter(split.held_out)), seed=FILM_SEED + seed
-        )
+        film_episode(learner, film_env, folder / "episode.gif", seed=FILM_SEED + seed)
         tracked.keep_results(result.reports, evaluations, folder)
-    if label is None:
+    if job is None:
         print_results("results (deterministic policy of the best epoch)", evaluations)
         print_where_to_look(config, folder)
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
 
 
-def tracked_run(config: DictConfig) -> TrackedRun:
+def tracked_run(config: DictConfig, invocation: Invocation) -> TrackedRun:
     """Opens the tracking store and starts a run in it."""
     from armscan.tracking import TrackedRun, open_store
 
     resolved: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
-    choices: Mapping[str, str] = HydraConfig.get().runtime.choices
-    overrides = list(HydraConfig.get().overrides.task)
     client, experiment_id = open_store(**resolved["tracking"])
+    choices = invocation.choices
     return TrackedRun(
         client,
         experiment_id,
         name=f"{choices['agent']}-{choices['obs']}-{resolved['projection']}-seed{resolved['seed']}",
         config=resolved,
         tags={
-            "overrides": " ".join(overrides),
-            **{f"choice.{group}": str(choices[group]) for group in ("data", "obs")},
+            "overrides": " ".join(invocation.overrides),
+            **{f"choice.{group}": choices[group] for group in CHOICES_IN_TAGS},
         },
-        parent_id=parent_run_id(),
+        parent_id=invocation.job.parent_run_id if invocation.job else None,
     )
-
-
-def job_label() -> str | None:
-    """Returns what tells this job of a multirun from the others: its number and overrides; None for a single run."""
-    hydra_config = HydraConfig.get()
-    if hydra_config.mode != RunMode.MULTIRUN:
-        return None
-    return f"{hydra_config.job.num} {hydra_config.job.override_dirname}"
 
 
 def print_where_to_look(config: DictConfig, folder: Path) -> None:
@@ -137,27 +151,45 @@ def print_where_to_look(config: DictConfig, folder: Path) -> None:
     print(f"all runs         {command} -m mlflow ui --backend-store-uri {config.tracking.uri}")
 
 
-def job(config: DictConfig) -> None:
-    """What Hydra calls: one run, or one job of a multirun, where a failure is noted and does not stop the others."""
-    folder, label = Path(HydraConfig.get().runtime.output_dir), job_label()
-    overrides = " ".join(HydraConfig.get().overrides.task)
-    if label is not None:
-        write_outcome(Outcome(overrides, failure=NO_OUTCOME))
+def run(config: DictConfig) -> None:
+    """What Hydra calls: a single run, or one job of a multirun in a process of its own."""
+    invocation = Invocation.current()
+    if invocation.job is None:
+        try:
+            run_experiment(config, invocation)
+        except Exception as error:
+            remove_if_empty(invocation.folder)
+            raise_or_exit(error)
+    else:
+        # A job that is killed, for its memory say, takes neither the launcher nor the other jobs with it.
+        invocation.job.write_outcome(failure=NO_OUTCOME)
+        command = [sys.executable, "-c", "from armscan.run import run_job; run_job()"]
+        ended = subprocess.run(command, input=pickle.dumps((config, invocation)), check=False)
+        if ended.returncode < 0:
+            invocation.job.write_outcome(failure=f"killed by {signal.Signals(-ended.returncode).name}: out of memory?")
+
+
+def run_job() -> None:
+    """One job of a multirun, handed over on standard input: a failure is noted, and does not stop the others."""
+    config, invocation = pickle.load(sys.stdin.buffer)
+    job: Job = invocation.job
     try:
-        figures = run_experiment(config)
+        figures = run_experiment(config, invocation)
     except Exception as error:
         line = mistake_in_one_line(error)
-        if all(entry.name == ".hydra" for entry in folder.iterdir()):
-            remove_run_folder(folder)
-        if label is None:
-            raise_or_exit(error)
         if line is None:
             traceback.print_exc()
-        print(f"[{label}] failed: {line or repr(error)}", file=sys.stderr, flush=True)
-        write_outcome(Outcome(overrides, failure=line or repr(error)))
+        remove_if_empty(invocation.folder)
+        print(f"[{job.label}] failed: {line or repr(error)}", file=sys.stderr, flush=True)
+        job.write_outcome(failure=line or repr(error))
     else:
-        if label is not None:
-            write_outcome(Outcome(overrides, figures=figures))
+        job.write_outcome(figures=figures)
+
+
+def remove_if_empty(folder: Path) -> None:
+    """Removes the folder of a run that has left nothing there but what Hydra wrote."""
+    if all(entry.name == ".hydra" for entry in folder.iterdir()):
+        remove_run_folder(folder)
 
 
 def raise_or_exit(error: Exception) -> NoReturn:
@@ -177,7 +209,7 @@ def main() -> int:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     quieten_libraries()
     try:
-        hydra.main(version_base="1.3", config_path="pkg://armscan.conf", config_name="config")(job)()
+        hydra.main(version_base="1.3", config_path="pkg://armscan.conf", config_name="config")(run)()
     except KeyboardInterrupt:
         end_multirun()
         print("interrupted", file=sys.stderr)

@@ -63,7 +63,9 @@ def _label_core_pixels(core: NDArray[np.bool_], widths: NDArray[np.int64], clust
     """Writes the cluster number, from 1, of each core pixel into `clusters`; returns how many clusters there are."""
     n_rows, n_cols = core.shape
     first_run = np.zeros(n_rows + 1, dtype=np.int64)
-    capacity = n_rows * (n_cols // 2 + 1)
+    # Below an eps of 1 not even the next pixel is a neighbour, and every run is a single pixel.
+    longest_run = n_cols if widths[0] >= 1 else 1
+    capacity = n_rows * (n_cols // 2 + 1 if widths[0] >= 1 else n_cols)
     starts = np.empty(capacity, dtype=np.int64)
     stops = np.empty(capacity, dtype=np.int64)
     n_runs = 0
@@ -72,11 +74,12 @@ def _label_core_pixels(core: NDArray[np.bool_], widths: NDArray[np.int64], clust
         while col < n_cols:
             if core[row, col]:
                 starts[n_runs] = col
-                while col < n_cols and core[row, col]:
+                while col < n_cols and core[row, col] and col - starts[n_runs] < longest_run:
                     col += 1
                 stops[n_runs] = col - 1
                 n_runs += 1
-            col += 1
+            else:
+                col += 1
         first_run[row + 1] = n_runs
     parents = np.arange(n_runs)
     for row in range(n_rows):

@@ -12,7 +12,7 @@ from armscan.anatomy import TissueClusters, landmark_reward
 from armscan.checks import check_choice, check_float
 from armscan.envs.actions import ActionBounds
 from armscan.envs.observations import SliceGeometry
-from armscan.errors import OptimalPlaneError
+from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, plane_distance, slid_into
 from armscan.volumes.volume import LabelVolume
 
@@ -98,6 +98,10 @@ class SceneSampler:
     transform: RandomTransform | None
     delta: float
     targets: Sequence[int]
+
+    def __post_init__(self) -> None:
+        if self.transform is not None and not isinstance(self.transform, RandomTransform):
+            raise InvalidValueError(f"transform is {self.transform!r}, but it must be a RandomTransform or None")
 
     def bounds(self, volume: LabelVolume) -> ActionBounds:
         """Returns the bounds that hold for every scene of a volume."""

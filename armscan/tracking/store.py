@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import warnings
 from pathlib import Path
 
 from filelock import FileLock
@@ -39,16 +40,23 @@ def open_store(uri: str, *, experiment: str, artifacts: str) -> tuple[MlflowClie
     for library in ("alembic", "mlflow"):
         logging.getLogger(library).setLevel(logging.WARNING)
     try:
-        if not uri.startswith(SQLITE_PREFIX):
-            return _open(uri, experiment, None if uri.startswith("http") else artifacts)
-        # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
-        database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
-        database.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
-            return _open(f"{SQLITE_PREFIX}{database}", experiment, artifacts)
+        with warnings.catch_warnings():
+            # SQLAlchemy tells MLflow's users of MLflow's own deprecated calls.
+            warnings.simplefilter("ignore")
+            return _open_locked(uri, experiment, artifacts)
     except (MlflowException, SQLAlchemyError, OSError, ModuleNotFoundError) as error:
         reason = " ".join(str(error).split())[:300]
         raise TrackingError(f"tracking.uri is {uri!r}, but this store cannot be used: {reason}") from error
+
+
+def _open_locked(uri: str, experiment: str, artifacts: str) -> tuple[MlflowClient, str]:
+    if not uri.startswith(SQLITE_PREFIX):
+        return _open(uri, experiment, None if uri.startswith("http") else artifacts)
+    # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
+    database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
+    database.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
+        return _open(f"{SQLITE_PREFIX}{database}", experiment, artifacts)
 
 
 def _open(uri: str, experiment: str, artifacts: str | None) -> tuple[MlflowClient, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -92,20 +92,19 @@ class Evaluation:
         return statistics.fmean(map(figure, self.episodes)) if self.episodes else float("nan")
 
 
-def evaluate(agent: Agent, env: Env, volume_names: Iterable[str], *, n_episodes: int, seed: int) -> Evaluation:
-    """Plays episodes on each volume in turn.
+def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluation:
+    """Plays episodes on each of the environment's volumes in turn.
 
     Args:
         agent: plays them.
-        env: holds the volumes.
-        volume_names: which volumes.
+        env: an `ArmscanEnv`, with or without wrappers.
         n_episodes: how many episodes; a multiple of the number of volumes treats them alike.
         seed: of the first episode, the next has the next seed: the same seed gives the same episodes to every agent.
 
     Returns:
         The episodes.
     """
-    names = list(volume_names)
+    names = list(env.get_wrapper_attr("volumes"))
     count = check_int("episodes", n_episodes, at_least=1)
     return Evaluation(tuple(_play(agent, env, names[i % len(names)], seed + i) for i in range(count)))
 

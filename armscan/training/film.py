@@ -15,18 +15,19 @@ MAX_COLOURS = 64
 MAX_ATTEMPTS = 20
 
 
-def film_episode(agent: Agent, env: Env, path: Path, *, volume_name: str, seed: int) -> None:
-    """Plays one episode that does not start solved and writes it as an animated GIF, its last frame held longer.
+def film_episode(agent: Agent, env: Env, path: Path, *, seed: int) -> None:
+    """Plays an episode on the first volume and writes it as an animated GIF, its last frame held longer.
 
     Args:
         agent: plays it.
         env: made with `render_mode="rgb_array"`.
         path: the file, ending in `.gif`.
-        volume_name: which volume.
-        seed: of the episode; the next one is tried where its episode starts solved, a few times.
+        seed: of the episode; where it starts solved, that of the next one is tried, a few times.
     """
     for attempt in range(MAX_ATTEMPTS):
-        observation, info = env.reset(seed=seed + attempt, options={"volume": volume_name})
+        observation, info = env.reset(
+            seed=seed + attempt, options={"volume": next(iter(env.get_wrapper_attr("volumes")))}
+        )
         if not info["starts_solved"]:
             break
     frames = [_picture(env)]

@@ -110,11 +110,10 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
     labels = np.asarray(labels)
     if labels.ndim != 3 or 0 in labels.shape:
         raise VolumeError(f"{name}: the image has shape {labels.shape}, but a labelmap must be 3-D and not empty")
+    if not np.issubdtype(labels.dtype, np.integer) and not np.issubdtype(labels.dtype, np.floating):
+        raise VolumeError(f"{name}: holds values of type {labels.dtype}, but a labelmap holds whole numbers")
     allowed = ", ".join(f"{label} {tissue}" for label, tissue in LABEL_NAMES.items())
-    whole = np.issubdtype(labels.dtype, np.integer) or (
-        np.issubdtype(labels.dtype, np.floating) and bool((labels == np.floor(labels)).all())
-    )
-    if not whole:
+    if np.issubdtype(labels.dtype, np.floating) and not (labels == np.floor(labels)).all():
         raise VolumeError(
             f"{name}: holds {labels.dtype} values between {labels.min():g} and {labels.max():g} that are not whole "
             f"numbers: grey values? A labelmap holds {allowed}"

@@ -59,7 +59,7 @@ def _generator_version() -> str:
 
 
 def _read(path: Path, seed: int) -> LabelVolume:
-    with np.load(path, allow_pickle=False) as arrays:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         return LabelVolume(
             arrays["labels"],
             tuple(arrays["spacing"].tolist()),

@@ -1,0 +1,89 @@
+"""What many tests need: volumes, an environment's arguments, a folder for cached phantoms."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+DATA = Path(__file__).parent / "data"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def phantom_cache(tmp_path_factory):
+    """Keeps the tests' phantoms out of the user's cache, for this process and those it starts."""
+    folder = tmp_path_factory.mktemp("phantoms")
+    os.environ["ARMSCAN_CACHE"] = str(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def data_folder():
+    """Four full-size labelmaps with their manifest."""
+    return DATA / "volumes"
+
+
+@pytest.fixture(scope="session")
+def dataset(data_folder):
+    from armscan.volumes import read_dataset
+
+    return read_dataset(data_folder)
+
+
+@pytest.fixture(scope="session")
+def golden():
+    """What an independent implementation saw in slices of these labelmaps."""
+    with np.load(DATA / "golden" / "slices_full.npz") as arrays:
+        return dict(arrays)
+
+
+@pytest.fixture(scope="session")
+def phantom():
+    from armscan.volumes import load_phantom
+
+    return load_phantom(0)
+
+
+@pytest.fixture(scope="session")
+def tiny_volume():
+    """A small block of every landmark, spaced differently along each axis."""
+    return make_tiny_volume()
+
+
+def make_tiny_volume(name="tiny", optimal_action=None):
+    from armscan.volumes import LabelVolume
+
+    labels = np.zeros((30, 20, 12), dtype=np.uint8)
+    labels[5:12, 4:15, 2:5] = 1
+    labels[14:20, 2:18, 5:8] = 2
+    labels[22:26, :, 8:10] = 3
+    return LabelVolume(labels, (0.5, 0.7, 0.9), name, optimal_action=optimal_action)
+
+
+@pytest.fixture
+def write_labelmap(tmp_path):
+    """Writes labels, indexed [x, y, z], as an image file; returns its path."""
+    import SimpleITK
+
+    def write(name="wrist.nii.gz", labels=None, spacing=(0.3, 0.4, 0.5, 1.0)):
+        labels = make_tiny_volume().labels if labels is None else labels
+        image = SimpleITK.GetImageFromArray(np.ascontiguousarray(np.transpose(labels)), isVector=False)
+        image.SetSpacing(spacing[: image.GetDimension()])
+        path = tmp_path / name
+        SimpleITK.WriteImage(image, str(path))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def write_manifest(tmp_path):
+    """Writes the manifest beside the labelmaps of `write_labelmap`; returns the folder."""
+
+    def write(entries):
+        text = entries if isinstance(entries, str) else json.dumps(entries)
+        (tmp_path / "optimal_actions.json").write_text(text)
+        return tmp_path
+
+    return write

@@ -1,0 +1,238 @@
+"""The environment, as Gymnasium and as its own page describe it."""
+
+import json
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import armscan
+from armscan.envs import ArmscanEnv, ManipulatorAction, RandomTransform
+from armscan.errors import InvalidValueError, ManifestError, ResetNeededError, VolumeError
+
+OBSERVATIONS = ["action_reward", "cluster"]
+PROJECTIONS = ["x", "y", "xy", "zy", "full", ["rz", "tx"]]
+
+
+@pytest.fixture
+def env(phantom):
+    return ArmscanEnv([phantom])
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS, ids=str)
+@pytest.mark.parametrize("observation", OBSERVATIONS)
+@pytest.mark.parametrize("wrappers", [{}, {"stack": 3}, {"memory": 2}, {"stack": 2, "memory": 3}], ids=str)
+def test_env_passes_the_checker_without_a_warning(phantom, observation, projection, wrappers):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        arguments = {"volumes": [phantom], "observation": observation, "projection": projection}
+        env = gym.make(armscan.ENV_ID, **arguments, **wrappers)
+        check_env(env.unwrapped, skip_render_check=True)
+        # The checker insists on the bare environment; the passive one inside `make` watches the wrapped one.
+        env.reset(seed=0)
+        for _ in range(3):
+            observed, _, terminated, _, _ = env.step(env.action_space.sample())
+            assert env.observation_space.contains(observed)
+            if terminated:
+                env.reset()
+
+
+def test_make_without_arguments_gives_phantoms():
+    env = gym.make(armscan.ENV_ID)
+    observed, info = env.reset(seed=0)
+    assert env.observation_space.contains(observed)
+    assert info["volume"].startswith("phantom-")
+
+
+def test_env_reads_the_volumes_of_a_folder(data_folder):
+    env = ArmscanEnv(data_folder)
+    assert list(env.volumes) == [f"0000{number}_labels.nii.gz" for number in (1, 2, 3, 4)]
+
+
+def play(env, seed, n_steps=30):
+    """Everything that an episode or two show, drawn from the environment's own generator."""
+    env.action_space.seed(seed)
+    observed, info = env.reset(seed=seed)
+    trace = [observed.tolist(), info["volume"], info["translation_mm"].tolist()]
+    for _ in range(n_steps):
+        observed, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        trace += [observed.tolist(), reward, terminated, truncated, info["distance_mm"], info["distance_deg"]]
+        if terminated or truncated:
+            observed, info = env.reset()
+            trace += [observed.tolist(), info["volume"]]
+    return trace
+
+
+def test_env_with_the_same_seed_plays_the_same_episode(dataset, env):
+    first, second = (ArmscanEnv(dataset, projection="zy", start="random") for _ in range(2))
+    assert play(first, 5) == play(second, 5)
+    assert play(first, 5) != play(first, 6)
+
+
+def test_env_with_the_same_seed_plays_the_same_episode_in_another_process(env):
+    script = (
+        "import json, sys; from armscan.envs import ArmscanEnv; from armscan.volumes import load_phantom\n"
+        "from tests.envs.test_env import play\n"
+        "print(json.dumps(play(ArmscanEnv([load_phantom(0)]), 5, 5), default=bool))"
+    )
+    answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert json.loads(answer.stdout) == json.loads(json.dumps(play(env, 5, 5), default=bool))
+
+
+def test_env_terminates_above_minus_delta_at_the_optimum(phantom):
+    env = ArmscanEnv([phantom], projection="full")
+    env.reset(seed=0)
+    _, reward, terminated, truncated, info = env.step(env.scene.optimum_normalised)
+    assert (reward > -0.05, terminated, truncated, info["is_success"]) == (True, True, False, True)
+    assert (info["distance_mm"], info["distance_deg"]) == pytest.approx((0.0, 0.0), abs=1e-4)
+
+
+@pytest.mark.parametrize("max_steps", [1, 3])
+def test_env_truncates_at_exactly_max_steps(phantom, max_steps):
+    env = ArmscanEnv([phantom], max_steps=max_steps)
+    env.reset(seed=0)
+    ends = [env.step(np.array([-1.0]))[2:4] for _ in range(max_steps)]
+    assert ends == [(False, False)] * (max_steps - 1) + [(False, True)]
+
+
+def test_env_does_not_truncate_a_success_on_the_last_step(phantom):
+    env = ArmscanEnv([phantom], max_steps=1)
+    env.reset(seed=0)
+    assert env.step(env.scene.optimum_normalised[3:])[2:4] == (True, False)
+
+
+def test_env_keeps_the_fixed_components_at_the_optimum(phantom):
+    env = ArmscanEnv([phantom], projection="y")
+    env.reset(seed=3)
+    for ty in (-0.7, 0.1):
+        env.step(np.array([ty]))
+        rotation, (tx, _) = env.plane.rotation, env.plane.translation
+        assert rotation == pytest.approx(env.scene.optimum.rotation)
+        assert tx == pytest.approx(env.scene.optimum.translation[0])
+
+
+def test_env_starts_in_the_middle_or_at_random(phantom):
+    assert ArmscanEnv([phantom], projection="zy").reset(seed=0)[1]["action"].tolist() == [0, 0]
+    starts = [ArmscanEnv([phantom], projection="zy", start="random").reset(seed=s)[1]["action"] for s in range(20)]
+    assert np.ptp(starts, axis=0).min() > 1
+
+
+def test_env_says_when_an_episode_starts_solved(dataset):
+    env = ArmscanEnv(dataset)
+    solved = []
+    for seed in range(40):
+        _, info = env.reset(seed=seed)
+        assert info["starts_solved"] == info["is_success"]
+        solved.append(info["starts_solved"])
+        info = env.step(np.array([0.0]))[4]
+        assert info["starts_solved"] == solved[-1]
+    assert 0 < sum(solved) < 40
+
+
+def test_env_computes_clusters_once_a_step(env, monkeypatch):
+    from armscan.envs import env as module
+
+    calls = []
+    from_slice = module.TissueClusters.from_slice
+    monkeypatch.setattr(module.TissueClusters, "from_slice", lambda s: calls.append(1) or from_slice(s))
+    env.reset(seed=0)
+    calls.clear()
+    env.step(np.array([0.3]))
+    assert len(calls) == 1
+
+
+def test_env_shows_what_it_rewards(phantom):
+    env = ArmscanEnv([phantom], transform=None, projection="full")
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(np.array([0.1, 0.0, -1.0, 0.2]))
+    assert info["rotation_deg"].tolist() == pytest.approx([18.0, 0.0])
+    np.testing.assert_array_equal(
+        env.slice_xz, phantom.slice(ManipulatorAction(info["rotation_deg"], info["translation_mm"]))
+    )
+    assert info["reward"] == reward
+
+
+def test_env_clips_actions_and_refuses_impossible_ones(env):
+    env.reset(seed=0)
+    assert env.step(np.array([7.0]))[4]["action"] == 1.0
+    for bad in ([np.nan], [np.inf], [0.0, 0.0], 0.5):
+        with pytest.raises(InvalidValueError, match=r"action is .*shape \(1,\)"):
+            env.step(np.array(bad))
+
+
+def test_env_needs_a_reset_before_and_after_an_episode(env):
+    with pytest.raises(ResetNeededError, match="reset"):
+        env.step(np.array([0.0]))
+    with pytest.raises(ResetNeededError, match="reset"):
+        _ = env.scene
+    env.reset(seed=0)
+    env.step(env.scene.optimum_normalised[3:])
+    with pytest.raises(ResetNeededError, match="reset"):
+        env.step(np.array([0.0]))
+
+
+def test_reset_takes_the_volume_as_an_option(dataset):
+    env = ArmscanEnv(dataset)
+    for name in dataset:
+        assert env.reset(seed=0, options={"volume": name})[1]["volume"] == name
+    with pytest.raises(InvalidValueError, match="reset option 'volume' is 'nobody'"):
+        env.reset(options={"volume": "nobody"})
+    with pytest.raises(InvalidValueError, match="reset option is speed"):
+        env.reset(options={"speed": 1})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"delta": 0}, "delta is 0"),
+        ({"delta": "a"}, "delta is 'a'"),
+        ({"max_steps": 0}, "max_steps is 0"),
+        ({"max_steps": 2.5}, "max_steps is 2.5"),
+        ({"start": "end"}, "start is 'end', but it must be middle or random"),
+        ({"targets": (4, 3)}, "targets is"),
+        ({"projection": "q"}, "projection is 'q'"),
+        ({"observation": "q"}, "observation is 'q'"),
+        ({"rotation_bounds_deg": (90,)}, "rotation_bounds_deg is"),
+        ({"rotation_bounds_deg": (400, 90)}, "rotation bound of rz"),
+        ({"translation_bounds_mm": 5}, "translation_bounds_mm is 5"),
+        ({"transform": 3}, "transform is 3"),
+        ({"render_mode": "sound"}, "render_mode is 'sound'"),
+        ({"volumes": []}, "volumes is empty"),
+        ({"volumes": [1]}, "volumes holds 1"),
+    ],
+)
+def test_env_refuses_impossible_arguments(phantom, arguments, message):
+    with pytest.raises(InvalidValueError, match=message):
+        ArmscanEnv(**({"volumes": [phantom]} | arguments))
+
+
+def test_env_refuses_two_volumes_of_one_name(phantom):
+    with pytest.raises(InvalidValueError, match="two of the same name"):
+        ArmscanEnv([phantom, phantom])
+
+
+def test_env_passes_on_what_is_wrong_with_a_folder(tmp_path, write_labelmap):
+    with pytest.raises(VolumeError, match="nowhere"):
+        ArmscanEnv(tmp_path / "nowhere")
+    write_labelmap()
+    with pytest.raises(ManifestError, match=r"optimal_actions\.json"):
+        ArmscanEnv(tmp_path)
+
+
+def test_importing_the_environment_loads_no_training_library():
+    script = (
+        "import sys, armscan, armscan.envs, armscan.anatomy, armscan.volumes\n"
+        "print([name for name in ('torch', 'tianshou', 'hydra', 'mlflow', 'optuna') if name in sys.modules])"
+    )
+    answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == "[]"
+
+
+def test_transform_about_the_first_voxel_can_be_chosen(phantom):
+    env = ArmscanEnv([phantom], transform=RandomTransform(centre="first_voxel", rz_deg=2.0))
+    env.reset(seed=0)
+    assert env.scene.transform.centre_mm == (0.0, 0.0, 0.0)

@@ -1,0 +1,74 @@
+"""What the agent gets to see."""
+
+import numpy as np
+import pytest
+
+from armscan.anatomy import Clusters, TissueClusters
+from armscan.envs import ActionRewardObservation, ClusterObservation, MergedObservation, SliceGeometry, View
+from armscan.envs.observations import flat_space, flattened, with_action_reward
+from armscan.errors import InvalidValueError
+
+GEOMETRY = SliceGeometry((361, 81), (0.27, 0.55))
+
+
+def view_of(bones, tendons, artery, geometry=GEOMETRY):
+    """A view of clusters given as lists of (across, depth, pixels)."""
+
+    def tissue(rows):
+        table = np.array(rows, dtype=float).reshape(-1, 3)
+        return Clusters(np.zeros(geometry.shape, np.int32), table[:, :2], table[:, 2].astype(int))
+
+    clusters = TissueClusters(tissue(bones), tissue(tendons), tissue(artery))
+    return View(np.zeros(geometry.shape, np.uint8), clusters, geometry, np.array([0.25]), -0.5)
+
+
+def test_cluster_observation_normalises_counts_sizes_and_centres():
+    view = view_of([(180, 40, 1000), (200, 50, 500)], [(180, 40, 250)], [])
+    features = ClusterObservation().observe(view)["clusters"].reshape(3, 4)
+    np.testing.assert_allclose(features[0], [2 / 4, 0.5, 10 * 0.27 / 25, 5 * 0.55 / 12], rtol=1e-6)
+    np.testing.assert_allclose(features[1], [1 / 3, 0.25, 0, 0], rtol=1e-6)
+    np.testing.assert_array_equal(features[2], 0)
+
+
+def test_cluster_observation_scales_sizes_by_pixel_area():
+    coarse = SliceGeometry((100, 40), (0.54, 1.1))
+    features = ClusterObservation().observe(view_of([(50, 20, 750)], [], [], coarse))["clusters"]
+    assert features[1] == pytest.approx(1.0)
+
+
+def test_cluster_observation_comes_raw_as_published():
+    view = view_of([(180, 40, 1000), (200, 50, 500)], [(7, 8, 9)], [])
+    features = ClusterObservation(normalised=False).observe(view)["clusters"]
+    np.testing.assert_array_equal(features, [2, 1500, 190, 45, 1, 9, 7, 8, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize("normalised", [True, False])
+def test_cluster_observation_space_holds_the_extremes_of_every_geometry(normalised):
+    other = SliceGeometry((50, 200), (1.0, 0.1))
+    observation = ClusterObservation(normalised=normalised)
+    space = observation.spaces([GEOMETRY, other], 1)["clusters"]
+    for geometry in (GEOMETRY, other):
+        for corner in ((0, 0), (geometry.shape[0] - 1, geometry.shape[1] - 1)):
+            view = view_of(*[[(*corner, geometry.shape[0] * geometry.shape[1])]] * 3, geometry)
+            assert space.contains(observation.observe(view)["clusters"])
+
+
+def test_flat_space_has_its_bounds_in_the_order_of_the_data():
+    observation = with_action_reward("cluster")
+    space = flat_space(observation.spaces([GEOMETRY], 1))
+    flat = flattened(observation.observe(view_of([], [], [])))
+    np.testing.assert_array_equal(flat[-2:], [0.25, -0.5])
+    np.testing.assert_array_equal(space.low[-2:], [-1, -1])
+    np.testing.assert_array_equal(space.high[-2:], [1, 0])
+    assert space.contains(flat)
+
+
+def test_merged_observations_refuse_duplicate_keys():
+    merged = MergedObservation([ActionRewardObservation(), ActionRewardObservation()])
+    with pytest.raises(InvalidValueError, match="both have the key action or reward"):
+        merged.spaces([GEOMETRY], 1)
+
+
+def test_with_action_reward_names_what_there_is():
+    with pytest.raises(InvalidValueError, match="observation is 'slices', but it must be action_reward or cluster"):
+        with_action_reward("slices")

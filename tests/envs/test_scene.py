@@ -1,0 +1,113 @@
+"""How volumes are moved at reset, and where their optimal planes go."""
+
+import numpy as np
+import pytest
+
+from armscan.anatomy import TissueClusters, landmark_reward
+from armscan.envs import ManipulatorAction, RandomTransform
+from armscan.envs.scene import SceneSampler
+from armscan.errors import InvalidValueError, OptimalPlaneError
+from armscan.volumes import LabelVolume
+
+from ..conftest import make_tiny_volume
+
+
+def sampler(**changes):
+    arguments = {
+        "rotation_bounds_deg": (90.0, 45.0),
+        "translation_bounds_mm": None,
+        "transform": RandomTransform(),
+        "delta": 0.05,
+        "targets": (4, 3, 1),
+    }
+    return SceneSampler(**(arguments | changes))
+
+
+def test_scene_optimum_is_rewarded_and_within_the_bounds(dataset, phantom):
+    rng = np.random.default_rng(0)
+    for volume in (*dataset.values(), phantom):
+        for _ in range(25):
+            scene = sampler().draw(volume, rng)
+            clusters = TissueClusters.from_slice(volume.slice(scene.optimum, transform=scene.transform))
+            assert landmark_reward(clusters) > -0.05
+            assert (np.abs(scene.optimum_normalised) <= 1).all()
+            assert scene.distance(scene.optimum) == pytest.approx((0.0, 0.0), abs=1e-4)
+
+
+def test_scene_optimum_shows_the_labelled_plane(phantom):
+    """The moved optimum is the labelled plane: every pixel both pictures have is the same, but for the shift across."""
+    labelled = phantom.slice(phantom.optimal_action)
+    scene = sampler().draw(phantom, np.random.default_rng(1))
+    matrix, _offset_mm = scene.transform.plane_map(scene.optimum)
+    assert abs(matrix[:, 1] @ phantom.optimal_action.normal) == pytest.approx(1.0)
+    seen = TissueClusters.from_slice(phantom.slice(scene.optimum, transform=scene.transform))
+    assert seen.bones.n_points == pytest.approx(TissueClusters.from_slice(labelled).bones.n_points, rel=0.03)
+
+
+def test_scene_without_transform_is_the_volume_as_it_is(phantom):
+    scene = sampler(transform=None).draw(phantom, np.random.default_rng(0))
+    assert scene.transform is None
+    assert scene.optimum == phantom.optimal_action
+
+
+def test_bounds_do_not_depend_on_the_draw(phantom):
+    rng = np.random.default_rng(0)
+    assert len({sampler().draw(phantom, rng).bounds for _ in range(20)}) == 1
+
+
+def test_random_transform_stays_within_its_limits(phantom):
+    rng = np.random.default_rng(0)
+    drawn = [RandomTransform(rz_deg=3, rx_deg=1, tx_mm=0, ty_mm=7).draw(phantom, rng) for _ in range(200)]
+    values = np.array([[*transform.rotation, *transform.translation] for transform in drawn])
+    assert (np.abs(values).max(axis=0) <= [3, 1, 0, 7]).all()
+    assert (values.std(axis=0) > [1, 0.3, -1, 2]).all()
+    assert drawn[0].centre_mm == phantom.centre_mm
+
+
+def test_random_transform_about_the_first_voxel_as_published(phantom):
+    drawn = RandomTransform(centre="first_voxel").draw(phantom, np.random.default_rng(0))
+    np.testing.assert_array_equal(drawn.offset_mm, [*drawn.translation, 0.0])
+
+
+@pytest.mark.parametrize("bad", [{"rz_deg": -1}, {"tx_mm": float("nan")}, {"centre": "corner"}, {"rx_deg": "a"}])
+def test_random_transform_refuses_impossible_limits(bad):
+    with pytest.raises(InvalidValueError, match="transform"):
+        RandomTransform(**bad)
+
+
+def test_sampler_refuses_a_volume_without_a_labelled_plane():
+    with pytest.raises(OptimalPlaneError, match="tiny: has no labelled optimal plane"):
+        sampler().check(make_tiny_volume())
+
+
+def test_sampler_refuses_a_plane_that_does_not_score():
+    volume = make_tiny_volume(optimal_action=ManipulatorAction((0, 0), (0, 5)))
+    with pytest.raises(OptimalPlaneError, match=r"tiny: the labelled optimal plane scores -0\.\d+"):
+        sampler().check(volume)
+
+
+def test_sampler_refuses_bounds_that_do_not_hold_the_turned_plane(phantom):
+    rz = phantom.optimal_action.rotation[0]
+    with pytest.raises(OptimalPlaneError, match=r"phantom-0: the optimal plane has rz = .* it must be at least"):
+        sampler(rotation_bounds_deg=(abs(rz) + 9.0, 45.0)).check(phantom)
+    sampler(rotation_bounds_deg=(abs(rz) + 10.1, 45.0)).check(phantom)
+
+
+def test_sampler_refuses_a_plane_outside_the_volume(phantom):
+    moved = LabelVolume(phantom.labels, phantom.spacing, "moved", ManipulatorAction((0, 0), (0, 5000)))
+    with pytest.raises(OptimalPlaneError, match=r"moved: the optimal plane, .* misses the volume"):
+        sampler().check(moved)
+
+
+def test_sampler_gives_up_where_no_transform_keeps_the_plane_in_view(phantom):
+    with pytest.raises(OptimalPlaneError, match="phantom-0: no transform of 1000"):
+        sampler(translation_bounds_mm=(97.0, phantom.optimal_action.translation[1] + 0.01), delta=1e-9).draw(
+            phantom, _OutOfView()
+        )
+
+
+class _OutOfView:
+    """A random generator that always moves the hand out of the picture."""
+
+    def uniform(self, _low, high):
+        return high * [0, 0, 40, -40]

@@ -1,0 +1,92 @@
+"""Frame stack and best-action memory."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from armscan.envs import ArmscanEnv, BestActionMemory, make_armscan_env
+from armscan.errors import InvalidValueError
+
+
+def test_stack_holds_the_last_observations_and_is_filled_with_the_first(phantom):
+    bare, stacked = make_armscan_env([phantom]), make_armscan_env([phantom], stack=3)
+    size = bare.observation_space.shape[0]
+    first, _ = bare.reset(seed=1)
+    observed, _ = stacked.reset(seed=1)
+    np.testing.assert_array_equal(observed, np.tile(first, 3))
+    latest = [first, first, first]
+    for action in (-0.9, -0.5, 0.9):
+        latest = [*latest[1:], bare.step(np.array([action]))[0]]
+        observed = stacked.step(np.array([action]))[0]
+        np.testing.assert_array_equal(observed.reshape(3, size), latest)
+
+
+class Scripted(gym.Env):
+    """Gives the rewards it is told."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, rewards):
+        self._rewards = iter(rewards)
+
+    def _answer(self, action):
+        self._reward = next(self._rewards)
+        return np.zeros(2, np.float32), {"action": np.float32(action), "reward": self._reward}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._answer([0.0])
+
+    def step(self, action):
+        observed, info = self._answer(action)
+        return observed, self._reward, False, False, info
+
+
+def remembered(observed):
+    return np.round(observed[2:].reshape(-1, 2).astype(float), 6).tolist()
+
+
+def test_memory_keeps_the_best_pairs_best_first_and_the_earlier_of_equals():
+    env = BestActionMemory(Scripted([-0.5, -0.75, -0.5, -0.25, -0.25, -0.5]), 3)
+    observed, _ = env.reset()
+    assert remembered(observed) == [[0.0, -0.5]] * 3
+    # Worse than the worst kept, and as good as it: neither enters.
+    assert remembered(env.step(np.array([0.1]))[0]) == [[0.0, -0.5]] * 3
+    assert remembered(env.step(np.array([0.2]))[0]) == [[0.0, -0.5]] * 3
+    assert remembered(env.step(np.array([0.3]))[0]) == [[0.3, -0.25], [0.0, -0.5], [0.0, -0.5]]
+    assert remembered(env.step(np.array([0.4]))[0]) == [[0.3, -0.25], [0.4, -0.25], [0.0, -0.5]]
+    assert remembered(env.step(np.array([0.5]))[0]) == [[0.3, -0.25], [0.4, -0.25], [0.0, -0.5]]
+
+
+def test_memory_is_emptied_at_reset():
+    env = BestActionMemory(Scripted([-0.5, -0.25, -0.75]), 2)
+    env.reset()
+    env.step(np.array([0.3]))
+    assert remembered(env.reset()[0]) == [[0.0, -0.75]] * 2
+
+
+def test_memory_follows_the_stack(phantom):
+    env = make_armscan_env([phantom], projection="zy", stack=2, memory=3)
+    assert env.observation_space.shape == (2 * 15 + 3 * 3,)
+    observed, info = env.reset(seed=0)
+    np.testing.assert_allclose(observed[-3:], [*info["action"], info["reward"]], rtol=1e-6)
+    assert env.observation_space.contains(observed)
+
+
+def test_memory_remembers_clipped_actions(phantom):
+    env = make_armscan_env([phantom], memory=1)
+    env.reset(seed=1)
+    _, reward, *_ = env.step(np.array([5.0]))
+    assert reward <= env.get_wrapper_attr("_pairs")[0, -1]
+    assert np.abs(env.get_wrapper_attr("_pairs")[:, :-1]).max() <= 1
+
+
+@pytest.mark.parametrize("arguments", [{"stack": 0}, {"stack": 1.5}, {"memory": -1}, {"memory": "a"}])
+def test_make_refuses_impossible_wrappers(phantom, arguments):
+    with pytest.raises(InvalidValueError, match=f"{next(iter(arguments))} is"):
+        make_armscan_env([phantom], **arguments)
+
+
+def test_make_without_wrappers_gives_the_bare_environment(phantom):
+    assert isinstance(make_armscan_env([phantom]), ArmscanEnv)
