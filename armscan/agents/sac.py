@@ -52,10 +52,10 @@ class SAC:
     """Training environments that are stepped side by side."""
 
     random_env_steps: int = 2_000
-    """Steps with random actions before the first update."""
+    """Steps with random actions before the first update, rounded up to as many for each environment."""
 
     env_steps_per_collection: int = 16
-    """Environment steps between two rounds of updates; raised to `num_envs`, each of which takes one at least."""
+    """Environment steps between two rounds of updates, rounded up to as many for each environment."""
 
     updates_per_env_step: float = 0.25
     """Gradient steps for each environment step; they are what training costs."""
@@ -89,7 +89,7 @@ class SAC:
                 num_training_envs=self.num_envs,
                 num_test_envs=1,
                 buffer_size=min(self.buffer_size, setup.total_env_steps + self.num_envs),
-                collection_step_num_env_steps=max(self.env_steps_per_collection, self.num_envs),
+                collection_step_num_env_steps=self._rounded_up(self.env_steps_per_collection),
                 update_step_num_gradient_steps_per_sample=self.updates_per_env_step,
                 batch_size=self.batch_size,
             ),
@@ -111,4 +111,8 @@ class SAC:
         )
         builder.with_actor_factory(self.network.actor_factory())
         builder.with_common_critic_factory(self.network.critic_factory())
-        return TianshouLearner(builder.build(), random_env_steps=self.random_env_steps)
+        return TianshouLearner(builder.build(), random_env_steps=self._rounded_up(self.random_env_steps))
+
+    def _rounded_up(self, n_env_steps: int) -> int:
+        """The next multiple of the number of environments, which Tianshou takes in any case."""
+        return math.ceil(n_env_steps / self.num_envs) * self.num_envs

@@ -38,4 +38,5 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise CheckpointError(f"{path}: there is no such checkpoint") from error
     # torch reports a damaged file by whichever of its readers meets the damage first.
     except Exception as error:
-        raise CheckpointError(f"{path}: is no checkpoint, or damaged ({str(error).splitlines()[0]})") from error
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise CheckpointError(f"{path}: is no checkpoint, or damaged ({reason})") from error

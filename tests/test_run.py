@@ -1,0 +1,185 @@
+"""The command, as a person types it."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from mlflow import MlflowClient
+
+from armscan import run
+from armscan.multirun import Multirun
+
+SMALL = [
+    "data.n_training=1",
+    "data.n_held_out=1",
+    "training.env_steps=400",
+    "training.epoch_env_steps=200",
+    "training.test_episodes=2",
+    "evaluation.episodes=3",
+    "env.max_steps=8",
+    "agent.random_env_steps=100",
+    "agent.batch_size=32",
+    "network.hidden_sizes=[16]",
+]
+REPOSITORY = Path(__file__).parent.parent
+
+
+def armscan_run(*arguments, cwd, **environment):
+    """Runs the command in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "armscan.run", *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        env=os.environ | environment,
+        check=False,
+    )
+
+
+def runs_in(folder):
+    client = MlflowClient(tracking_uri=f"sqlite:///{folder}/mlruns.db")
+    experiment = client.get_experiment_by_name("armscan")
+    return client, client.search_runs([experiment.experiment_id])
+
+
+@pytest.fixture
+def answer(tmp_path, monkeypatch, capsys):
+    """Runs the command in this process, in an empty folder; returns its exit code and what it printed."""
+
+    def command(*arguments):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["armscan.run", *arguments])
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+        monkeypatch.setattr(Multirun, "folder", None)
+        GlobalHydra.instance().clear()
+        try:
+            code = run.main()
+        except SystemExit as leaving:
+            code = leaving.code
+        return code, capsys.readouterr().err.strip()
+
+    return command
+
+
+def test_run_trains_evaluates_and_tracks(tmp_path):
+    ended = armscan_run(*SMALL, "seed=3", cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr == ""
+    for word in ("400/400 steps", "return", "success", "left", "held-out volumes", "mlflow ui", "episode.gif"):
+        assert word in ended.stdout
+    client, (tracked,) = runs_in(tmp_path)
+    assert tracked.info.status == "FINISHED"
+    assert tracked.data.params["network.hidden_sizes"] == "[16]"
+    assert tracked.data.params["env.transform.rz_deg"] == "10.0"
+    assert {"git.commit", "git.dirty", "overrides"} <= tracked.data.tags.keys()
+    for volumes in ("training_volumes", "held_out_volumes"):
+        for figure in ("success_rate", "mean_steps", "mean_distance_mm", "mean_distance_deg"):
+            assert f"{volumes}/{figure}" in tracked.data.metrics
+    steps = [point.step for point in client.get_metric_history(tracked.info.run_id, "test/mean_return")]
+    assert steps == sorted(set(steps))
+    assert steps[-1] >= 400
+    artifacts = {file.path for file in client.list_artifacts(tracked.info.run_id)}
+    assert artifacts == {"best.pt", "last.pt", "config.yaml", "episode.gif", "evaluation.json", "learning_curve.png"}
+    (folder,) = (tmp_path / "outputs").glob("*/*")
+    evaluation = json.loads((folder / "evaluation.json").read_text())
+    assert len(evaluation["held-out volumes"]["episodes"]) == 3
+
+
+def test_run_of_the_same_seed_gives_the_same_figures(tmp_path):
+    for _ in range(2):
+        assert armscan_run(*SMALL, "seed=3", cwd=tmp_path).returncode == 0
+    first, second = (
+        {name: value for name, value in tracked.data.metrics.items() if name not in ("wall_s", "speed/env_steps_per_s")}
+        for tracked in runs_in(tmp_path)[1]
+    )
+    assert first == second
+
+
+def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_path):
+    varied = ["-m", "obs=cluster,action_reward", "env.delta=0.05,7"]
+    ended = armscan_run(*varied, "projection=zy", "stack=2", "memory=1", *SMALL, cwd=tmp_path)
+    assert ended.returncode == 1
+    assert "Traceback" not in ended.stderr
+    assert "delta is 7, but it must be a finite number above 0 and at most 1" in ended.stderr
+    assert "again alone: python -m armscan.run obs=cluster env.delta=7" in ended.stderr
+    tracked = runs_in(tmp_path)[1]
+    (parent,) = [each for each in tracked if each.info.run_name.startswith("multirun")]
+    children = [each for each in tracked if each is not parent]
+    assert parent.info.status == "FAILED"
+    assert [child.data.tags["mlflow.parentRunId"] for child in children] == [parent.info.run_id] * 2
+    assert {child.info.status for child in children} == {"FINISHED"}
+    assert {child.data.tags["choice.obs"] for child in children} == {"cluster", "action_reward"}
+    assert len(list((tmp_path / "multirun").glob("*/*/*/best.pt"))) == 2
+
+
+def test_run_on_labelmap_files(tmp_path, data_folder):
+    arguments = ["data=nifti", f"data.path={data_folder}", *(word for word in SMALL if not word.startswith("data."))]
+    ended = armscan_run(*arguments, cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    assert runs_in(tmp_path)[1][0].data.tags["choice.data"] == "nifti"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["obs=foo"], "obs is 'foo', but it must be action_reward or cluster"),
+        (["agent=foo"], "agent is 'foo', but it must be sac"),
+        (["agent.lrr=1"], "there is no key 'lrr' in agent, but only network, lr, "),
+        (["agnet=sac"], "there is no key 'agnet' at the top, but only data, obs, agent, "),
+        (["+agent.foo=1"], "there is no key 'foo' in agent, but only "),
+        (["data=nifti", "data.pth=x"], "there is no key 'pth' in data, but only path, held_out or split_seed"),
+        (["data=nifti"], "data.path is not set"),
+        (["data=nifti", "data.path=/nowhere"], "/nowhere: the folder of volumes does not exist"),
+        (["seed=["], "'seed=[' cannot be read: what follows the options must be key=value"),
+        (["foo"], "'foo' cannot be read"),
+        (["obs=null"], "Config group override must be a string or a list"),
+        (["obs=cluster,action_reward"], "obs=cluster,action_reward gives several values, which needs -m"),
+        (["seed=-1"], "seed is -1, but it must be a whole number of at least 0"),
+        (["stack=0"], "stack is 0, but it must be a whole number of at least 1"),
+        (["projection=q"], "projection is 'q', but it must be x, y, xy, zy or full, or a list of rz, rx, tx or ty"),
+        (["env.transform=3"], "transform is 3, but it must be a RandomTransform or None"),
+        (["agent.lr=fast"], "agent.lr is 'fast', but it must be a finite number above 0"),
+        (["training.env_steps=abc"], "training.env_steps is 'abc', but it must be a whole number of at least 1"),
+        (["device=tpu"], "device is 'tpu', but it must be cpu or cuda"),
+        (["tracking.uri=./mlruns"], "tracking.uri is './mlruns', but this store cannot be used"),
+        (["-m", "obs=cluster,foo"], "obs is 'foo', but it must be action_reward or cluster"),
+        (["-m", "seed=1,2", "tracking.uri=./mlruns"], "tracking.uri is './mlruns', but this store cannot be used"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_run_answers_a_mistake_in_one_line_and_leaves_nothing(answer, tmp_path, arguments, line):
+    few_phantoms = [] if "data=nifti" in arguments else ["data.n_training=1", "data.n_held_out=1"]
+    code, printed = answer(*arguments, *few_phantoms)
+    assert code == 2
+    assert printed.startswith(f"error: {line}")
+    assert len(printed.splitlines()) == 1
+    assert {file.name for file in tmp_path.iterdir()} <= {"mlruns.db", "mlruns.db.lock"}
+
+
+def test_run_shows_what_is_wrong_with_a_volume(answer, tmp_path, write_labelmap, write_manifest):
+    path = write_labelmap("wrist.nii.gz")
+    path.write_bytes(path.read_bytes()[:-10])
+    folder = write_manifest({"wrist.nii.gz": {"rotation": [0, 0], "translation": [0, 5]}})
+    code, printed = answer("data=nifti", f"data.path={folder}")
+    assert code == 2
+    assert printed.startswith(f"error: {path}: the file is truncated or damaged")
+    assert {file.name for file in tmp_path.iterdir()} == {"wrist.nii.gz", "optimal_actions.json"}
+
+
+def test_run_works_from_the_wheel_without_the_repository(tmp_path):
+    wheel_folder, installed = tmp_path / "wheel", tmp_path / "installed"
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", wheel_folder, REPOSITORY], check=True)
+    (wheel,) = wheel_folder.iterdir()
+    with zipfile.ZipFile(wheel) as contents:
+        configs = {name for name in contents.namelist() if name.endswith(".yaml")}
+    assert configs == {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "armscan" / "conf").rglob("*.yaml")}
+    subprocess.run([*pip, "install", "--no-deps", "--target", installed, wheel], check=True)
+    ended = armscan_run(*SMALL, cwd=tmp_path, PYTHONPATH=str(installed), PYTHONSAFEPATH="1")
+    assert ended.returncode == 0, ended.stderr
+    assert (installed / "armscan" / "run.py").is_file()

@@ -1,0 +1,123 @@
+"""Runs in MLflow, on a real SQLite store."""
+
+import subprocess
+import sys
+
+import pytest
+
+from armscan.errors import TrackingError
+from armscan.tracking import TrackedRun, draw_learning_curve, open_store, source_tags
+from armscan.tracking.run import flattened
+from armscan.training import EpochReport
+
+from ..training.test_train import evaluation_of
+
+REPORTS = [
+    EpochReport(
+        epoch=epoch,
+        n_env_steps=100 * epoch,
+        wall_s=1.0 * epoch,
+        metrics={"train/length": 9.0 / epoch, "train/return": -3.0},
+        evaluation=evaluation_of(9 // epoch),
+        is_best=True,
+    )
+    for epoch in (1, 2, 3)
+]
+
+
+@pytest.fixture
+def store(tmp_path):
+    return open_store(f"sqlite:///{tmp_path}/runs.db", experiment="test", artifacts=str(tmp_path / "artifacts"))
+
+
+def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
+    client, experiment_id = store
+    config = {"agent": {"lr": 0.1, "sizes": [1, 2]}, "seed": 3}
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "best.pt").write_text("weights")
+    with TrackedRun(client, experiment_id, name="n", config=config, tags={"overrides": "seed=3"}) as tracked:
+        tracked.on_start(300)
+        for report in REPORTS:
+            tracked.on_epoch(report)
+        tracked.on_end()
+        tracked.keep_results(REPORTS, {"held-out volumes": evaluation_of(2, 4)}, folder)
+    run = client.get_run(tracked.run_id)
+    assert run.info.status == "FINISHED"
+    assert run.data.params == {"agent.lr": "0.1", "agent.sizes": "[1, 2]", "seed": "3"}
+    assert run.data.tags["overrides"] == "seed=3"
+    assert run.data.tags["git.commit"] == source_tags()["git.commit"]
+    assert run.data.metrics["held_out_volumes/mean_steps"] == 3.0
+    history = client.get_metric_history(tracked.run_id, "test/mean_steps")
+    assert [(point.step, point.value) for point in history] == [(100, 9.0), (200, 4.0), (300, 3.0)]
+    files = {file.path for file in client.list_artifacts(tracked.run_id)}
+    assert files == {"best.pt", "config.yaml", "evaluation.json", "learning_curve.png"}
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), "KILLED"), (ValueError("no"), "FAILED")])
+def test_tracked_run_says_how_it_ended(store, error, status):
+    client, experiment_id = store
+
+    def fail():
+        with TrackedRun(client, experiment_id, name="n", config={}, tags={}) as tracked:
+            ids.append(tracked.run_id)
+            raise error
+
+    ids = []
+    with pytest.raises(type(error)):
+        fail()
+    run = client.get_run(ids[0])
+    assert run.info.status == status
+    assert run.data.tags["failure"]
+
+
+def test_runs_are_children_of_their_parent(store):
+    client, experiment_id = store
+    with TrackedRun(client, experiment_id, name="parent", config={}, tags={}) as parent:
+        pass
+    with TrackedRun(client, experiment_id, name="child", config={}, tags={}, parent_id=parent.run_id):
+        pass
+    (child,) = client.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{parent.run_id}'")
+    assert child.info.run_name == "child"
+
+
+def test_many_processes_may_open_a_fresh_store_at_once(tmp_path):
+    script = (
+        "import sys; from armscan.tracking import open_store\n"
+        "print(open_store(sys.argv[1], experiment='test', artifacts='artifacts')[1])"
+    )
+    command = [sys.executable, "-c", script, f"sqlite:///{tmp_path}/fresh.db"]
+    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, cwd=tmp_path) for _ in range(4)]
+    answers = {process.communicate()[0] for process in processes}
+    assert [process.returncode for process in processes] == [0] * 4
+    assert len(answers) == 1
+
+
+@pytest.mark.parametrize("uri", ["./mlruns", "nonsense://x", "sqlite:////proc/no/runs.db"])
+def test_open_store_names_a_store_that_cannot_be_used(uri):
+    with pytest.raises(TrackingError, match=r"tracking\.uri is"):
+        open_store(uri, experiment="test", artifacts="artifacts")
+
+
+def test_open_store_names_a_damaged_store(tmp_path):
+    (tmp_path / "runs.db").write_bytes(b"no database at all" * 100)
+    with pytest.raises(TrackingError, match="not a database"):
+        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="test", artifacts="artifacts")
+
+
+def test_flattened_gives_dotted_keys_and_keeps_lists():
+    assert flattened({"a": {"b": 1, "c": {"d": None}}, "e": [1, 2], "f": {}}) == {
+        "a.b": 1,
+        "a.c.d": None,
+        "e": "[1, 2]",
+        "f": "{}",
+    }
+
+
+def test_learning_curve_is_a_picture(tmp_path):
+    from PIL import Image
+
+    draw_learning_curve(REPORTS, tmp_path / "curve.png", title="test")
+    with Image.open(tmp_path / "curve.png") as picture:
+        assert picture.size[0] > 600
+        assert len(picture.convert("RGB").getcolors(100_000)) > 20
