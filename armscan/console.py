@@ -115,5 +115,5 @@ def print_jobs(outcomes: Mapping[str, Outcome]) -> None:
     for number, outcome in outcomes.items():
         held_out = outcome.figures.get(HELD_OUT, {})
         figures = [f"{held_out['success_rate']:.1%}", f"{held_out['mean_steps']:.2f}"] if held_out else ["-", "-"]
-        table.add_row(number, outcome.varied, "failed" if outcome.failure else "done", *figures)
+        table.add_row(number, outcome.varied, "failed" if outcome.is_failed else outcome.failure or "done", *figures)
     Console().print(table)

@@ -6,7 +6,7 @@ import json
 import shlex
 import shutil
 import sys
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -20,7 +20,7 @@ from armscan.files import write_whole
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
-NO_OUTCOME = "ended without a word"
+NO_OUTCOME, INTERRUPTED = "ended without a word", "interrupted"
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,15 @@ class Outcome:
     varied: str
     failure: str | None = None
     figures: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    @property
+    def is_failed(self) -> bool:
+        """Whether something went wrong; to be interrupted is nobody's failure."""
+        return self.failure not in (None, INTERRUPTED)
+
+    def interrupted(self) -> Outcome:
+        """Returns the outcome of a job whose multirun was interrupted: its own, if it had one by then."""
+        return replace(self, failure=INTERRUPTED) if self.failure == NO_OUTCOME else self
 
 
 class Multirun(Callback):
@@ -112,8 +121,11 @@ class Job:
         write_whole(file, lambda opened: opened.write(json.dumps(asdict(outcome)).encode()))
 
 
-def end_multirun() -> int:
+def end_multirun(*, is_interrupted: bool = False) -> int:
     """Closes the parent run and shows what became of the jobs.
+
+    Args:
+        is_interrupted: whether somebody stopped the multirun.
 
     Returns:
         The exit code: 0 where every job succeeded, or where this was no multirun; 1 otherwise.
@@ -122,8 +134,11 @@ def end_multirun() -> int:
         return 0
     files = sorted((Multirun.folder / OUTCOME_FOLDER).glob("*.json"), key=lambda file: int(file.stem))
     outcomes = {file.stem: Outcome(**json.loads(file.read_text())) for file in files}
-    failed = {number: outcome for number, outcome in outcomes.items() if outcome.failure is not None}
-    has_runs = _close_parent(Multirun.folder, is_failed=bool(failed) or not outcomes)
+    if is_interrupted:
+        outcomes = {number: outcome.interrupted() for number, outcome in outcomes.items()}
+    failed = {number: outcome for number, outcome in outcomes.items() if outcome.is_failed}
+    status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
+    has_runs = _close_parent(Multirun.folder, status)
     if outcomes:
         from armscan.console import print_jobs
 
@@ -136,8 +151,12 @@ def end_multirun() -> int:
     return 1 if failed or not outcomes else 0
 
 
-def _close_parent(folder: Path, *, is_failed: bool) -> bool:
-    """Closes the parent run and what a killed job left open; deletes it where no job got as far as a run of its own."""
+def _close_parent(folder: Path, status: str) -> bool:
+    """Closes the parent run and what a killed job left open; deletes it where no job got as far as a run of its own.
+
+    Returns:
+        Whether a job got as far as that.
+    """
     from armscan.tracking import open_store
 
     word = json.loads((folder / PARENT_FILE).read_text())
@@ -145,9 +164,10 @@ def _close_parent(folder: Path, *, is_failed: bool) -> bool:
     children = client.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
     for child in children:
         if child.info.status == "RUNNING":
-            client.set_tag(child.info.run_id, "failure", NO_OUTCOME)
-            client.set_terminated(child.info.run_id, "FAILED")
-    client.set_terminated(word["run_id"], "FAILED" if is_failed else "FINISHED")
+            is_killed = status == "KILLED"
+            client.set_tag(child.info.run_id, "failure", INTERRUPTED if is_killed else NO_OUTCOME)
+            client.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
+    client.set_terminated(word["run_id"], status)
     if not children:
         client.delete_run(word["run_id"])
     return bool(children)

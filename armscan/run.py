@@ -16,6 +16,8 @@ import pickle
 import signal
 import subprocess
 import sys
+import threading
+import time
 import traceback
 from dataclasses import dataclass
 from functools import partial
@@ -29,13 +31,21 @@ from omegaconf import DictConfig, OmegaConf
 
 from armscan.checks import check_int
 from armscan.mistakes import mistake_in_one_line, quieten_libraries
-from armscan.multirun import NO_OUTCOME, Job, end_multirun, remove_run_folder
+from armscan.multirun import INTERRUPTED, NO_OUTCOME, Job, end_multirun, remove_run_folder
 
 if TYPE_CHECKING:
     from armscan.tracking import TrackedRun
 
 CHOICES_IN_TAGS = ("data", "obs", "agent", "network")
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
+# What a job's process runs; it may be interrupted while it is still importing.
+JOB_PROGRAM = """
+try:
+    from armscan.run import run_job
+    run_job()
+except KeyboardInterrupt:
+    raise SystemExit(130)
+"""
 # First seeds of the episodes that are played for each purpose, so that none is played for two.
 TEST_SEED, TRAINING_VOLUMES_SEED, HELD_OUT_VOLUMES_SEED, FILM_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
 
@@ -92,6 +102,8 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
 
     # Everything is built, and so checked, before anything is tracked.
+    if job is None:
+        print(f"preparing the volumes of data={invocation.choices['data']}", flush=True)
     split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
     make_env = instantiate(config.env, _convert_="object")
     training_env, held_out_env = make_env(split.training), make_env(split.held_out)
@@ -157,20 +169,26 @@ def run(config: DictConfig) -> None:
     if invocation.job is None:
         try:
             run_experiment(config, invocation)
+        except KeyboardInterrupt:
+            remove_if_empty(invocation.folder)
+            raise
         except Exception as error:
             remove_if_empty(invocation.folder)
             raise_or_exit(error)
     else:
         # A job that is killed, for its memory say, takes neither the launcher nor the other jobs with it.
         invocation.job.write_outcome(failure=NO_OUTCOME)
-        command = [sys.executable, "-c", "from armscan.run import run_job; run_job()"]
-        ended = subprocess.run(command, input=pickle.dumps((config, invocation)), check=False)
+        ended = subprocess.run(
+            [sys.executable, "-c", JOB_PROGRAM], input=pickle.dumps((config, invocation)), check=False
+        )
         if ended.returncode < 0:
             invocation.job.write_outcome(failure=f"killed by {signal.Signals(-ended.returncode).name}: out of memory?")
 
 
 def run_job() -> None:
     """One job of a multirun, handed over on standard input: a failure is noted, and does not stop the others."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    threading.Thread(target=leave_with_parent, args=(os.getppid(),), daemon=True).start()
     config, invocation = pickle.load(sys.stdin.buffer)
     job: Job = invocation.job
     try:
@@ -182,8 +200,18 @@ def run_job() -> None:
         remove_if_empty(invocation.folder)
         print(f"[{job.label}] failed: {line or repr(error)}", file=sys.stderr, flush=True)
         job.write_outcome(failure=line or repr(error))
+    except KeyboardInterrupt:
+        remove_if_empty(invocation.folder)
+        job.write_outcome(failure=INTERRUPTED)
     else:
         job.write_outcome(figures=figures)
+
+
+def leave_with_parent(parent_pid: int) -> None:
+    """Ends this process when the one that started it is gone, rather than going on for nobody."""
+    while os.getppid() == parent_pid:
+        time.sleep(1.0)
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def remove_if_empty(folder: Path) -> None:
@@ -207,12 +235,14 @@ def main() -> int:
         os.environ[WANTS_TRACEBACKS] = "1"
     # Hydra raises, so that its errors are answered here and not by Hydra.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    # Whoever ends a run, by Ctrl-C or by kill, finds it closed as killed in the tracking store.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     quieten_libraries()
     try:
         hydra.main(version_base="1.3", config_path="pkg://armscan.conf", config_name="config")(run)()
     except KeyboardInterrupt:
-        end_multirun()
-        print("interrupted", file=sys.stderr)
+        end_multirun(is_interrupted=True)
+        print(INTERRUPTED, file=sys.stderr)
         return 130
     except Exception as error:
         end_multirun()

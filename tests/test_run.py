@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 import zipfile
 from pathlib import Path
 
@@ -183,3 +185,51 @@ def test_run_works_from_the_wheel_without_the_repository(tmp_path):
     ended = armscan_run(*SMALL, cwd=tmp_path, PYTHONPATH=str(installed), PYTHONSAFEPATH="1")
     assert ended.returncode == 0, ended.stderr
     assert (installed / "armscan" / "run.py").is_file()
+
+
+@pytest.mark.parametrize("multirun", [[], ["-m", "seed=0,1"]], ids=["single", "multirun"])
+def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
+    command = [sys.executable, "-m", "armscan.run", *multirun, *SMALL, "training.env_steps=500000"]
+    with (tmp_path / "printed").open("w") as printed:
+        process = subprocess.Popen(
+            command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT, start_new_session=True
+        )
+    n_jobs = 2 if multirun else 1
+    deadline_s = time.monotonic() + 240
+    while (tmp_path / "printed").read_text().count("/500000 steps") < 2 * n_jobs:
+        assert process.poll() is None, (tmp_path / "printed").read_text()
+        assert time.monotonic() < deadline_s
+        time.sleep(0.5)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=60) == 130
+    output = (tmp_path / "printed").read_text()
+    assert output.rstrip().endswith("interrupted")
+    assert "Traceback" not in output
+    tracked = runs_in(tmp_path)[1]
+    assert {each.info.status for each in tracked} == {"KILLED"}
+    assert len(tracked) == n_jobs + bool(multirun)
+
+
+def test_killed_job_takes_no_other_with_it(tmp_path):
+    command = [sys.executable, "-m", "armscan.run", "-m", "seed=0,1", *SMALL, "training.env_steps=3000"]
+    with (tmp_path / "printed").open("w") as printed:
+        process = subprocess.Popen(command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT)
+    deadline_s = time.monotonic() + 240
+    while "[0 seed=0]" not in (tmp_path / "printed").read_text():
+        assert process.poll() is None
+        assert time.monotonic() < deadline_s
+        time.sleep(0.2)
+    os.kill(job_process_ids(process.pid)[0], signal.SIGKILL)
+    assert process.wait(timeout=240) == 1
+    output = (tmp_path / "printed").read_text()
+    assert output.count("killed by SIGKILL: out of memory?") == 1
+    assert "Traceback" not in output
+    statuses = sorted(each.info.status for each in runs_in(tmp_path)[1])
+    assert statuses == ["FAILED", "FAILED", "FINISHED"]
+
+
+def job_process_ids(launcher_pid):
+    """The processes of a multirun's jobs: the grandchildren of the launcher."""
+    listing = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True, check=True).stdout
+    parents = dict(map(int, line.split()) for line in listing.splitlines())
+    return [pid for pid, parent in parents.items() if parents.get(parent) == launcher_pid]
