@@ -26,27 +26,30 @@ def disc_half_widths(eps_px: float) -> NDArray[np.int64]:
     return widths
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _find_core_pixels(mask: NDArray[np.bool_], widths: NDArray[np.int64], min_samples: int) -> NDArray[np.bool_]:
     """Marks the pixels of the mask with at least `min_samples` pixels (themselves included) in their disc."""
     n_rows, n_cols = mask.shape
-    before = np.zeros((n_rows, n_cols + 1), dtype=np.int32)
+    reach, pad = widths.size - 1, widths[0]
+    # How many pixels of the mask lie before each column, with margins so that no disc leaves the table.
+    before = np.zeros((n_rows + 2 * reach, n_cols + 2 * pad + 1), dtype=np.int32)
     for row in range(n_rows):
+        line = before[row + reach]
         for col in range(n_cols):
-            before[row, col + 1] = before[row, col] + mask[row, col]
+            line[col + pad + 1] = line[col + pad] + mask[row, col]
+        line[n_cols + pad + 1 :] = line[n_cols + pad]
     core = np.zeros((n_rows, n_cols), dtype=np.bool_)
-    reach = widths.size - 1
+    counts = np.empty(n_cols, dtype=np.int32)
     for row in range(n_rows):
-        if before[row, n_cols] == 0:
-            continue
+        counts[:] = 0
+        # Row by row of the disc, for all columns at once: such loops run several pixels at a time.
+        for d in range(-reach, reach + 1):
+            width = widths[abs(d)]
+            line = before[row + reach + d]
+            for col in range(n_cols):
+                counts[col] += line[col + pad + width + 1] - line[col + pad - width]
         for col in range(n_cols):
-            if not mask[row, col]:
-                continue
-            count = 0
-            for other in range(max(0, row - reach), min(n_rows, row + reach + 1)):
-                width = widths[abs(other - row)]
-                count += before[other, min(n_cols, col + width + 1)] - before[other, max(0, col - width)]
-            core[row, col] = count >= min_samples
+            core[row, col] = mask[row, col] and counts[col] >= min_samples
     return core
 
 
