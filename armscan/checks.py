@@ -5,18 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, TypeVar
+
+import numpy as np
 
 from armscan.errors import InvalidValueError, listed
 
 T = TypeVar("T")
+# Seeds of every random generator in use fit.
+LARGEST_SEED = 2**31 - 1
 
 
-def check_int(name: str, value: Any, *, at_least: int) -> int:
-    """Returns `value` as an int if it is a whole number of at least `at_least`."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < at_least:
-        raise InvalidValueError(f"{name} is {value!r}, but it must be a whole number of at least {at_least}")
+def check_int(name: str, value: Any, *, at_least: int, at_most: int | None = None) -> int:
+    """Returns `value` as an int if it is a whole number within the given bounds."""
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not is_whole or value < at_least or (at_most is not None and value > at_most):
+        above = "" if at_most is None else f" and at most {at_most}"
+        raise InvalidValueError(f"{name} is {value!r}, but it must be a whole number of at least {at_least}{above}")
     return int(value)
+
+
+def check_seed(name: str, value: Any) -> int:
+    """Returns `value` if it can seed every random generator in use."""
+    return check_int(name, value, at_least=0, at_most=LARGEST_SEED)
 
 
 def check_float(
@@ -33,17 +45,9 @@ def check_float(
         for word, bound in (("above", above), ("at least", at_least), ("at most", at_most))
         if math.isfinite(bound)
     ]
-    is_number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    if not is_number or value <= above or value < at_least or value > at_most:
+    if not _is_finite(value) or value <= above or value < at_least or value > at_most:
         raise InvalidValueError(f"{name} is {value!r}, but it must be a finite number {' and '.join(bounds)}".rstrip())
     return float(value)
-
-
-def check_bool(name: str, value: Any) -> bool:
-    """Returns `value` if it is a bool."""
-    if not isinstance(value, bool):
-        raise InvalidValueError(f"{name} is {value!r}, but it must be true or false")
-    return value
 
 
 def check_choice(name: str, value: T, allowed: Sequence[T]) -> T:
@@ -55,10 +59,22 @@ def check_choice(name: str, value: T, allowed: Sequence[T]) -> T:
 
 def check_numbers(name: str, value: Any, length: int, meaning: str) -> tuple[float, ...]:
     """Returns `value` as a tuple of `length` finite floats; `meaning` says of what: '(rz, rx) in degrees'."""
-    try:
-        numbers = tuple(float(number) for number in value)
-    except (TypeError, ValueError):
-        numbers = ()
-    if len(numbers) != length or not all(map(math.isfinite, numbers)):
+    is_sequence = isinstance(value, list | tuple | np.ndarray)
+    if not is_sequence or len(value) != length or not all(map(_is_finite, value)):
         raise InvalidValueError(f"{name} is {value!r}, but it must be {length} finite numbers, {meaning}")
-    return numbers
+    return tuple(float(number) for number in value)
+
+
+def check_path(name: str, value: Any) -> Path:
+    """Returns `value` as a path if it is a text or a path."""
+    if not isinstance(value, str | Path):
+        raise InvalidValueError(f"{name} is {value!r}, but it must be the path of a file or folder")
+    return Path(value)
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether `value` is a number, not a truth value, that a float can hold."""
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:
+        return False

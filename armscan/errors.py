@@ -32,6 +32,10 @@ class ResetNeededError(ArmscanError, RuntimeError):
     """An environment was stepped or rendered without a running episode."""
 
 
+class DivergedError(ArmscanError, ArithmeticError):
+    """Learning has led to weights that are not finite."""
+
+
 class CheckpointError(ArmscanError, ValueError):
     """A checkpoint cannot be read, or belongs to another agent."""
 

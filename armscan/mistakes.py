@@ -95,13 +95,13 @@ def _composition_mistake(error: ConfigCompositionException) -> str:
     return text
 
 
-def _instantiation_mistake(error: InstantiationException) -> str | None:
+def _instantiation_mistake(error: InstantiationException) -> str:
     text = " ".join(str(error).split())
     if unexpected := re.search(r"unexpected keyword argument '(\w+)'.*full_key: (\S+)", text):
         key, parent = unexpected.groups()
         allowed = _keys_under(parent)
         return f"there is no key {key!r} in {parent}" + (f", but only {listed(allowed)}" if allowed else "")
-    return text if error.__cause__ is None or isinstance(error.__cause__, ImportError) else None
+    return f"{text} (HYDRA_FULL_ERROR=1 shows where)"
 
 
 def _keys_under(parent: str) -> list[str]:

@@ -29,13 +29,15 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.checks import check_int
+from armscan.checks import check_int, check_seed
+from armscan.errors import InvalidValueError
 from armscan.mistakes import mistake_in_one_line, quieten_libraries
 from armscan.multirun import INTERRUPTED, NO_OUTCOME, Job, end_multirun, remove_run_folder
 
 if TYPE_CHECKING:
     from armscan.tracking import TrackedRun
 
+SECTIONS = ("data", "obs", "agent", "network", "tracking", "env", "training", "evaluation")
 CHOICES_IN_TAGS = ("data", "obs", "agent", "network")
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
 # What a job's process runs; it may be interrupted while it is still importing.
@@ -98,7 +100,8 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     quieten_libraries()
     torch.set_num_threads(1)
     folder, job = invocation.folder, invocation.job
-    seed = check_int("seed", config.seed, at_least=0)
+    check_sections(config)
+    seed = check_seed("seed", config.seed)
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
 
     # Everything is built, and so checked, before anything is tracked.
@@ -130,6 +133,15 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
         print_results("results (deterministic policy of the best epoch)", evaluations)
         print_where_to_look(config, folder)
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
+
+
+def check_sections(config: DictConfig) -> None:
+    """Raises `InvalidValueError` where a whole section of the configuration was replaced by a value."""
+    for section in SECTIONS:
+        if not isinstance(config.get(section), DictConfig):
+            raise InvalidValueError(
+                f"{section} is {config.get(section)!r}, but it must be a section of the configuration"
+            )
 
 
 def tracked_run(config: DictConfig, invocation: Invocation) -> TrackedRun:

@@ -61,15 +61,20 @@ class SAC:
     """Gradient steps for each environment step; they are what training costs."""
 
     def __post_init__(self) -> None:
-        for name in ("lr", "entropy_lr", "initial_entropy_coefficient"):
-            check_float(f"agent.{name}", getattr(self, name), above=0.0)
-        check_float("agent.updates_per_env_step", self.updates_per_env_step, above=0.0)
-        check_float("agent.target_entropy_per_dim", self.target_entropy_per_dim)
+        for name in ("lr", "entropy_lr"):
+            check_float(f"agent.{name}", getattr(self, name), above=0.0, at_most=1.0)
+        for name in ("initial_entropy_coefficient", "updates_per_env_step"):
+            check_float(f"agent.{name}", getattr(self, name), above=0.0, at_most=1000.0)
+        check_float("agent.target_entropy_per_dim", self.target_entropy_per_dim, at_least=-1000.0, at_most=1000.0)
         for name in ("gamma", "tau"):
             check_float(f"agent.{name}", getattr(self, name), at_least=0.0, at_most=1.0)
         for field in fields(self):
             if field.type == "int":
                 check_int(f"agent.{field.name}", getattr(self, field.name), at_least=1)
+        if self.batch_size > self.buffer_size:
+            raise InvalidValueError(
+                f"agent.batch_size is {self.batch_size}, but it must be at most agent.buffer_size = {self.buffer_size}"
+            )
 
     def learner(self, setup: LearningSetup) -> TianshouLearner:
         """Makes an agent that has learned nothing yet.
@@ -77,10 +82,11 @@ class SAC:
         Raises:
             InvalidValueError: if the training takes no more steps than the random ones.
         """
-        if self.random_env_steps >= setup.total_env_steps:
+        n_random = self._rounded_up(self.random_env_steps)
+        if n_random >= setup.total_env_steps:
             raise InvalidValueError(
-                f"agent.random_env_steps is {self.random_env_steps}, but it must be below training.env_steps = "
-                f"{setup.total_env_steps}, or nothing is learned"
+                f"agent.random_env_steps is {self.random_env_steps}, {n_random} for {self.num_envs} environments, but "
+                f"it must be below training.env_steps = {setup.total_env_steps}, or nothing is learned"
             )
         builder = SACExperimentBuilder(
             ArmscanEnvFactory(setup.make_env),
@@ -111,7 +117,7 @@ class SAC:
         )
         builder.with_actor_factory(self.network.actor_factory())
         builder.with_common_critic_factory(self.network.critic_factory())
-        return TianshouLearner(builder.build(), random_env_steps=self._rounded_up(self.random_env_steps))
+        return TianshouLearner(builder.build(), random_env_steps=n_random)
 
     def _rounded_up(self, n_env_steps: int) -> int:
         """The next multiple of the number of environments, which Tianshou takes in any case."""

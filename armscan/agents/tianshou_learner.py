@@ -18,6 +18,7 @@ from tianshou.utils.logger.logger_base import BaseLogger
 
 from armscan.agents.protocols import EnvMaker
 from armscan.envs.observations import FloatVector
+from armscan.errors import DivergedError
 from armscan.volumes.plane import FloatArray
 
 
@@ -148,13 +149,30 @@ class TianshouLearner:
         self._collector.collect(n_step=self._random_env_steps, random=True)
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
-        """Learns for one epoch of at least `n_env_steps`; returns its training metrics by name."""
+        """Learns for one epoch of at least `n_env_steps`; returns its training metrics by name.
+
+        Raises:
+            DivergedError: if the weights are not finite afterwards.
+        """
         self._trainer.params.epoch_num_steps = n_env_steps
         n_before, start_s = self.n_env_steps, time.perf_counter()
-        self._trainer.execute_epoch()
+        try:
+            self._trainer.execute_epoch()
+        except ValueError as error:
+            # torch's distributions refuse the NaNs of a policy that has diverged.
+            self._check_weights(error)
+            raise
+        self._check_weights()
         metrics = self._metrics.take()
         metrics["speed/env_steps_per_s"] = (self.n_env_steps - n_before) / (time.perf_counter() - start_s)
         return metrics
+
+    def _check_weights(self, cause: ValueError | None = None) -> None:
+        if not all(torch.isfinite(weights).all() for weights in self._algorithm.parameters()):
+            raise DivergedError(
+                f"learning has diverged: after {self.n_env_steps} environment steps the networks' weights are not "
+                "finite any more; a smaller agent.lr or agent.entropy_lr may help"
+            ) from cause
 
     def act(self, observation: FloatVector) -> FloatArray:
         """Returns the deterministic policy's action, shape (n_free,)."""

@@ -110,7 +110,7 @@ def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED
 
 def checked_targets(targets: Sequence[int]) -> tuple[int, int, int]:
     """Returns the targets as a tuple of three ints, each at least 1."""
-    if isinstance(targets, str) or len(targets) != 3:
+    if isinstance(targets, str) or not isinstance(targets, Sequence) or len(targets) != 3:
         raise InvalidValueError(f"targets is {targets!r}, but it must be 3 whole numbers (bones, tendons, artery)")
     bones, tendons, artery = (check_int("each of targets", target, at_least=1) for target in targets)
     return bones, tendons, artery

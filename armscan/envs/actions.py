@@ -72,7 +72,8 @@ def free_components(projection: str | Sequence[str]) -> tuple[int, ...]:
             )
         names: tuple[str, ...] = PROJECTIONS[projection]
     else:
-        names = tuple(projection)
+        names = tuple(projection) if isinstance(projection, Sequence) else (str(projection),)
+        names = tuple(map(str, names))
     if not names or len(set(names)) != len(names) or not set(names) <= set(COMPONENTS):
         raise InvalidValueError(
             f"projection is {list(names)!r}, but it must be {listed(PROJECTIONS)}, "

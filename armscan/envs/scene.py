@@ -17,6 +17,7 @@ from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform,
 from armscan.volumes.volume import LabelVolume
 
 MAX_DRAWS = 1000
+MAX_SHIFT_MM = 10_000.0
 CENTRES = ("middle", "first_voxel")
 
 
@@ -43,7 +44,7 @@ class RandomTransform:
         for name in ("rz_deg", "rx_deg"):
             check_float(f"transform {name}", getattr(self, name), at_least=0.0, at_most=180.0)
         for name in ("tx_mm", "ty_mm"):
-            check_float(f"transform {name}", getattr(self, name), at_least=0.0)
+            check_float(f"transform {name}", getattr(self, name), at_least=0.0, at_most=MAX_SHIFT_MM)
         check_choice("transform centre", self.centre, CENTRES)
 
     def draw(self, volume: LabelVolume, rng: np.random.Generator) -> RigidTransform:

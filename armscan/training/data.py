@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from armscan.checks import check_int
+from armscan.checks import check_int, check_path, check_seed
 from armscan.errors import InvalidValueError, listed
 from armscan.volumes import LabelVolume, load_phantoms, read_dataset
 
@@ -46,7 +45,7 @@ def phantom_data(n_training: int = 16, n_held_out: int = 8, first_seed: int = 0,
             f"data.first_seed + data.n_training is {first_seed + n_training}, but it must be at most "
             f"{HELD_OUT_FIRST_SEED}, where the held-out phantoms begin"
         )
-    folder = Path(cache_dir) if cache_dir else None
+    folder = None if cache_dir is None else check_path("data.cache_dir", cache_dir)
     return Split(
         training=load_phantoms(range(first_seed, first_seed + n_training), folder),
         held_out=load_phantoms(range(HELD_OUT_FIRST_SEED, HELD_OUT_FIRST_SEED + n_held_out), folder),
@@ -64,17 +63,19 @@ def nifti_data(path: str, held_out: float | Sequence[str] = 0.25, split_seed: in
     Raises:
         InvalidValueError: if nothing would be left to train on, or to judge on.
     """
-    volumes = read_dataset(path)
+    volumes = read_dataset(check_path("data.path", path))
     names = list(volumes)
-    if isinstance(held_out, float | int):
+    if isinstance(held_out, float | int) and not isinstance(held_out, bool):
         if not 0 < held_out < 1:
             raise InvalidValueError(f"data.held_out is {held_out!r}, but as a share it must be above 0 and below 1")
-        drawn = np.random.default_rng(check_int("data.split_seed", split_seed, at_least=0)).permutation(len(names))
+        drawn = np.random.default_rng(check_seed("data.split_seed", split_seed)).permutation(len(names))
         chosen = {names[index] for index in drawn[: math.ceil(held_out * len(names))]}
     elif isinstance(held_out, str):
         chosen = {held_out}
-    else:
+    elif isinstance(held_out, Sequence) and all(isinstance(name, str) for name in held_out):
         chosen = set(held_out)
+    else:
+        raise InvalidValueError(f"data.held_out is {held_out!r}, but it must be a share, or a list of volumes' names")
     if unknown := sorted(chosen - set(names)):
         raise InvalidValueError(f"data.held_out names {listed(unknown)}, but {path} holds {listed(names)}")
     if not chosen or len(chosen) == len(names):

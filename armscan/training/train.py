@@ -64,6 +64,8 @@ class Budget:
     def __post_init__(self) -> None:
         for name in ("env_steps", "epoch_env_steps", "test_episodes"):
             check_int(f"training.{name}", getattr(self, name), at_least=1)
+        if self.solved is not None and not isinstance(self.solved, SolvedCriterion):
+            raise InvalidValueError(f"training.solved is {self.solved!r}, but it must be a SolvedCriterion or null")
         if self.epoch_env_steps > self.env_steps:
             raise InvalidValueError(
                 f"training.epoch_env_steps is {self.epoch_env_steps}, but it must be at most training.env_steps = "

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from armscan.checks import check_path
 from armscan.errors import InvalidValueError, ManifestError, VolumeError, listed
 from armscan.volumes.headers import CHECKS
 from armscan.volumes.plane import ManipulatorAction
@@ -34,11 +35,14 @@ def read_dataset(path: str | Path) -> dict[str, LabelVolume]:
         VolumeError: if the folder or a file cannot be used.
         ManifestError: if the manifest is missing or damaged, or does not name the folder's volumes.
     """
-    folder = Path(path)
-    if not folder.is_dir():
-        what = "is a file, not a folder" if folder.exists() else "does not exist"
-        raise VolumeError(f"{folder}: the folder of volumes {what}")
-    files = {file.name: file for file in sorted(folder.iterdir()) if file.is_file() and volume_suffix(file)}
+    folder = check_path("the folder of volumes", path)
+    try:
+        if not folder.is_dir():
+            what = "is a file, not a folder" if folder.exists() else "does not exist"
+            raise VolumeError(f"{folder}: the folder of volumes {what}")
+        files = {file.name: file for file in sorted(folder.iterdir()) if file.is_file() and volume_suffix(file)}
+    except OSError as error:
+        raise VolumeError(f"{folder}: the folder of volumes cannot be read ({error.strerror})") from error
     if not files:
         raise VolumeError(f"{folder}: the folder holds no volume (files ending in {listed(CHECKS)})")
     manifest = folder / MANIFEST_NAME
@@ -56,15 +60,24 @@ def read_dataset(path: str | Path) -> dict[str, LabelVolume]:
 
 def _read_manifest(manifest: Path) -> dict[str, Any]:
     try:
-        entries = json.loads(manifest.read_text(encoding="utf-8"))
+        entries = json.loads(manifest.read_text(encoding="utf-8"), object_pairs_hook=_without_duplicates)
     except FileNotFoundError as error:
         raise ManifestError(f"{manifest}: the manifest with the volumes' optimal planes does not exist") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ManifestError(f"{manifest}: the manifest cannot be read as JSON ({error})") from error
     if not isinstance(entries, dict):
         raise ManifestError(
             f"{manifest}: is a {type(entries).__name__}, but it must be an object with an entry a volume"
         )
+    return entries
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Refuses what JSON allows and everybody regrets: a key that is there twice, the first one forgotten."""
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the key {max(names, key=names.count)!r} is there twice")
     return entries
 
 

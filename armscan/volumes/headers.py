@@ -18,6 +18,8 @@ from typing import BinaryIO
 from armscan.errors import VolumeError
 
 TEXT_HEADER_BYTES = 65536
+# Bytes of a voxel by the code of its type; the header's own figure can be anything and is not what is read.
+NIFTI_VOXEL_BYTES = {2: 1, 4: 2, 8: 4, 16: 4, 64: 8, 256: 1, 512: 2, 768: 4, 1024: 8, 1280: 8}
 
 
 def check_nifti(path: Path) -> None:
@@ -31,19 +33,20 @@ def check_nifti(path: Path) -> None:
     for order in "<>":
         if len(header) >= 348 and struct.unpack_from(f"{order}i", header)[0] == 348:
             dims = struct.unpack_from(f"{order}8h", header, 40)
-            bits_per_voxel = struct.unpack_from(f"{order}h", header, 72)[0]
+            type_code = struct.unpack_from(f"{order}h", header, 70)[0]
             spacing = struct.unpack_from(f"{order}8f", header, 76)[1:4]
             offset = struct.unpack_from(f"{order}f", header, 108)[0]
             break
         if len(header) >= 540 and struct.unpack_from(f"{order}i", header)[0] == 540:
             dims = struct.unpack_from(f"{order}8q", header, 16)
-            bits_per_voxel = struct.unpack_from(f"{order}h", header, 14)[0]
+            type_code = struct.unpack_from(f"{order}h", header, 12)[0]
             spacing = struct.unpack_from(f"{order}8d", header, 104)[1:4]
             offset = struct.unpack_from(f"{order}q", header, 168)[0]
             break
     else:
         raise VolumeError(f"{path}: the file does not begin with a NIfTI header")
-    expected = offset + math.prod(dims[1 : 1 + dims[0]]) * bits_per_voxel // 8
+    # Any other type is no labelmap's, and is refused after reading.
+    expected = offset + math.prod(dims[1 : 1 + dims[0]]) * NIFTI_VOXEL_BYTES.get(type_code, 1)
     if not n_bytes >= expected:
         raise VolumeError(
             f"{path}: the file is truncated: it holds {n_bytes} bytes, but its header promises {expected:g}"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armscan.checks import check_path
 from armscan.errors import VolumeError, listed
 from armscan.volumes.headers import CHECKS
 from armscan.volumes.plane import ManipulatorAction
@@ -43,16 +44,16 @@ def read_volume(
     # Deferred: it takes long to load, and who steps through phantoms never needs it.
     import SimpleITK
 
-    path = Path(path)
+    path = check_path("the volume's file", path)
     suffix = volume_suffix(path)
     if suffix is None:
         raise VolumeError(f"{path}: a volume is read from {listed(CHECKS)}")
-    if not path.is_file():
-        raise VolumeError(f"{path}: there is no such file")
-    if sorted(axes) != ["x", "y", "z"]:
+    if not isinstance(axes, str) or sorted(axes) != ["x", "y", "z"]:
         raise VolumeError(f"{path}: axes is {axes!r}, but it must be the letters x, y and z in some order")
     SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
     try:
+        if not path.is_file():
+            raise VolumeError(f"{path}: there is no such file")
         CHECKS[suffix](path)
         image = SimpleITK.ReadImage(str(path))
     except OSError as error:

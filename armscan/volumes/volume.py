@@ -123,9 +123,8 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
         received = ", ".join(f"{value:g}" for value in present[:8]) + (", ..." if present.size > 8 else "")
         raise VolumeError(f"{name}: holds the values {received}, but a labelmap holds {allowed} only")
     checked = np.ascontiguousarray(labels, dtype=np.uint8)
-    present = np.flatnonzero(np.bincount(checked.ravel(), minlength=len(LABEL_NAMES)))
     for label in LANDMARK_LABELS:
-        if label not in present:
+        if not (checked == label).any():
             raise VolumeError(
                 f"{name}: no voxel is labelled {label} ({LABEL_NAMES[label]}), but every landmark must be there"
             )

@@ -8,7 +8,7 @@ import torch
 
 from armscan.agents import MLP, SAC, LearningSetup, checked_device
 from armscan.envs import make_armscan_env
-from armscan.errors import InvalidValueError
+from armscan.errors import DivergedError, InvalidValueError
 
 SMALL = {"num_envs": 2, "random_env_steps": 20, "batch_size": 16, "env_steps_per_collection": 4}
 
@@ -90,17 +90,30 @@ def test_replay_buffer_is_no_larger_than_the_training(make_learner):
     ("changes", "message"),
     [
         ({"lr": 0}, r"agent\.lr is 0"),
+        ({"lr": 1e300}, r"agent\.lr is 1e\+300"),
         ({"lr": "fast"}, r"agent\.lr is 'fast'"),
         ({"gamma": 1.5}, r"agent\.gamma is 1\.5"),
         ({"batch_size": 0}, r"agent\.batch_size is 0"),
         ({"num_envs": 2.5}, r"agent\.num_envs is 2\.5"),
         ({"updates_per_env_step": -1}, r"agent\.updates_per_env_step is -1"),
-        ({"random_env_steps": 100}, r"agent\.random_env_steps is 100, but it must be below"),
+        ({"random_env_steps": 100}, r"agent\.random_env_steps is 100, .* must be below"),
+        ({"random_env_steps": 1, "num_envs": 100}, r"agent\.random_env_steps is 1, 100 for 100 environments"),
+        ({"buffer_size": 10}, r"agent\.batch_size is 16, but it must be at most agent\.buffer_size = 10"),
     ],
 )
 def test_sac_refuses_impossible_parameters(make_learner, changes, message):
     with pytest.raises(InvalidValueError, match=message):
         make_learner(**changes)
+
+
+@pytest.mark.parametrize("part", ["policy.actor", "critic"])
+def test_learner_says_that_it_has_diverged(make_learner, part):
+    learner = make_learner()
+    learner.warm_up()
+    for weights in learner._algorithm.get_submodule(part).parameters():
+        weights.data.fill_(float("nan"))
+    with pytest.raises(DivergedError, match=r"learning has diverged: after \d+ environment steps"):
+        learner.learn(60)
 
 
 @pytest.mark.parametrize(

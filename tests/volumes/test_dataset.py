@@ -2,7 +2,7 @@
 
 import pytest
 
-from armscan.errors import ManifestError, VolumeError
+from armscan.errors import InvalidValueError, ManifestError, VolumeError
 from armscan.volumes import read_dataset
 
 PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
@@ -30,6 +30,12 @@ def test_read_dataset_names_a_missing_folder(tmp_path):
 def test_read_dataset_refuses_a_file_as_folder(write_labelmap):
     with pytest.raises(VolumeError, match="is a file, not a folder"):
         read_dataset(write_labelmap())
+
+
+@pytest.mark.parametrize("path", [None, 3, b"folder", "a" * 5000])
+def test_read_dataset_refuses_what_is_no_path(path):
+    with pytest.raises((VolumeError, InvalidValueError), match="folder"):
+        read_dataset(path)
 
 
 def test_read_dataset_refuses_an_empty_folder(tmp_path):
@@ -67,6 +73,11 @@ def test_read_dataset_names_a_file_without_an_entry(write_labelmap, write_manife
         ({"a.nii.gz": {**PLANE, "rotation": [1]}}, r"entry 'a.nii.gz': rotation is \[1\]"),
         ({"a.nii.gz": {**PLANE, "rotation": "ab"}}, r"entry 'a.nii.gz': rotation is 'ab'"),
         ('{"a.nii.gz": {"rotation": [NaN, 0], "translation": [0, 0]}}', r"entry 'a.nii.gz': rotation is \[nan, 0\]"),
+        ({"a.nii.gz": {**PLANE, "rotation": "12"}}, r"entry 'a.nii.gz': rotation is '12'"),
+        ({"a.nii.gz": {**PLANE, "rotation": ["1", "2"]}}, r"entry 'a.nii.gz': rotation is \['1', '2'\]"),
+        ({"a.nii.gz": {**PLANE, "rotation": [10**400, 0]}}, r"entry 'a.nii.gz': rotation is"),
+        ('{"a.nii.gz": {}, "a.nii.gz": {}}', r"the key 'a.nii.gz' is there twice"),
+        ("[" * 100_000, "cannot be read as JSON"),
         ({"a.nii.gz": {**PLANE, "axes": 3}}, r"entry 'a.nii.gz': axes is 3"),
     ],
 )

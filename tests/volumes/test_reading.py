@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from armscan.errors import VolumeError
+from armscan.errors import InvalidValueError, VolumeError
 from armscan.volumes import read_volume
 
 FORMATS = ["wrist.nii", "wrist.nii.gz", "wrist.nrrd", "wrist.mha", "wrist.mhd"]
@@ -32,15 +32,32 @@ def test_read_volume_brings_stored_axes_into_order(write_labelmap, tiny_volume):
     assert volume.spacing == pytest.approx((0.5, 0.7, 0.9))
 
 
-@pytest.mark.parametrize("axes", ["xy", "xxz", "abc", "xyzz"])
+@pytest.mark.parametrize("axes", ["xy", "xxz", "abc", "xyzz", None, 3])
 def test_read_volume_refuses_axes_that_are_no_order(write_labelmap, axes):
-    with pytest.raises(VolumeError, match=f"axes is '{axes}'"):
+    with pytest.raises(VolumeError, match=f"axes is {axes!r}"):
         read_volume(write_labelmap(), axes=axes)
 
 
 def test_read_volume_names_a_missing_file(tmp_path):
     with pytest.raises(VolumeError, match=r"nowhere\.nii: there is no such file"):
         read_volume(tmp_path / "nowhere.nii")
+
+
+@pytest.mark.parametrize("path", [None, 3, b"wrist.nii", "a" * 5000 + ".nii"])
+def test_read_volume_refuses_what_is_no_path(path):
+    with pytest.raises((VolumeError, InvalidValueError), match="file"):
+        read_volume(path)
+
+
+def test_read_volume_refuses_more_voxels_than_the_file_holds(write_labelmap):
+    """Even where the header understates the size of a voxel, so that its own sum comes out right."""
+    path = write_labelmap("wrist.nii")
+    damaged = bytearray(path.read_bytes())
+    struct.pack_into("<h", damaged, 46, 60)
+    struct.pack_into("<h", damaged, 72, 1)
+    path.write_bytes(damaged)
+    with pytest.raises(VolumeError, match=r"wrist\.nii: the file is truncated"):
+        read_volume(path)
 
 
 def test_read_volume_names_the_endings_it_reads(tmp_path):

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import platformdirs
 
+from armscan.errors import InvalidValueError
 from armscan.files import write_whole
 from armscan.volumes.phantom import generate, tube, wrist
 from armscan.volumes.plane import ManipulatorAction
@@ -39,8 +40,14 @@ def load_phantom(seed: int, cache_dir: Path | None = None) -> LabelVolume:
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
         # Not there, or damaged: a cached phantom can always be made again.
         volume = generate.make_phantom(seed)
+    try:
         _write(path, volume)
-        return volume
+    except OSError as error:
+        raise InvalidValueError(
+            f"{path.parent}: phantoms cannot be kept there ({error.strerror}); name another folder by data.cache_dir "
+            "or the environment variable ARMSCAN_CACHE"
+        ) from error
+    return volume
 
 
 def default_cache_dir() -> Path:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.checks import check_int
+from armscan.checks import check_seed
 from armscan.volumes.phantom.tube import Tube, fill_tube
 from armscan.volumes.phantom.wrist import draw_wrist
 from armscan.volumes.plane import FloatArray, ManipulatorAction, slid_into
@@ -77,9 +77,9 @@ def make_phantom(seed: int) -> LabelVolume:
         The volume, named `phantom-SEED`, with its optimal plane.
 
     Raises:
-        InvalidValueError: if the seed is not a whole number of at least 0.
+        InvalidValueError: if the seed is not a whole number from 0 to 2^31 - 1.
     """
-    rng = np.random.default_rng(check_int("seed", seed, at_least=0))
+    rng = np.random.default_rng(check_seed("seed", seed))
     pose = Pose.draw(rng)
     action = pose.optimal_action()
     plane = ManipulatorAction(pose.rotation, (0.0, 0.0))
