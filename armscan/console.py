@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -117,3 +118,22 @@ def print_jobs(outcomes: Mapping[str, Outcome]) -> None:
         figures = [f"{held_out['success_rate']:.1%}", f"{held_out['mean_steps']:.2f}"] if held_out else ["-", "-"]
         table.add_row(number, outcome.varied, "failed" if outcome.is_failed else outcome.failure or "done", *figures)
     Console().print(table)
+
+
+def print_where_to_look(folder: Path, tracking_uri: str, *, files: Sequence[str] = ("",)) -> None:
+    """Prints where the results lie, and the command that opens the UI over all runs.
+
+    Args:
+        folder: of the run or multirun.
+        tracking_uri: of the store.
+        files: what is worth looking at in the folder; the folder itself where none is named.
+    """
+    for file in files:
+        print(f"look at   {_from_here(folder / file)}")
+    print(f"all runs  {_from_here(Path(sys.executable))} -m mlflow ui --backend-store-uri {tracking_uri}")
+
+
+def _from_here(path: Path) -> Path:
+    """The path as one would type it in the current folder."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path

@@ -140,9 +140,12 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
     has_runs = _close_parent(Multirun.folder, status)
     if outcomes:
-        from armscan.console import print_jobs
+        from armscan.console import print_jobs, print_where_to_look
 
         print_jobs(outcomes)
+        if has_runs:
+            tracking_uri = json.loads((Multirun.folder / PARENT_FILE).read_text())["tracking"]["uri"]
+            print_where_to_look(Multirun.folder, tracking_uri)
     for number, outcome in failed.items():
         print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
         print(f"  again alone: python -m armscan.run {outcome.overrides}", file=sys.stderr)

@@ -94,7 +94,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     import torch
 
     from armscan.agents import LearningSetup, checked_device
-    from armscan.console import print_results, progress_reporter
+    from armscan.console import print_results, print_where_to_look, progress_reporter
     from armscan.training import HELD_OUT, TRAINED_ON, evaluate, film_episode, train
 
     quieten_libraries()
@@ -131,7 +131,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
         tracked.keep_results(result.reports, evaluations, folder)
     if job is None:
         print_results("results (deterministic policy of the best epoch)", evaluations)
-        print_where_to_look(config, folder)
+        print_where_to_look(folder, config.tracking.uri, files=("learning_curve.png", "episode.gif"))
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
 
 
@@ -162,17 +162,6 @@ def tracked_run(config: DictConfig, invocation: Invocation) -> TrackedRun:
         },
         parent_id=invocation.job.parent_run_id if invocation.job else None,
     )
-
-
-def print_where_to_look(config: DictConfig, folder: Path) -> None:
-    """Prints where the results are, and the command that opens the UI."""
-    here = Path.cwd()
-    shown = folder.relative_to(here) if folder.is_relative_to(here) else folder
-    program = Path(sys.executable)
-    command = program.relative_to(here) if program.is_relative_to(here) else program
-    print(f"learning curve   {shown / 'learning_curve.png'}")
-    print(f"film             {shown / 'episode.gif'}")
-    print(f"all runs         {command} -m mlflow ui --backend-store-uri {config.tracking.uri}")
 
 
 def run(config: DictConfig) -> None:

@@ -109,6 +109,7 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     assert "Traceback" not in ended.stderr
     assert "delta is 7, but it must be a finite number above 0 and at most 1" in ended.stderr
     assert "again alone: python -m armscan.run obs=cluster env.delta=7" in ended.stderr
+    assert "mlflow ui --backend-store-uri sqlite:///mlruns.db" in ended.stdout
     tracked = runs_in(tmp_path)[1]
     (parent,) = [each for each in tracked if each.info.run_name.startswith("multirun")]
     children = [each for each in tracked if each is not parent]
