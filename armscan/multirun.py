@@ -6,6 +6,7 @@ import json
 import shlex
 import shutil
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -20,6 +21,7 @@ from armscan.files import write_whole
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
+MAX_TAG_CHARS = 5000
 NO_OUTCOME, INTERRUPTED = "ended without a word", "interrupted"
 
 
@@ -138,7 +140,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         outcomes = {number: outcome.interrupted() for number, outcome in outcomes.items()}
     failed = {number: outcome for number, outcome in outcomes.items() if outcome.is_failed}
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
-    has_runs = _close_parent(Multirun.folder, status)
+    has_runs = _close_parent(Multirun.folder, status, failed)
     if outcomes:
         from armscan.console import print_jobs, print_where_to_look
 
@@ -154,7 +156,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     return 1 if failed or not outcomes else 0
 
 
-def _close_parent(folder: Path, status: str) -> bool:
+def _close_parent(folder: Path, status: str, failed: Mapping[str, Outcome]) -> bool:
     """Closes the parent run and what a killed job left open; deletes it where no job got as far as a run of its own.
 
     Returns:
@@ -170,6 +172,8 @@ def _close_parent(folder: Path, status: str) -> bool:
             is_killed = status == "KILLED"
             client.set_tag(child.info.run_id, "failure", INTERRUPTED if is_killed else NO_OUTCOME)
             client.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
+    for number, outcome in failed.items():
+        client.set_tag(word["run_id"], f"failure.{number}", f"{outcome.varied}: {outcome.failure}"[:MAX_TAG_CHARS])
     client.set_terminated(word["run_id"], status)
     if not children:
         client.delete_run(word["run_id"])

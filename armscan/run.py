@@ -36,7 +36,9 @@ from armscan.multirun import INTERRUPTED, NO_OUTCOME, Job, end_multirun, remove_
 
 if TYPE_CHECKING:
     from armscan.tracking import TrackedRun
+    from armscan.training import Split
 
+MAX_TAG_CHARS = 5000
 SECTIONS = ("data", "obs", "agent", "network", "tracking", "env", "training", "evaluation")
 CHOICES_IN_TAGS = ("data", "obs", "agent", "network")
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
@@ -105,8 +107,6 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
 
     # Everything is built, and so checked, before anything is tracked.
-    if job is None:
-        print(f"preparing the volumes of data={invocation.choices['data']}", flush=True)
     split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
     make_env = instantiate(config.env, _convert_="object")
     training_env, held_out_env = make_env(split.training), make_env(split.held_out)
@@ -120,7 +120,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     learner = instantiate(config.agent, _convert_="object").learner(setup)
     test = partial(evaluate, learner, held_out_env, n_episodes=budget.test_episodes, seed=TEST_SEED + seed)
 
-    with tracked_run(config, invocation) as tracked:
+    with tracked_run(config, invocation, split) as tracked:
         progress = progress_reporter(job.label if job else None)
         result = train(learner, budget, test, folder, callbacks=[progress, tracked])
         evaluations = {
@@ -128,9 +128,9 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
             HELD_OUT: evaluate(learner, held_out_env, n_episodes=n_episodes, seed=HELD_OUT_VOLUMES_SEED + seed),
         }
         film_episode(learner, film_env, folder / "episode.gif", seed=FILM_SEED + seed)
-        tracked.keep_results(result.reports, evaluations, folder)
+        tracked.keep_results(result, evaluations, folder)
     if job is None:
-        print_results("results (deterministic policy of the best epoch)", evaluations)
+        print_results(f"results (deterministic policy, as it was after {result.best.n_env_steps} steps)", evaluations)
         print_where_to_look(folder, config.tracking.uri, files=("learning_curve.png", "episode.gif"))
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
 
@@ -144,7 +144,7 @@ def check_sections(config: DictConfig) -> None:
             )
 
 
-def tracked_run(config: DictConfig, invocation: Invocation) -> TrackedRun:
+def tracked_run(config: DictConfig, invocation: Invocation, split: Split) -> TrackedRun:
     """Opens the tracking store and starts a run in it."""
     from armscan.tracking import TrackedRun, open_store
 
@@ -154,20 +154,35 @@ def tracked_run(config: DictConfig, invocation: Invocation) -> TrackedRun:
     return TrackedRun(
         client,
         experiment_id,
-        name=f"{choices['agent']}-{choices['obs']}-{resolved['projection']}-seed{resolved['seed']}",
+        name=run_name(resolved, choices),
         config=resolved,
         tags={
             "overrides": " ".join(invocation.overrides),
             **{f"choice.{group}": choices[group] for group in CHOICES_IN_TAGS},
+            "volumes.training": " ".join(split.training)[:MAX_TAG_CHARS],
+            "volumes.held_out": " ".join(split.held_out)[:MAX_TAG_CHARS],
         },
         parent_id=invocation.job.parent_run_id if invocation.job else None,
     )
+
+
+def run_name(config: dict[str, Any], choices: dict[str, str]) -> str:
+    """Returns what the UI calls a run: what most runs differ by."""
+    projection = config["projection"]
+    parts = [choices["agent"], choices["obs"], projection if isinstance(projection, str) else "+".join(projection)]
+    parts += [
+        f"{wrapper}{config[wrapper]}"
+        for wrapper, without in (("stack", 1), ("memory", 0))
+        if config[wrapper] != without
+    ]
+    return "-".join([*parts, choices["data"], f"seed{config['seed']}"])
 
 
 def run(config: DictConfig) -> None:
     """What Hydra calls: a single run, or one job of a multirun in a process of its own."""
     invocation = Invocation.current()
     if invocation.job is None:
+        print(f"preparing data={invocation.choices['data']}, agent={invocation.choices['agent']}", flush=True)
         try:
             run_experiment(config, invocation)
         except KeyboardInterrupt:

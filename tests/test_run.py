@@ -79,6 +79,8 @@ def test_run_trains_evaluates_and_tracks(tmp_path):
     assert tracked.data.params["network.hidden_sizes"] == "[16]"
     assert tracked.data.params["env.transform.rz_deg"] == "10.0"
     assert {"git.commit", "git.dirty", "overrides"} <= tracked.data.tags.keys()
+    assert tracked.info.run_name == "sac-cluster-y-phantom-seed3"
+    assert tracked.data.tags["volumes.held_out"] == "phantom-1000000"
     for volumes in ("training_volumes", "held_out_volumes"):
         for figure in ("success_rate", "mean_steps", "mean_distance_mm", "mean_distance_deg"):
             assert f"{volumes}/{figure}" in tracked.data.metrics
@@ -114,6 +116,7 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     (parent,) = [each for each in tracked if each.info.run_name.startswith("multirun")]
     children = [each for each in tracked if each is not parent]
     assert parent.info.status == "FAILED"
+    assert parent.data.tags["failure.1"].startswith("obs=cluster env.delta=7: delta is 7")
     assert [child.data.tags["mlflow.parentRunId"] for child in children] == [parent.info.run_id] * 2
     assert {child.info.status for child in children} == {"FINISHED"}
     assert {child.data.tags["choice.obs"] for child in children} == {"cluster", "action_reward"}

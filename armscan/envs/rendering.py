@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from armscan.envs.observations import View
 from armscan.envs.scene import Scene
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
-from armscan.volumes.volume import LabelVolume
+from armscan.volumes.volume import LABEL_NAMES, LabelVolume
 
 WIDTH, HEIGHT = 860, 480
 SLICE_BOX = (16, 48, 532, 292)
@@ -140,11 +140,14 @@ def _write_facts(draw: ImageDraw.ImageDraw, scene: Scene, plane: ManipulatorActi
     rz, rx, tx, ty = plane.to_array()
     draw.text((x, y), f"step {n_steps}    reward {view.reward:.3f}", fill=INK, font=_font(24))
     lines = (
-        f"{scene.volume.name}:  {bones} bones, {tendons} tendon groups, {artery} artery",
+        f"{scene.volume.name}:  clusters: bones {bones}, tendons {tendons}, artery {artery}",
         f"rz {rz:.1f}°, rx {rx:.1f}°,  tx {tx:.1f} mm, ty {ty:.1f} mm",
         f"{distance_mm:.1f} mm and {distance_deg:.1f}° from the optimal plane",
     )
     for row, line in enumerate(lines):
         draw.text((x, y + 42 + 24 * row), line, fill=INK, font=_font(16))
-    draw.text((x, y + 124), "current plane", fill=PLANE_INK, font=_font(15))
-    draw.text((x + 110, y + 124), "optimal plane", fill=OPTIMUM_INK, font=_font(15))
+    legend = [("current plane", PLANE_INK), ("optimal plane", OPTIMUM_INK)]
+    legend += [(name, tuple(TISSUE_INKS[label])) for label, name in LABEL_NAMES.items() if label > 0]
+    for text, ink in legend:
+        draw.text((x, y + 124), text, fill=ink, font=_font(15))
+        x += 16 + round(_font(15).getlength(text))

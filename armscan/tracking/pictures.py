@@ -29,6 +29,8 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
     ]
     if trained:
         lengths.plot(*zip(*trained, strict=True), marker=".", alpha=0.6, label="training, exploring")
+    best = [report for report in reports if report.is_best][-1]
+    lengths.axvline(best.n_env_steps, color="grey", linestyle=":", label=f"best epoch, kept: step {best.n_env_steps}")
     lengths.set_ylabel("mean steps an episode")
     lengths.set_ylim(bottom=0)
     lengths.legend()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,7 +15,7 @@ from mlflow.entities import Metric, Param
 
 from armscan.tracking.pictures import draw_learning_curve
 from armscan.tracking.source import source_tags
-from armscan.training import EpochReport, Evaluation
+from armscan.training import EpochReport, Evaluation, TrainingResult
 
 CONFIG_FILE, EVALUATION_FILE, CURVE_FILE = "config.yaml", "evaluation.json", "learning_curve.png"
 PARAMS_A_BATCH = 100
@@ -78,22 +78,23 @@ class TrackedRun:
         for file in files:
             self._client.log_artifact(self.run_id, str(file))
 
-    def keep_results(self, reports: Sequence[EpochReport], evaluations: Mapping[str, Evaluation], folder: Path) -> None:
+    def keep_results(self, result: TrainingResult, evaluations: Mapping[str, Evaluation], folder: Path) -> None:
         """Logs the final evaluations, and keeps what the run has made in its folder.
 
         Args:
-            reports: of the training's epochs.
+            result: of the training; the evaluations are logged at the step of its best epoch, whose weights they judge.
             evaluations: by the name of their volumes.
             folder: of the run; the learning curve's picture and the evaluations' figures are added to it.
         """
         for name, evaluation in evaluations.items():
             prefix = name.replace(" ", "_").replace("-", "_")
             figures = {f"{prefix}/{figure}": value for figure, value in evaluation.metrics().items()}
-            self.log_figures(figures, n_env_steps=reports[-1].n_env_steps)
+            self.log_figures(figures, n_env_steps=result.best.n_env_steps)
+        self.log_figures({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
         contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
         (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
         (folder / CONFIG_FILE).write_text(yaml.safe_dump(self._config, sort_keys=False))
-        draw_learning_curve(reports, folder / CURVE_FILE, title=self.name)
+        draw_learning_curve(result.reports, folder / CURVE_FILE, title=self.name)
         self.log_files(*sorted(file for file in folder.iterdir() if file.is_file()))
 
     def __enter__(self) -> Self:

@@ -66,11 +66,6 @@ class Budget:
             check_int(f"training.{name}", getattr(self, name), at_least=1)
         if self.solved is not None and not isinstance(self.solved, SolvedCriterion):
             raise InvalidValueError(f"training.solved is {self.solved!r}, but it must be a SolvedCriterion or null")
-        if self.epoch_env_steps > self.env_steps:
-            raise InvalidValueError(
-                f"training.epoch_env_steps is {self.epoch_env_steps}, but it must be at most training.env_steps = "
-                f"{self.env_steps}"
-            )
 
 
 @dataclass(frozen=True)
@@ -86,6 +81,11 @@ class TrainingResult:
     reports: tuple[EpochReport, ...]
     is_solved: bool
     wall_s: float
+
+    @property
+    def best(self) -> EpochReport:
+        """The epoch whose weights the learner holds."""
+        return [report for report in self.reports if report.is_best][-1]
 
 
 def train(
