@@ -194,6 +194,10 @@ class ArmscanEnv(gym.Env[FloatVector, FloatArray]):
         return draw_frame(self.scene, self._plane, self._view, self._n_steps)
 
     def _drawn_volume(self, options: dict[str, Any]) -> LabelVolume:
+        if not isinstance(options, dict):
+            raise InvalidValueError(
+                f"reset options are {options!r}, but they must be a dict such as {{'volume': name}}"
+            )
         if unknown := sorted(options.keys() - {"volume"}):
             raise InvalidValueError(f"reset option is {listed(unknown)}, but only 'volume' is known")
         if "volume" in options:

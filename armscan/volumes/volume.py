@@ -44,6 +44,10 @@ class LabelVolume:
     def __post_init__(self) -> None:
         object.__setattr__(self, "labels", _checked_labels(self.labels, self.name))
         object.__setattr__(self, "spacing", _checked_spacing(self.spacing, self.name))
+        if self.optimal_action is not None and not isinstance(self.optimal_action, ManipulatorAction):
+            raise VolumeError(
+                f"{self.name}: optimal_action is {self.optimal_action!r}, but it must be a ManipulatorAction or None"
+            )
 
     @property
     def shape(self) -> tuple[int, int, int]:

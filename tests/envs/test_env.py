@@ -181,6 +181,8 @@ def test_reset_takes_the_volume_as_an_option(dataset):
         assert env.reset(seed=0, options={"volume": name})[1]["volume"] == name
     with pytest.raises(InvalidValueError, match="reset option 'volume' is 'nobody'"):
         env.reset(options={"volume": "nobody"})
+    with pytest.raises(InvalidValueError, match="reset options are 'fast'"):
+        env.reset(options="fast")
     with pytest.raises(InvalidValueError, match="reset option is speed"):
         env.reset(options={"speed": 1})
 

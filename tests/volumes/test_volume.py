@@ -51,6 +51,11 @@ def test_volume_refuses_what_is_no_labelmap(labels, message):
         LabelVolume(labels, SPACING, "wrist")
 
 
+def test_volume_refuses_an_optimal_plane_that_is_none():
+    with pytest.raises(VolumeError, match=r"wrist: optimal_action is \(0, 1\)"):
+        LabelVolume(labels_with(1, 2, 3), SPACING, "wrist", optimal_action=(0, 1))
+
+
 @pytest.mark.parametrize("spacing", [(0, 1, 1), (-1, 1, 1), (np.nan, 1, 1), (np.inf, 1, 1), (1, 1), "abc", None])
 def test_volume_refuses_impossible_spacing(spacing):
     with pytest.raises(VolumeError, match="wrist: spacing is"):
