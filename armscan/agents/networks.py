@@ -39,7 +39,9 @@ class MLP:
     def __init__(self, hidden_sizes: Sequence[int] = (64, 64), activation: str = "relu") -> None:
         if isinstance(hidden_sizes, str) or not isinstance(hidden_sizes, Sequence):
             raise InvalidValueError(f"hidden_sizes is {hidden_sizes!r}, but it must be a list of whole numbers")
-        self.hidden_sizes = [check_int("each of hidden_sizes", size, at_least=1) for size in hidden_sizes]
+        self.hidden_sizes = [
+            check_int("each of hidden_sizes", size, at_least=1, at_most=65536) for size in hidden_sizes
+        ]
         self.activation = ACTIVATIONS[check_choice("activation", activation, list(ACTIVATIONS))]
 
     def actor_factory(self) -> ActorFactory:

@@ -26,7 +26,8 @@ class Tissue:
     usual_area_px: float
 
     def __post_init__(self) -> None:
-        check_float(f"{self.name}: eps_px", self.eps_px, above=0.0)
+        check_int(f"{self.name}: label", self.label, at_least=0, at_most=255)
+        check_float(f"{self.name}: eps_px", self.eps_px, above=0.0, at_most=1000.0)
         check_int(f"{self.name}: min_samples", self.min_samples, at_least=1)
 
 

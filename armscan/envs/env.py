@@ -145,11 +145,13 @@ class ArmscanEnv(gym.Env[FloatVector, FloatArray]):
     @property
     def plane(self) -> ManipulatorAction:
         """The current plane, in the moved volume's frame."""
+        _ = self.scene
         return self._plane
 
     @property
     def slice_xz(self) -> NDArray[np.uint8]:
         """The current slice, indexed [across, depth]."""
+        _ = self.scene
         return self._view.slice_xz
 
     def reset(
@@ -171,7 +173,10 @@ class ArmscanEnv(gym.Env[FloatVector, FloatArray]):
         """Places the plane; see the class for what comes back."""
         if not self._running:
             raise ResetNeededError("the episode has ended or not begun: call reset() before step()")
-        received = np.asarray(action, dtype=np.float64)
+        try:
+            received = np.asarray(action, dtype=np.float64)
+        except (TypeError, ValueError):
+            received = np.empty(0)
         if received.shape != self.action_space.shape or not np.isfinite(received).all():
             raise InvalidValueError(
                 f"action is {action!r}, but it must be an array of shape {self.action_space.shape} of finite numbers"
@@ -198,7 +203,7 @@ class ArmscanEnv(gym.Env[FloatVector, FloatArray]):
             raise InvalidValueError(
                 f"reset options are {options!r}, but they must be a dict such as {{'volume': name}}"
             )
-        if unknown := sorted(options.keys() - {"volume"}):
+        if unknown := sorted(map(str, options.keys() - {"volume"})):
             raise InvalidValueError(f"reset option is {listed(unknown)}, but only 'volume' is known")
         if "volume" in options:
             return self.volumes[check_choice("reset option 'volume'", options["volume"], self._names)]
@@ -244,7 +249,12 @@ def named_volumes(volumes: Volumes) -> dict[str, LabelVolume]:
         return load_phantoms(DEFAULT_PHANTOMS)
     if isinstance(volumes, str | Path):
         return read_dataset(volumes)
-    listed_volumes = list(volumes.values()) if isinstance(volumes, Mapping) else list(volumes)
+    if isinstance(volumes, Mapping):
+        listed_volumes = list(volumes.values())
+    elif isinstance(volumes, list | tuple):
+        listed_volumes = list(volumes)
+    else:
+        raise InvalidValueError(f"volumes is {volumes!r}, but it must be volumes by name or in a list, or a folder")
     if not listed_volumes:
         raise InvalidValueError("volumes is empty, but an environment needs at least one")
     for volume in listed_volumes:

@@ -166,7 +166,12 @@ def with_action_reward(observation: str | Observation) -> Observation:
         if observation not in OBSERVATIONS:
             raise InvalidValueError(f"observation is {observation!r}, but it must be {listed(OBSERVATIONS)}")
         observation = OBSERVATIONS[observation]()
-    if not callable(getattr(observation, "spaces", None)) or not callable(getattr(observation, "observe", None)):
+    is_class = isinstance(observation, type)
+    if (
+        is_class
+        or not callable(getattr(observation, "spaces", None))
+        or not callable(getattr(observation, "observe", None))
+    ):
         raise InvalidValueError(
             f"observation is {observation!r}, but it must be {listed(OBSERVATIONS)}, or an object with the methods of "
             "Observation"

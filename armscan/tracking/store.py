@@ -15,6 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from armscan.errors import TrackingError
 
 SQLITE_PREFIX = "sqlite:///"
+EXAMPLES = {"uri": "sqlite:///mlruns.db", "experiment": "armscan", "artifacts": "mlartifacts"}
 LOCK_TIMEOUT_S = 120
 # A server that is away should be said to be away within seconds, not after minutes of retries.
 HTTP_DEFAULTS = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2", "MLFLOW_HTTP_REQUEST_TIMEOUT": "20"}
@@ -34,6 +35,9 @@ def open_store(uri: str, *, experiment: str, artifacts: str) -> tuple[MlflowClie
     Raises:
         TrackingError: if the store cannot be reached or used.
     """
+    for name, value in (("uri", uri), ("experiment", experiment), ("artifacts", artifacts)):
+        if not isinstance(value, str) or not value.strip() or value == SQLITE_PREFIX:
+            raise TrackingError(f"tracking.{name} is {value!r}, but it must be a text such as {EXAMPLES[name]!r}")
     for name, value in HTTP_DEFAULTS.items():
         os.environ.setdefault(name, value)
     # The making of a new database is told table by table.

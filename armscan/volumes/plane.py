@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.checks import check_numbers
+from armscan.errors import InvalidValueError
 
 FloatArray = NDArray[np.float64]
 
@@ -52,7 +53,7 @@ class ManipulatorAction:
     @classmethod
     def from_array(cls, components: FloatArray) -> Self:
         """Builds the action from its four components (rz, rx, tx, ty) in degrees and mm."""
-        rz, rx, tx, ty = components
+        rz, rx, tx, ty = check_numbers("components", components, 4, "(rz, rx) in degrees and (tx, ty) in mm")
         return cls(rotation=(rz, rx), translation=(tx, ty))
 
     def to_array(self) -> FloatArray:
@@ -83,11 +84,19 @@ class RigidTransform:
         rotation: (rz, rx) in degrees, R = Rz(rz) Rx(rx).
         translation: t = (tx, ty) in mm; nothing moves in depth.
         centre_mm: c, the point that the rotation leaves in place.
+
+    Raises:
+        InvalidValueError: if a component is not a finite number.
     """
 
     rotation: tuple[float, float] = (0.0, 0.0)
     translation: tuple[float, float] = (0.0, 0.0)
     centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_numbers("rotation", self.rotation, 2, "(rz, rx) in degrees")
+        check_numbers("translation", self.translation, 2, "(tx, ty) in mm")
+        check_numbers("centre_mm", self.centre_mm, 3, "(x, y, z) in mm")
 
     @cached_property
     def matrix(self) -> FloatArray:
@@ -110,6 +119,9 @@ class RigidTransform:
 
         The result is the same set of points. Where the motion turns about X as well, the picture may be turned and
         shifted within the plane, because a `ManipulatorAction` has neither a rotation about Y nor a shift in depth.
+
+        Raises:
+            InvalidValueError: if the moved plane never meets the volume's floor z = 0, where every plane begins.
         """
         normal = self.matrix.T @ action.normal
         origin_mm = self.matrix.T @ (action.offset_mm - self.offset_mm)
@@ -121,6 +133,8 @@ class RigidTransform:
         moved = ManipulatorAction((wrapped_deg(np.rad2deg(rz)), wrapped_deg(np.rad2deg(rx))), (0.0, 0.0))
         if origin_mm[2] != 0.0:
             in_depth = moved.matrix[:, 2]
+            if abs(in_depth[2]) < 1e-9:
+                raise InvalidValueError(f"{action}, moved by {self}, lies parallel to the volume's floor and above it")
             origin_mm = origin_mm - origin_mm[2] / in_depth[2] * in_depth
         return ManipulatorAction(moved.rotation, (origin_mm[0], origin_mm[1]))
 

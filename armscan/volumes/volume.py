@@ -7,16 +7,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.checks import check_numbers
+from armscan.checks import check_int, check_numbers
 from armscan.errors import InvalidValueError, VolumeError
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
 from armscan.volumes.slicing import sample_plane
 
 LABEL_NAMES = {0: "background", 1: "bones", 2: "tendons", 3: "artery", 4: "nerve"}
 LANDMARK_LABELS = (1, 2, 3)
+LONGEST_SIDE_PX = 65536
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LabelVolume:
     """An integer labelmap of an arm with its spacing and, where one is known, the plane to find.
 
@@ -48,6 +49,10 @@ class LabelVolume:
             raise VolumeError(
                 f"{self.name}: optimal_action is {self.optimal_action!r}, but it must be a ManipulatorAction or None"
             )
+
+    def __repr__(self) -> str:
+        n_x, n_y, n_z = self.shape
+        return f"LabelVolume({self.name!r}, {n_x} x {n_y} x {n_z})"
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -95,12 +100,18 @@ class LabelVolume:
             The slice, indexed [across, depth], uint8; 0 where the plane is outside the volume.
 
         Raises:
-            InvalidValueError: if `shape` is not two whole numbers of at least 1.
+            InvalidValueError: if `shape` is not two whole numbers from 1 to 65536, or another argument of another type.
         """
+        if not isinstance(action, ManipulatorAction):
+            raise InvalidValueError(f"action is {action!r}, but it must be a ManipulatorAction")
+        if transform is not None and not isinstance(transform, RigidTransform):
+            raise InvalidValueError(f"transform is {transform!r}, but it must be a RigidTransform or None")
         if shape is None:
             shape = self.slice_shape
-        elif len(shape) != 2 or not all(isinstance(n, int | np.integer) and n >= 1 for n in shape):
-            raise InvalidValueError(f"shape is {shape!r}, but it must be 2 whole numbers of at least 1 (across, depth)")
+        elif not isinstance(shape, tuple | list) or len(shape) != 2:
+            raise InvalidValueError(f"shape is {shape!r}, but it must be 2 whole numbers (across, depth)")
+        for n_pixels in shape:
+            check_int(f"each of shape = {shape}", n_pixels, at_least=1, at_most=LONGEST_SIDE_PX)
         if transform is None:
             matrix, offset_mm = action.matrix, action.offset_mm
         else:

@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import armscan
-from armscan.envs import ArmscanEnv, ManipulatorAction, RandomTransform
+from armscan.envs import ArmscanEnv, ClusterObservation, ManipulatorAction, RandomTransform
 from armscan.errors import InvalidValueError, ManifestError, ResetNeededError, VolumeError
 
 OBSERVATIONS = ["action_reward", "cluster"]
@@ -159,9 +159,9 @@ def test_env_shows_what_it_rewards(phantom):
 def test_env_clips_actions_and_refuses_impossible_ones(env):
     env.reset(seed=0)
     assert env.step(np.array([7.0]))[4]["action"] == 1.0
-    for bad in ([np.nan], [np.inf], [0.0, 0.0], 0.5):
+    for bad in (np.array([np.nan]), np.array([np.inf]), np.zeros(2), 0.5, "x", ["a"], {"a": 1}, None):
         with pytest.raises(InvalidValueError, match=r"action is .*shape \(1,\)"):
-            env.step(np.array(bad))
+            env.step(bad)
 
 
 def test_env_needs_a_reset_before_and_after_an_episode(env):
@@ -169,6 +169,10 @@ def test_env_needs_a_reset_before_and_after_an_episode(env):
         env.step(np.array([0.0]))
     with pytest.raises(ResetNeededError, match="reset"):
         _ = env.scene
+    with pytest.raises(ResetNeededError, match="reset"):
+        _ = env.plane
+    with pytest.raises(ResetNeededError, match="reset"):
+        _ = env.slice_xz
     env.reset(seed=0)
     env.step(env.scene.optimum_normalised[3:])
     with pytest.raises(ResetNeededError, match="reset"):
@@ -205,6 +209,8 @@ def test_reset_takes_the_volume_as_an_option(dataset):
         ({"render_mode": "sound"}, "render_mode is 'sound'"),
         ({"volumes": []}, "volumes is empty"),
         ({"volumes": [1]}, "volumes holds 1"),
+        ({"volumes": 3}, "volumes is 3"),
+        ({"observation": ClusterObservation}, "observation is <class"),
     ],
 )
 def test_env_refuses_impossible_arguments(phantom, arguments, message):

@@ -98,7 +98,7 @@ def test_many_processes_may_open_a_fresh_store_at_once(tmp_path):
     assert len(answers) == 1
 
 
-@pytest.mark.parametrize("uri", ["./mlruns", "nonsense://x", "sqlite:////proc/no/runs.db"])
+@pytest.mark.parametrize("uri", ["./mlruns", "nonsense://x", "sqlite:////proc/no/runs.db", "sqlite:///", "", None, 3])
 def test_open_store_names_a_store_that_cannot_be_used(uri):
     with pytest.raises(TrackingError, match=r"tracking\.uri is"):
         open_store(uri, experiment="test", artifacts="artifacts")

@@ -22,6 +22,25 @@ def test_action_refuses_what_is_not_two_finite_numbers(bad):
         ManipulatorAction((0.0, 0.0), bad)
 
 
+@pytest.mark.parametrize("bad", [{"rotation": 3}, {"translation": (1, 2, 3)}, {"centre_mm": (1, 2)}])
+def test_transform_refuses_what_is_not_finite_numbers(bad):
+    with pytest.raises(InvalidValueError, match=f"{next(iter(bad))} is"):
+        RigidTransform(**bad)
+
+
+@pytest.mark.parametrize("components", [None, (1, 2, 3), (1, 2, 3, float("nan"))])
+def test_action_from_array_refuses_what_is_not_four_numbers(components):
+    with pytest.raises(InvalidValueError, match="components is"):
+        ManipulatorAction.from_array(components)
+
+
+def test_inverse_plane_refuses_a_plane_that_never_meets_the_floor():
+    with pytest.raises(InvalidValueError, match="parallel to the volume's floor"):
+        RigidTransform((0.0, 180.0), centre_mm=(0.0, 0.0, 5.0)).inverse_plane(
+            ManipulatorAction((0.0, 90.0), (0.0, 0.0))
+        )
+
+
 def test_action_matrix_turns_about_x_first_and_z_second():
     matrix = ManipulatorAction((90.0, 90.0), (0.0, 0.0)).matrix
     np.testing.assert_allclose(matrix @ [0, 0, 1], [1, 0, 0], atol=1e-12)

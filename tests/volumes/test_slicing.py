@@ -90,7 +90,14 @@ def test_slice_leaves_the_volume_as_it_was(tiny_volume):
     np.testing.assert_array_equal(tiny_volume.labels, before)
 
 
-@pytest.mark.parametrize("shape", [(0, 3), (3,), (2.5, 3), (3, -1)])
+def test_slice_refuses_what_is_no_plane_and_no_transform(tiny_volume):
+    with pytest.raises(InvalidValueError, match="action is None"):
+        tiny_volume.slice(None)
+    with pytest.raises(InvalidValueError, match="transform is 3"):
+        tiny_volume.slice(ManipulatorAction((0.0, 0.0), (0.0, 0.0)), transform=3)
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (3,), (2.5, 3), (3, -1), 3, (True, 3), (10**9, 10**9)])
 def test_slice_refuses_impossible_shape(tiny_volume, shape):
-    with pytest.raises(InvalidValueError, match="shape is"):
+    with pytest.raises(InvalidValueError, match=r"shape (is|=)"):
         tiny_volume.slice(ManipulatorAction((0.0, 0.0), (0.0, 0.0)), shape)
