@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
@@ -64,14 +64,14 @@ class Multirun(Callback):
         from armscan.tracking import open_store, source_tags
 
         folder = Path(config.hydra.sweep.dir)
+        if not isinstance(config.tracking, DictConfig):
+            _leave(f"tracking is {config.tracking!r}, but it must be a section, such as its default")
         tracking: dict[str, str] = OmegaConf.to_container(config.tracking, resolve=True)  # type: ignore[assignment]
         overrides = list(config.hydra.overrides.task)
         try:
             client, experiment_id = open_store(**tracking)
         except ArmscanError as error:
-            # Hydra turns an exception of a callback into a warning and goes on.
-            print(f"error: {error}", file=sys.stderr)
-            raise SystemExit(2) from error
+            _leave(str(error))
         command = " ".join(overrides)
         tags = {**source_tags(), "overrides": command}
         parent = client.create_run(experiment_id, run_name=f"multirun {command}"[:250], tags=tags)
@@ -79,6 +79,12 @@ class Multirun(Callback):
         word = {"run_id": parent.info.run_id, "tracking": tracking, "overrides": overrides}
         (folder / PARENT_FILE).write_text(json.dumps(word))
         Multirun.folder = folder
+
+
+def _leave(mistake: str) -> NoReturn:
+    """Ends the process: an exception of a callback would be turned into a warning by Hydra, and the jobs started."""
+    print(f"error: {mistake}", file=sys.stderr)
+    raise SystemExit(2)
 
 
 @dataclass(frozen=True)

@@ -254,6 +254,8 @@ def main() -> int:
     # Whoever ends a run, by Ctrl-C or by kill, finds it closed as killed in the tracking store.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     quieten_libraries()
+    # Hydra reads its options only before the first override, and people write them anywhere.
+    sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in ("-m", "--multirun"))
     try:
         hydra.main(version_base="1.3", config_path="pkg://armscan.conf", config_name="config")(run)()
     except KeyboardInterrupt:

@@ -166,6 +166,8 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["device=tpu"], "device is 'tpu', but it must be cpu or cuda"),
         (["tracking.uri=./mlruns"], "tracking.uri is './mlruns', but this store cannot be used"),
         (["-m", "obs=cluster,foo"], "obs is 'foo', but it must be action_reward or cluster"),
+        (["obs=cluster", "-m", "agent=foo"], "agent is 'foo', but it must be sac"),
+        (["-m", "seed=1,2", "tracking=null"], "Config group override must be a string or a list"),
         (["-m", "seed=1,2", "tracking.uri=./mlruns"], "tracking.uri is './mlruns', but this store cannot be used"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -60,6 +60,8 @@ def _open_locked(uri: str, experiment: str, artifacts: str) -> tuple[MlflowClien
     database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
     database.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
+        # MLflow would try for minutes to open what cannot be opened.
+        database.open("ab").close()
         return _open(f"{SQLITE_PREFIX}{database}", experiment, artifacts)
 
 

@@ -104,6 +104,12 @@ def test_open_store_names_a_store_that_cannot_be_used(uri):
         open_store(uri, experiment="test", artifacts="artifacts")
 
 
+def test_open_store_names_a_folder_in_the_place_of_the_store(tmp_path):
+    (tmp_path / "runs.db").mkdir()
+    with pytest.raises(TrackingError, match="Is a directory"):
+        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="test", artifacts="artifacts")
+
+
 def test_open_store_names_a_damaged_store(tmp_path):
     (tmp_path / "runs.db").write_bytes(b"no database at all" * 100)
     with pytest.raises(TrackingError, match="not a database"):
