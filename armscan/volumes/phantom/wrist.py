@@ -17,7 +17,7 @@ import numpy as np
 from armscan.volumes.phantom.tube import Tube
 
 BONE, TENDON, ARTERY, NERVE = 1, 2, 3, 4
-TUNNEL_HALF_LENGTH_MM = 8.0
+TUNNEL_HALF_LENGTH_MM = 7.5
 
 # x and z of the fingers at the knuckles, and y of the knuckles and of the joint beyond, thumb to little finger.
 FINGER_X = (-41.0, -18.5, -1.0, 13.5, 26.0)
