@@ -50,6 +50,13 @@ def check_float(
     return float(value)
 
 
+def check_bool(name: str, value: Any) -> bool:
+    """Returns `value` if it is a truth value."""
+    if not isinstance(value, bool):
+        raise InvalidValueError(f"{name} is {value!r}, but it must be true or false")
+    return value
+
+
 def check_choice(name: str, value: T, allowed: Sequence[T]) -> T:
     """Returns `value` if it is one of `allowed`."""
     if value not in allowed:

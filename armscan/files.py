@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""The files of a run's folder, and files that are there whole or not at all."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
+
+# What training keeps in the folder of its run.
+BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:

@@ -9,15 +9,16 @@ import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, NoReturn, Self
+from typing import Any, Self
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.errors import ArmscanError
+from armscan.errors import InvalidValueError
 from armscan.files import write_whole
+from armscan.mistakes import mistake_in_one_line
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
@@ -61,30 +62,30 @@ class Multirun(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Opens the store, starts the parent run, and leaves word of it for the jobs."""
+        try:
+            self._start(config)
+        # Hydra would turn any exception of a callback into a warning, and start the jobs all the same.
+        except Exception as error:
+            print(f"error: {mistake_in_one_line(error) or repr(error)}", file=sys.stderr)
+            raise SystemExit(2) from error
+
+    @staticmethod
+    def _start(config: DictConfig) -> None:
         from armscan.tracking import open_store, source_tags
 
         folder = Path(config.hydra.sweep.dir)
         if not isinstance(config.tracking, DictConfig):
-            _leave(f"tracking is {config.tracking!r}, but it must be a section, such as its default")
+            raise InvalidValueError(f"tracking is {config.tracking!r}, but it must be a section, such as its default")
         tracking: dict[str, str] = OmegaConf.to_container(config.tracking, resolve=True)  # type: ignore[assignment]
         overrides = list(config.hydra.overrides.task)
-        try:
-            client, experiment_id = open_store(**tracking)
-        except ArmscanError as error:
-            _leave(str(error))
+        client, experiment_id = open_store(**tracking)
+        (folder / OUTCOME_FOLDER).mkdir(parents=True)
         command = " ".join(overrides)
         tags = {**source_tags(), "overrides": command}
         parent = client.create_run(experiment_id, run_name=f"multirun {command}"[:250], tags=tags)
-        (folder / OUTCOME_FOLDER).mkdir(parents=True)
         word = {"run_id": parent.info.run_id, "tracking": tracking, "overrides": overrides}
         (folder / PARENT_FILE).write_text(json.dumps(word))
         Multirun.folder = folder
-
-
-def _leave(mistake: str) -> NoReturn:
-    """Ends the process: an exception of a callback would be turned into a warning by Hydra, and the jobs started."""
-    print(f"error: {mistake}", file=sys.stderr)
-    raise SystemExit(2)
 
 
 @dataclass(frozen=True)
@@ -187,8 +188,16 @@ def _close_parent(folder: Path, status: str, failed: Mapping[str, Outcome]) -> b
 
 
 def remove_run_folder(folder: Path) -> None:
-    """Removes the folder of a run that came to nothing, and the folder of its day where nothing else is in it."""
-    shutil.rmtree(folder, ignore_errors=True)
-    for above in (folder.parent, folder.parent.parent):
-        if above.is_dir() and above != Path.cwd() and not any(above.iterdir()):
-            above.rmdir()
+    """Removes what a run that came to nothing has left in its folder, and the folders that are empty then.
+
+    Nothing else is touched: the folder may be one that somebody named, with other files in it.
+    """
+    for ours in (folder / ".hydra", folder / OUTCOME_FOLDER):
+        shutil.rmtree(ours, ignore_errors=True)
+    for ours in (folder / PARENT_FILE, folder / "multirun.yaml"):
+        ours.unlink(missing_ok=True)
+    here = Path.cwd()
+    for emptied in (folder, folder.parent, folder.parent.parent):
+        if here.is_relative_to(emptied.resolve()) or not emptied.is_dir() or any(emptied.iterdir()):
+            break
+        emptied.rmdir()

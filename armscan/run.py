@@ -31,6 +31,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from armscan.checks import check_int, check_seed
 from armscan.errors import InvalidValueError
+from armscan.files import LAST_CHECKPOINT
 from armscan.mistakes import mistake_in_one_line, quieten_libraries
 from armscan.multirun import INTERRUPTED, NO_OUTCOME, Job, end_multirun, remove_run_folder
 
@@ -231,8 +232,8 @@ def leave_with_parent(parent_pid: int) -> None:
 
 
 def remove_if_empty(folder: Path) -> None:
-    """Removes the folder of a run that has left nothing there but what Hydra wrote."""
-    if all(entry.name == ".hydra" for entry in folder.iterdir()):
+    """Removes what Hydra wrote into the folder of a run that has not come as far as a checkpoint."""
+    if not (folder / LAST_CHECKPOINT).exists():
         remove_run_folder(folder)
 
 

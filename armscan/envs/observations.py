@@ -11,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from armscan.anatomy import PUBLISHED_TARGETS, TISSUES, USUAL_PIXEL_MM, TissueClusters, checked_targets
+from armscan.checks import check_bool
 from armscan.errors import InvalidValueError, listed
 from armscan.volumes.plane import FloatArray
 
@@ -83,7 +84,7 @@ class ClusterObservation:
     """
 
     def __init__(self, *, normalised: bool = True, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
-        self.normalised = normalised
+        self.normalised = check_bool("normalised", normalised)
         self._targets = checked_targets(targets)
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:

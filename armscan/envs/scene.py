@@ -125,8 +125,9 @@ class SceneSampler:
         scene = self._scene(volume, None)
         if scene is None:
             raise OptimalPlaneError(
-                f"{volume.name}: the optimal plane, {volume.optimal_action}, misses the volume or its translation "
-                f"bounds {self.bounds(volume).translation_mm} mm"
+                f"{volume.name}: the optimal plane, {volume.optimal_action}, misses the volume or its bounds: "
+                f"rotations within +-{self.rotation_bounds_deg} degrees, translations from 0 to "
+                f"{self.bounds(volume).translation_mm} mm"
             )
         reward, counts = self._seen_at_optimum(scene)
         if reward <= -self.delta:
@@ -156,7 +157,9 @@ class SceneSampler:
         bounds = self.bounds(volume)
         optimum = volume.optimal_action if transform is None else transform.inverse_plane(volume.optimal_action)
         within = slid_into(optimum, bounds.translation_mm)
-        return None if within is None else Scene(volume, transform, within, bounds)
+        if within is None or (np.abs(within.rotation) > self.rotation_bounds_deg).any():
+            return None
+        return Scene(volume, transform, within, bounds)
 
     def _seen_at_optimum(self, scene: Scene) -> tuple[float, tuple[int, int, int]]:
         clusters = TissueClusters.from_slice(scene.volume.slice(scene.optimum, transform=scene.transform))

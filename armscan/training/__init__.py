@@ -1,11 +1,12 @@
 """One run: which volumes, how long to train, how to judge, what to keep."""
 
+from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
 from armscan.training.data import Split, nifti_data, phantom_data
 from armscan.training.evaluation import HELD_OUT, TRAINED_ON, Episode, Evaluation, evaluate
 from armscan.training.film import film_episode
-from armscan.training.train import BEST_CHECKPOINT, LAST_CHECKPOINT, Budget, SolvedCriterion, TrainingResult, train
+from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
 
 __all__ = [
     "BEST_CHECKPOINT",

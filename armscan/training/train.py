@@ -10,11 +10,10 @@ from pathlib import Path
 from armscan.agents.protocols import Learner
 from armscan.checks import check_float, check_int
 from armscan.errors import InvalidValueError
+from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
 from armscan.training.evaluation import Evaluation
-
-BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
 
 
 @dataclass(frozen=True, kw_only=True)

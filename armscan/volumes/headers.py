@@ -47,7 +47,7 @@ def check_nifti(path: Path) -> None:
         raise VolumeError(f"{path}: the file does not begin with a NIfTI header")
     # Any other type is no labelmap's, and is refused after reading.
     expected = offset + math.prod(dims[1 : 1 + dims[0]]) * NIFTI_VOXEL_BYTES.get(type_code, 1)
-    if not n_bytes >= expected:
+    if not n_bytes >= expected or offset < 0:
         raise VolumeError(
             f"{path}: the file is truncated: it holds {n_bytes} bytes, but its header promises {expected:g}"
         )

@@ -15,7 +15,7 @@ from armscan.volumes.volume import LabelVolume
 
 def volume_suffix(path: Path) -> str | None:
     """Returns the ending that says a file is a volume ('.nii.gz', ...), None for any other file."""
-    return next((suffix for suffix in CHECKS if path.name.lower().endswith(suffix)), None)
+    return next((suffix for suffix in CHECKS if path.name.endswith(suffix)), None)
 
 
 def read_volume(

@@ -137,7 +137,8 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
         present = np.unique(labels)
         received = ", ".join(f"{value:g}" for value in present[:8]) + (", ..." if present.size > 8 else "")
         raise VolumeError(f"{name}: holds the values {received}, but a labelmap holds {allowed} only")
-    checked = np.ascontiguousarray(labels, dtype=np.uint8)
+    # A copy: what the caller does with the array afterwards must not change the volume.
+    checked = np.array(labels, dtype=np.uint8, order="C")
     for label in LANDMARK_LABELS:
         if not (checked == label).any():
             raise VolumeError(

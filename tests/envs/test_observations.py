@@ -63,6 +63,12 @@ def test_flat_space_has_its_bounds_in_the_order_of_the_data():
     assert space.contains(flat)
 
 
+@pytest.mark.parametrize("normalised", ["no", None, 3])
+def test_cluster_observation_refuses_what_is_no_truth_value(normalised):
+    with pytest.raises(InvalidValueError, match=r"normalised is .* true or false"):
+        ClusterObservation(normalised=normalised)
+
+
 def test_merged_observations_refuse_duplicate_keys():
     merged = MergedObservation([ActionRewardObservation(), ActionRewardObservation()])
     with pytest.raises(InvalidValueError, match="both have the key action or reward"):

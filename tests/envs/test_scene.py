@@ -44,6 +44,17 @@ def test_scene_optimum_shows_the_labelled_plane(phantom):
     assert seen.bones.n_points == pytest.approx(TissueClusters.from_slice(labelled).bones.n_points, rel=0.03)
 
 
+def test_scene_optimum_stays_within_tight_rotation_bounds(phantom):
+    rz, rx = phantom.optimal_action.rotation
+    tight = sampler(
+        rotation_bounds_deg=(abs(rz) + 10.0, abs(rx) + 20.0),
+        transform=RandomTransform(rz_deg=10.0, rx_deg=20.0, tx_mm=0.0, ty_mm=0.0),
+        delta=1.0,
+    )
+    rng = np.random.default_rng(0)
+    assert max(np.abs(tight.draw(phantom, rng).optimum_normalised).max() for _ in range(200)) <= 1
+
+
 def test_scene_without_transform_is_the_volume_as_it_is(phantom):
     scene = sampler(transform=None).draw(phantom, np.random.default_rng(0))
     assert scene.transform is None

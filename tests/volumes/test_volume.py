@@ -22,6 +22,13 @@ def test_volume_keeps_whole_valued_floats_as_bytes():
     np.testing.assert_array_equal(volume.labels.flat[:5], [1, 2, 3, 4, 0])
 
 
+def test_volume_does_not_change_with_the_array_it_was_made_of():
+    labels = labels_with(1, 2, 3)
+    volume = LabelVolume(labels, SPACING, "v")
+    labels[:] = 0
+    assert volume.labels.any()
+
+
 def test_volume_measures_itself():
     volume = LabelVolume(labels_with(1, 2, 3), (0.5, 1.0, 2.0), "v")
     assert volume.size_mm == (2.0, 4.0, 8.0)
