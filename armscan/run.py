@@ -204,10 +204,17 @@ def run(config: DictConfig) -> None:
 
 def run_job() -> None:
     """One job of a multirun, handed over on standard input: a failure is noted, and does not stop the others."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=leave_with_parent, args=(os.getppid(),), daemon=True).start()
     config, invocation = pickle.load(sys.stdin.buffer)
     job: Job = invocation.job
+
+    def leave(*_: object) -> None:
+        """Ends the job at once: raised inside compiled code, an interrupt can come out as any other error."""
+        job.write_outcome(failure=INTERRUPTED)
+        os._exit(130)
+
+    for ending in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ending, leave)
     try:
         figures = run_experiment(config, invocation)
     except Exception as error:
@@ -217,9 +224,6 @@ def run_job() -> None:
         remove_if_empty(invocation.folder)
         print(f"[{job.label}] failed: {line or repr(error)}", file=sys.stderr, flush=True)
         job.write_outcome(failure=line or repr(error))
-    except KeyboardInterrupt:
-        remove_if_empty(invocation.folder)
-        job.write_outcome(failure=INTERRUPTED)
     else:
         job.write_outcome(figures=figures)
 
