@@ -44,6 +44,15 @@ class TrackingError(ArmscanError, RuntimeError):
     """The tracking store cannot be reached or used."""
 
 
+def is_interruption(error: BaseException | None) -> bool:
+    """Whether an error is an interrupt, or came of one: raised inside compiled code, it can come out as any other."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def listed(allowed: Iterable[object]) -> str:
     """Returns the allowed values as they are written in a message: 'a, b or c'."""
     names = [str(value) for value in allowed]

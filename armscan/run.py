@@ -30,7 +30,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from armscan.checks import check_int, check_seed
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, is_interruption
 from armscan.files import LAST_CHECKPOINT
 from armscan.mistakes import mistake_in_one_line, quieten_libraries
 from armscan.multirun import INTERRUPTED, NO_OUTCOME, Job, end_multirun, remove_run_folder
@@ -191,6 +191,8 @@ def run(config: DictConfig) -> None:
             raise
         except Exception as error:
             remove_if_empty(invocation.folder)
+            if is_interruption(error):
+                raise KeyboardInterrupt from error
             raise_or_exit(error)
     else:
         # A job that is killed, for its memory say, takes neither the launcher nor the other jobs with it.

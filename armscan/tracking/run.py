@@ -13,6 +13,7 @@ import yaml
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param
 
+from armscan.errors import is_interruption
 from armscan.tracking.pictures import draw_learning_curve
 from armscan.tracking.source import source_tags
 from armscan.training import EpochReport, Evaluation, TrainingResult
@@ -106,7 +107,7 @@ class TrackedRun:
         """Closes the run: FINISHED, KILLED where it was interrupted, FAILED after any other error."""
         if error is None:
             self.end("FINISHED")
-        elif isinstance(error, KeyboardInterrupt):
+        elif is_interruption(error):
             self.end("KILLED", reason="interrupted")
         else:
             self.end("FAILED", reason=repr(error))
