@@ -9,4 +9,8 @@ __version__ = "0.1.0"
 
 ENV_ID = "armscan/Armscan-v0"
 
-gymnasium.register(id=ENV_ID, entry_point="armscan.envs.wrappers:make_armscan_env")
+gymnasium.register(
+    id=ENV_ID,
+    entry_point="armscan.envs.making:make_armscan_env",
+    vector_entry_point="armscan.envs.making:make_armscan_vector_env",
+)

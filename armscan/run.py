@@ -109,11 +109,11 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
 
     # Everything is built, and so checked, before anything is tracked.
     split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
-    make_env = instantiate(config.env, _convert_="object")
-    training_env, held_out_env = make_env(split.training), make_env(split.held_out)
-    film_env = make_env(split.held_out, render_mode="rgb_array")
+    maker = instantiate(config.env, _convert_="object")
+    training_env, held_out_env = maker.one(split.training), maker.one(split.held_out)
+    film_env = maker.one(split.held_out, render_mode="rgb_array")
     setup = LearningSetup(
-        make_env=partial(make_env, split.training),
+        make_envs=partial(maker.many, volumes=split.training, autoreset_mode="Disabled"),
         total_env_steps=budget.env_steps,
         seed=seed,
         device=checked_device(config.device),

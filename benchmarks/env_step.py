@@ -23,7 +23,7 @@ import numpy as np
 import SimpleITK
 from sklearn.cluster import DBSCAN
 
-from armscan.anatomy import TISSUES, Clusters, TissueClusters, landmark_reward
+from armscan.anatomy import PIXEL_TISSUES, Clusters, TissueClusters, landmark_reward
 from armscan.envs import ArmscanEnv, ManipulatorAction
 from armscan.volumes import LabelVolume, read_dataset
 
@@ -38,7 +38,7 @@ def plain_reward(image: SimpleITK.Image, action: ManipulatorAction) -> float:
     transform.SetTranslation(action.offset_mm)
     resampled = SimpleITK.Resample(image, image, transform, SimpleITK.sitkNearestNeighbor, 0)
     slice_xz = SimpleITK.GetArrayFromImage(resampled)[:, 0, :].T
-    return landmark_reward(TissueClusters(*(_clusters_by_sklearn(slice_xz, tissue) for tissue in TISSUES)))
+    return landmark_reward(TissueClusters(*(_clusters_by_sklearn(slice_xz, tissue) for tissue in PIXEL_TISSUES)))
 
 
 def _clusters_by_sklearn(slice_xz: np.ndarray, tissue) -> Clusters:

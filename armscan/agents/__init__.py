@@ -2,17 +2,17 @@
 
 from armscan.agents.device import checked_device
 from armscan.agents.networks import MLP, Network
-from armscan.agents.protocols import Agent, EnvMaker, Learner, LearningAlgorithm, LearningSetup
+from armscan.agents.protocols import Agent, Learner, LearningAlgorithm, LearningSetup, VectorEnvMaker
 from armscan.agents.sac import SAC
 
 __all__ = [
     "MLP",
     "SAC",
     "Agent",
-    "EnvMaker",
     "Learner",
     "LearningAlgorithm",
     "LearningSetup",
     "Network",
+    "VectorEnvMaker",
     "checked_device",
 ]

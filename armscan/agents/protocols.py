@@ -6,18 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import gymnasium as gym
+from gymnasium.vector import VectorEnv
 
-from armscan.envs.observations import FloatVector
+from armscan.envs.task import Observed
 from armscan.volumes.plane import FloatArray
 
-EnvMaker = Callable[[], gym.Env[FloatVector, FloatArray]]
+VectorEnvMaker = Callable[[int], VectorEnv[Any, Any, Any]]
 
 
 class Agent(Protocol):
     """Whoever chooses planes."""
 
-    def act(self, observation: FloatVector) -> FloatArray:
+    def act(self, observation: Observed) -> FloatArray:
         """Returns the action, shape (n_free,), for one observation, as it is judged: without exploration."""
 
 
@@ -46,13 +46,13 @@ class LearningSetup:
     """What every learning algorithm is given beside its own parameters.
 
     Args:
-        make_env: makes one training environment.
+        make_envs: makes as many training environments as are asked for, without autoreset.
         total_env_steps: environment steps that training may take.
         seed: of everything drawn.
         device: torch device.
     """
 
-    make_env: EnvMaker
+    make_envs: VectorEnvMaker
     total_env_steps: int
     seed: int
     device: str

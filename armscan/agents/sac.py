@@ -12,7 +12,8 @@ from tianshou.highlevel.params.alpha import AutoAlphaFactoryDefault
 
 from armscan.agents.networks import Network
 from armscan.agents.protocols import LearningSetup
-from armscan.agents.tianshou_learner import ArmscanEnvFactory, TianshouLearner
+from armscan.agents.tianshou_envs import SideBySideFactory
+from armscan.agents.tianshou_learner import TianshouLearner
 from armscan.checks import check_float, check_int
 from armscan.errors import InvalidValueError
 
@@ -89,7 +90,7 @@ class SAC:
                 f"it must be below training.env_steps = {setup.total_env_steps}, or nothing is learned"
             )
         builder = SACExperimentBuilder(
-            ArmscanEnvFactory(setup.make_env),
+            SideBySideFactory(setup.make_envs),
             ExperimentConfig(seed=setup.seed, device=setup.device, watch=False, persistence_enabled=False),
             OffPolicyTrainingConfig(
                 num_training_envs=self.num_envs,

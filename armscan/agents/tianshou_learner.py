@@ -7,45 +7,16 @@ from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from tianshou.data import Batch
-from tianshou.highlevel.env import EnvFactory, EnvMode, VectorEnvType
 from tianshou.highlevel.experiment import Experiment
 from tianshou.highlevel.persistence import PolicyPersistence
 from tianshou.utils.logger.logger_base import BaseLogger
 
-from armscan.agents.protocols import EnvMaker
-from armscan.envs.observations import FloatVector
+from armscan.envs.task import Observed
 from armscan.errors import DivergedError
 from armscan.volumes.plane import FloatArray
-
-
-class ArmscanEnvFactory(EnvFactory):
-    """Gives Tianshou the training environments, side by side in one process."""
-
-    def __init__(self, make_env: EnvMaker) -> None:
-        super().__init__(VectorEnvType.DUMMY)
-        self._make_env = make_env
-
-    def _create_env(self, mode: EnvMode) -> gym.Env[FloatVector, FloatArray]:
-        return WithoutInfo(self._make_env())
-
-
-class WithoutInfo(gym.Wrapper[FloatVector, FloatArray, FloatVector, FloatArray]):
-    """Drops `info`, which a replay buffer would store with every transition."""
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatVector, dict[str, Any]]:
-        """Starts an episode."""
-        return self.env.reset(seed=seed, options=options)[0], {}
-
-    def step(self, action: FloatArray) -> tuple[FloatVector, float, bool, bool, dict[str, Any]]:
-        """Takes a step."""
-        observation, reward, terminated, truncated, _ = self.env.step(action)
-        return observation, float(reward), terminated, truncated, {}
 
 
 class EpochMetrics(BaseLogger):
@@ -174,11 +145,11 @@ class TianshouLearner:
                 "finite any more; a smaller agent.lr or agent.entropy_lr may help"
             ) from cause
 
-    def act(self, observation: FloatVector) -> FloatArray:
+    def act(self, observation: Observed) -> FloatArray:
         """Returns the deterministic policy's action, shape (n_free,)."""
         policy = self._algorithm.policy
         with torch.no_grad():
-            result = policy(Batch(obs=observation[None], info=Batch()))
+            result = policy(Batch(obs=_batch_of_one(observation), info=Batch()))
         return np.asarray(policy.map_action(result.act.cpu().numpy())[0])
 
     def state(self) -> dict[str, Any]:
@@ -188,6 +159,12 @@ class TianshouLearner:
     def load_state(self, state: dict[str, Any]) -> None:
         """Takes over weights and optimisers' state."""
         self._algorithm.load_state_dict(dict(state))
+
+
+def _batch_of_one(observation: Observed) -> Any:
+    if isinstance(observation, dict):
+        return Batch({name: part[None] for name, part in observation.items()})
+    return observation[None]
 
 
 class _NoPersistence(PolicyPersistence):

@@ -1,18 +1,51 @@
-"""What is seen in a slice: tissues, their clusters, and the reward computed from them."""
+"""What is seen in a slice: tissues, their clusters, and the rewards computed from them."""
 
-from armscan.anatomy.landmarks import PUBLISHED_TARGETS, Clusters, TissueClusters, checked_targets, landmark_reward
-from armscan.anatomy.tissues import ARTERY, BONES, TENDONS, TISSUES, USUAL_PIXEL_MM, Tissue
+from armscan.anatomy.landmarks import Clusters, Landmarks, TissueClusters
+from armscan.anatomy.rewards import (
+    OTHER_PUBLISHED_TARGETS,
+    PUBLISHED_TARGETS,
+    AgreementReward,
+    LandmarkReward,
+    Reward,
+    checked_targets,
+    landmark_reward,
+)
+from armscan.anatomy.scanner import Scanner
+from armscan.anatomy.tissues import (
+    ARTERY,
+    BONES,
+    METRIC_TISSUES,
+    PIXEL_TISSUES,
+    TENDONS,
+    USUAL_PIXEL_MM,
+    MetricTissue,
+    PixelTissue,
+    Tissue,
+    Tissues,
+    checked_tissues,
+)
 
 __all__ = [
     "ARTERY",
     "BONES",
+    "METRIC_TISSUES",
+    "OTHER_PUBLISHED_TARGETS",
+    "PIXEL_TISSUES",
     "PUBLISHED_TARGETS",
     "TENDONS",
-    "TISSUES",
     "USUAL_PIXEL_MM",
+    "AgreementReward",
     "Clusters",
+    "LandmarkReward",
+    "Landmarks",
+    "MetricTissue",
+    "PixelTissue",
+    "Reward",
+    "Scanner",
     "Tissue",
     "TissueClusters",
+    "Tissues",
     "checked_targets",
+    "checked_tissues",
     "landmark_reward",
 ]

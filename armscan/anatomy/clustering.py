@@ -1,94 +1,143 @@
-"""DBSCAN on a pixel grid, compiled: the same clusters as scikit-learn's, found from runs of pixels.
+"""DBSCAN on a pixel grid, compiled: the same clusters as scikit-learn's.
 
-On a grid the neighbours within eps of a pixel fill a disc, so a neighbour count is a sum over the disc's rows (from
-prefix sums), and the clusters are the connected components of core pixels. Core pixels are joined as runs: two runs in
-rows d apart touch when the gap between them is at most the disc's half width at d.
+On a grid the neighbours within eps of a pixel fill a disc (an ellipse where pixels are not square), so neighbour counts
+are sums over the disc's rows, and the clusters are the connected components of core pixels. Core pixels are joined as
+runs: two runs in rows d apart touch when the gap between them is at most the disc's half width at d.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+IntArray = NDArray[np.int64]
+RunArray = NDArray[np.int32]
+Pixels = NDArray[np.uint8]
+
 
 @numba.njit(cache=True, nogil=True)
-def disc_half_widths(eps_px: float) -> NDArray[np.int64]:
-    """Returns for each row distance d = 0 .. floor(eps) the largest w with d^2 + w^2 <= eps^2."""
-    widths = np.empty(int(np.floor(eps_px)) + 1, dtype=np.int64)
+def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -> IntArray:
+    """Returns for each row distance d = 0, 1, .. the largest w with (d row_step)^2 + (w col_step)^2 <= eps^2.
+
+    Args:
+        eps: radius, in the unit of the steps.
+        row_step: distance of neighbouring rows.
+        col_step: distance of neighbouring columns.
+    """
+    widths = np.empty(int(np.floor(eps / row_step)) + 2, dtype=np.int64)
+    n_rows = 0
     for d in range(widths.size):
-        width = int(np.floor(np.sqrt(eps_px * eps_px - d * d)))
-        while d * d + (width + 1) * (width + 1) <= eps_px * eps_px:
+        if (d * row_step) ** 2 > eps * eps:
+            break
+        width = int(np.floor(np.sqrt(eps * eps - (d * row_step) ** 2) / col_step))
+        while (d * row_step) ** 2 + ((width + 1) * col_step) ** 2 <= eps * eps:
             width += 1
-        while d * d + width * width > eps_px * eps_px:
+        while width > 0 and (d * row_step) ** 2 + (width * col_step) ** 2 > eps * eps:
             width -= 1
         widths[d] = width
-    return widths
+        n_rows += 1
+    return widths[:n_rows]
+
+
+@numba.njit(cache=True, nogil=True)
+def count_disc_pixels(half_widths: IntArray) -> int:
+    """Returns how many pixels a disc has, its middle included."""
+    return int(2 * np.sum(2 * half_widths + 1) - (2 * half_widths[0] + 1))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _find_core_pixels(mask: NDArray[np.bool_], widths: NDArray[np.int64], min_samples: int) -> NDArray[np.bool_]:
-    """Marks the pixels of the mask with at least `min_samples` pixels (themselves included) in their disc."""
-    n_rows, n_cols = mask.shape
-    reach, pad = widths.size - 1, widths[0]
-    # How many pixels of the mask lie before each column, with margins so that no disc leaves the table.
-    before = np.zeros((n_rows + 2 * reach, n_cols + 2 * pad + 1), dtype=np.int32)
-    for row in range(n_rows):
-        line = before[row + reach]
-        for col in range(n_cols):
-            line[col + pad + 1] = line[col + pad] + mask[row, col]
-        line[n_cols + pad + 1 :] = line[n_cols + pad]
-    core = np.zeros((n_rows, n_cols), dtype=np.bool_)
-    counts = np.empty(n_cols, dtype=np.int32)
-    for row in range(n_rows):
-        counts[:] = 0
-        # Row by row of the disc, for all columns at once: such loops run several pixels at a time.
+def _find_core(mask: Pixels, stride: int, half_widths: IntArray, min_samples: int, zero: Any) -> Pixels:
+    """Marks the core pixels of a flat mask.
+
+    Args:
+        mask: 0 or 1, rows of `stride` with as many columns of margin as the disc is wide, and as many rows above and
+            below as it is high, so that no disc leaves it.
+        stride: see above.
+        half_widths: of the disc.
+        min_samples: pixels in the disc that make a core pixel.
+        zero: of the smallest type that holds the disc's number of pixels: small types are summed many at a time.
+
+    Returns:
+        0 or 1 for each pixel but the margins.
+    """
+    pad, reach = half_widths[0], half_widths.size - 1
+    first = reach * stride + pad
+    n_pixels = mask.size - 2 * first
+    inside = mask[first : first + n_pixels]
+    window = np.full(n_pixels, zero)
+    window[:] = inside
+    counts = np.full(n_pixels + 2 * reach * stride, zero)
+    for width in range(pad + 1):
+        if width > 0:
+            left, right = mask[first - width :][:n_pixels], mask[first + width :][:n_pixels]
+            for i in range(n_pixels):
+                window[i] += left[i] + right[i]
         for d in range(-reach, reach + 1):
-            width = widths[abs(d)]
-            line = before[row + reach + d]
-            for col in range(n_cols):
-                counts[col] += line[col + pad + width + 1] - line[col + pad - width]
-        for col in range(n_cols):
-            core[row, col] = mask[row, col] and counts[col] >= min_samples
+            if half_widths[abs(d)] == width:
+                shifted = counts[(reach + d) * stride :][:n_pixels]
+                for i in range(n_pixels):
+                    shifted[i] += window[i]
+    core = np.empty(n_pixels, dtype=np.uint8)
+    counted = counts[reach * stride :][:n_pixels]
+    for i in range(n_pixels):
+        core[i] = inside[i] & np.uint8(counted[i] >= min_samples)
     return core
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _core_pixels(mask: Pixels, stride: int, half_widths: IntArray, min_samples: int) -> Pixels:
+    n_in_disc = count_disc_pixels(half_widths)
+    if n_in_disc < 2**8:
+        return _find_core(mask, stride, half_widths, min_samples, np.uint8(0))
+    if n_in_disc < 2**16:
+        return _find_core(mask, stride, half_widths, min_samples, np.uint16(0))
+    return _find_core(mask, stride, half_widths, min_samples, np.uint32(0))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _find_runs(core: Pixels, n_cols: int, longest: int) -> tuple[RunArray, RunArray, IntArray]:
+    """Returns the first and last column of each run of core pixels, and the number of the first run of each row."""
+    n_rows = core.shape[0]
+    capacity = n_rows * (n_cols // 2 + 1 if longest > 1 else n_cols)
+    starts, stops = np.empty(capacity, dtype=np.int32), np.empty(capacity, dtype=np.int32)
+    first_run = np.zeros(n_rows + 1, dtype=np.int64)
+    n_runs = 0
+    for row in range(n_rows):
+        line = core[row]
+        col = 0
+        while col < n_cols:
+            if line[col]:
+                start = col
+                while col < n_cols and line[col] and col - start < longest:
+                    col += 1
+                starts[n_runs], stops[n_runs] = start, col - 1
+                n_runs += 1
+            else:
+                col += 1
+        first_run[row + 1] = n_runs
+    return starts[:n_runs], stops[:n_runs], first_run
+
+
 @numba.njit(cache=True, nogil=True)
-def _find_root(parents: NDArray[np.int64], run: int) -> int:
+def _find_root(parents: IntArray, run: int) -> int:
     while parents[run] != run:
         parents[run] = parents[parents[run]]
         run = parents[run]
     return run
 
 
-@numba.njit(cache=True, nogil=True)
-def _label_core_pixels(core: NDArray[np.bool_], widths: NDArray[np.int64], clusters: NDArray[np.int32]) -> int:
-    """Writes the cluster number, from 1, of each core pixel into `clusters`; returns how many clusters there are."""
-    n_rows, n_cols = core.shape
-    first_run = np.zeros(n_rows + 1, dtype=np.int64)
-    # Below an eps of 1 not even the next pixel is a neighbour, and every run is a single pixel.
-    longest_run = n_cols if widths[0] >= 1 else 1
-    capacity = n_rows * (n_cols // 2 + 1 if widths[0] >= 1 else n_cols)
-    starts = np.empty(capacity, dtype=np.int64)
-    stops = np.empty(capacity, dtype=np.int64)
-    n_runs = 0
-    for row in range(n_rows):
-        col = 0
-        while col < n_cols:
-            if core[row, col]:
-                starts[n_runs] = col
-                while col < n_cols and core[row, col] and col - starts[n_runs] < longest_run:
-                    col += 1
-                stops[n_runs] = col - 1
-                n_runs += 1
-            else:
-                col += 1
-        first_run[row + 1] = n_runs
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _number_runs(starts: RunArray, stops: RunArray, first_run: IntArray, half_widths: IntArray) -> tuple[RunArray, int]:
+    """Returns the cluster of each run, from 0 in the order of the clusters' first runs, and how many there are."""
+    n_rows, n_runs = first_run.size - 1, starts.size
     parents = np.arange(n_runs)
     for row in range(n_rows):
         for run in range(first_run[row], first_run[row + 1]):
-            for other_row in range(row, min(n_rows, row + widths.size)):
-                width = widths[other_row - row]
+            for other_row in range(row, min(n_rows, row + half_widths.size)):
+                width = half_widths[other_row - row]
                 for other in range(max(run + 1, first_run[other_row]), first_run[other_row + 1]):
                     if starts[other] > stops[run] + width:
                         break
@@ -96,63 +145,97 @@ def _label_core_pixels(core: NDArray[np.bool_], widths: NDArray[np.int64], clust
                         a, b = _find_root(parents, run), _find_root(parents, other)
                         # The root is the earliest run, so roots come in the order of the clusters' first core pixels.
                         parents[max(a, b)] = min(a, b)
-    numbers = np.zeros(n_runs, dtype=np.int32)
+    numbers = np.empty(n_runs, dtype=np.int32)
     n_clusters = 0
+    for run in range(n_runs):
+        root = _find_root(parents, run)
+        if root == run:
+            numbers[run] = n_clusters
+            n_clusters += 1
+        else:
+            numbers[run] = numbers[root]
+    return numbers, n_clusters
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reached(
+    shape: tuple[int, int],
+    starts: RunArray,
+    stops: RunArray,
+    first_run: IntArray,
+    numbers: RunArray,
+    half_widths: IntArray,
+    n_clusters: int,
+) -> RunArray:
+    """Returns for each pixel the lowest cluster with a core pixel within eps, `n_clusters` where there is none."""
+    n_rows, n_cols = shape
+    reached = np.full(shape, np.int32(n_clusters))
+    reach = half_widths.size - 1
     for row in range(n_rows):
         for run in range(first_run[row], first_run[row + 1]):
-            root = _find_root(parents, run)
-            if root == run:
-                n_clusters += 1
-                numbers[run] = n_clusters
-            clusters[row, starts[run] : stops[run] + 1] = numbers[root]
-    return n_clusters
+            for other_row in range(max(0, row - reach), min(n_rows, row + reach + 1)):
+                width = half_widths[abs(other_row - row)]
+                line = reached[other_row, max(0, starts[run] - width) : min(n_cols, stops[run] + width + 1)]
+                for col in range(line.size):
+                    line[col] = min(line[col], numbers[run])
+    return reached
 
 
-@numba.njit(cache=True, nogil=True)
-def _lowest_core_cluster_near(
-    clusters: NDArray[np.int32], core: NDArray[np.bool_], widths: NDArray[np.int64], row: int, col: int
-) -> int:
-    """Returns the lowest number among the core pixels in the disc about a pixel, 0 if there is none."""
-    n_rows, n_cols = core.shape
-    lowest = 0
-    reach = widths.size - 1
-    for other_row in range(max(0, row - reach), min(n_rows, row + reach + 1)):
-        width = widths[abs(other_row - row)]
-        for other_col in range(max(0, col - width), min(n_cols, col + width + 1)):
-            if core[other_row, other_col]:
-                number = clusters[other_row, other_col]
-                if lowest == 0 or number < lowest:
-                    lowest = number
-    return lowest
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _cluster(
+    slice_xz: Pixels, label: int, half_widths: IntArray, min_samples: int
+) -> tuple[int, Pixels, RunArray, IntArray]:
+    """Clusters a label's pixels.
 
-
-@numba.njit(cache=True, nogil=True)
-def _bounding_box(slice_xz: NDArray[np.uint8], label: int) -> tuple[int, int, int, int]:
-    """Returns first row, row after the last, first column and column after the last of a label; all 0 without it."""
-    n_rows, n_cols = slice_xz.shape
-    row_first, row_stop, col_first, col_stop = n_rows, 0, n_cols, 0
+    Returns:
+        The first row that holds any; the mask and the cluster of each pixel (see `_reached`) from that row to the last
+        one that holds any; and for each cluster, noise last, the number of its pixels and the sums of their rows and
+        columns.
+    """
+    n_cols = slice_xz.shape[1]
+    row_first, row_stop = slice_xz.shape[0], 0
+    for row in range(slice_xz.shape[0]):
+        n_in_row = 0
+        for col in range(n_cols):
+            n_in_row += slice_xz[row, col] == label
+        if n_in_row:
+            row_first = min(row_first, row)
+            row_stop = row + 1
+    n_rows = max(0, row_stop - row_first)
+    pad, reach = half_widths[0], half_widths.size - 1
+    # One margin between two rows serves both.
+    stride = n_cols + pad
+    flat = np.zeros((n_rows + 2 * reach) * stride + 2 * pad, dtype=np.uint8)
+    mask = flat[reach * stride + pad :][: n_rows * stride].reshape((n_rows, stride))
     for row in range(n_rows):
         for col in range(n_cols):
-            if slice_xz[row, col] == label:
-                row_first = min(row_first, row)
-                row_stop = row + 1
-                col_first = min(col_first, col)
-                col_stop = max(col_stop, col + 1)
-    if row_stop == 0:
-        return 0, 0, 0, 0
-    return row_first, row_stop, col_first, col_stop
+            mask[row, col] = slice_xz[row_first + row, col] == label
+    core = _core_pixels(flat, stride, half_widths, min_samples).reshape((n_rows, stride))
+    # Below an eps of one column not even the next pixel is a neighbour, and every run is a single pixel.
+    starts, stops, first_run = _find_runs(core, n_cols, n_cols if pad >= 1 else 1)
+    numbers, n_clusters = _number_runs(starts, stops, first_run, half_widths)
+    clusters = _reached((n_rows, n_cols), starts, stops, first_run, numbers, half_widths, n_clusters)
+    sums = np.zeros((n_clusters + 1, 3), dtype=np.int64)
+    for row in range(n_rows):
+        for col in range(n_cols):
+            if mask[row, col]:
+                number = clusters[row, col]
+                sums[number, 0] += 1
+                sums[number, 1] += row_first + row
+                sums[number, 2] += col
+    return row_first, mask[:, :n_cols], clusters, sums
 
 
 @numba.njit(cache=True, nogil=True)
 def cluster_label(
-    slice_xz: NDArray[np.uint8], label: int, eps_px: float, min_samples: int
-) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:
+    slice_xz: Pixels, label: int, half_widths: IntArray, min_samples: int
+) -> tuple[NDArray[np.int32], NDArray[np.float64], IntArray]:
     """Clusters the pixels of a label as scikit-learn's DBSCAN does their coordinates in row-major order.
 
     Args:
         slice_xz: labels, indexed [across, depth].
         label: whose pixels.
-        eps_px: largest distance of neighbours, in pixels.
+        half_widths: of the disc of neighbours, as `disc_half_widths` gives them.
         min_samples: neighbours, the pixel itself included, that make a core pixel.
 
     Returns:
@@ -160,30 +243,39 @@ def cluster_label(
         the lowest-numbered cluster within eps; 0 for noise and background), the mean pixel coordinate of each
         cluster, shape (n_clusters, 2), and its number of pixels, shape (n_clusters,).
     """
+    row_first, mask, clusters, sums = _cluster(slice_xz, label, half_widths, min_samples)
+    n_clusters = sums.shape[0] - 1
     image = np.zeros(slice_xz.shape, dtype=np.int32)
-    row_first, row_stop, col_first, col_stop = _bounding_box(slice_xz, label)
-    mask = slice_xz[row_first:row_stop, col_first:col_stop] == label
-    clusters = image[row_first:row_stop, col_first:col_stop]
-    widths = disc_half_widths(eps_px)
-    core = _find_core_pixels(mask, widths, min_samples)
-    n_clusters = _label_core_pixels(core, widths, clusters)
-    centres = np.zeros((n_clusters, 2))
-    sizes = np.zeros(n_clusters, dtype=np.int64)
-    if n_clusters == 0:
-        return image, centres, sizes
     for row in range(mask.shape[0]):
         for col in range(mask.shape[1]):
-            if not mask[row, col]:
-                continue
-            number = clusters[row, col]
-            if number == 0:
-                number = _lowest_core_cluster_near(clusters, core, widths, row, col)
-                # Not a core pixel, so that its number misleads no later border pixel.
-                clusters[row, col] = number
-            if number > 0:
-                centres[number - 1, 0] += row_first + row
-                centres[number - 1, 1] += col_first + col
-                sizes[number - 1] += 1
+            if mask[row, col] and clusters[row, col] < n_clusters:
+                image[row_first + row, col] = clusters[row, col] + 1
+    return image, sums[:n_clusters, 1:] / sums[:n_clusters, :1], sums[:n_clusters, 0].copy()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def summarise_label(
+    slice_xz: Pixels, label: int, half_widths: IntArray, min_samples: int, summary: NDArray[np.float64]
+) -> None:
+    """Clusters the pixels of a label, and keeps of it only what rewards and observations need.
+
+    Args:
+        slice_xz: as in `cluster_label`.
+        label: likewise.
+        half_widths: likewise.
+        min_samples: likewise.
+        summary: filled with the number of clusters, the number of pixels in them, and the mean of their centres,
+            (across, depth) in pixels, 0 where there is none; shape (4,).
+    """
+    sums = _cluster(slice_xz, label, half_widths, min_samples)[3]
+    n_clusters = sums.shape[0] - 1
+    summary[:] = 0.0
+    summary[0] = n_clusters
     for number in range(n_clusters):
-        centres[number] /= sizes[number]
-    return image, centres, sizes
+        n_pixels = sums[number, 0]
+        summary[1] += n_pixels
+        summary[2] += sums[number, 1] / n_pixels
+        summary[3] += sums[number, 2] / n_pixels
+    if n_clusters > 0:
+        summary[2] /= n_clusters
+        summary[3] /= n_clusters

@@ -1,39 +1,122 @@
-"""The landmark tissues and how their pixels in a slice are clustered."""
+"""The landmark tissues and how their pixels in a slice are clustered: by pixels, as published, or by millimetres."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
-from armscan.checks import check_float, check_int
+from armscan.anatomy.clustering import IntArray, count_disc_pixels, disc_half_widths
+from armscan.checks import check_float, check_int, check_numbers
+from armscan.errors import InvalidValueError
+
+USUAL_PIXEL_MM = (0.27, 0.55)
+
+
+class Neighbourhood(NamedTuple):
+    """What makes a core pixel: at least `min_samples` pixels in the disc of these half widths about it."""
+
+    half_widths: IntArray
+    min_samples: int
+
+
+class Tissue(Protocol):
+    """A landmark tissue: its label in a labelmap, and how its pixels are clustered."""
+
+    @property
+    def label(self) -> int:
+        """Its value in a labelmap."""
+
+    def neighbourhood(self, pixel_mm: tuple[float, float]) -> Neighbourhood:
+        """Returns what makes a core pixel in slices of pixels of this size, (across, depth)."""
 
 
 @dataclass(frozen=True)
-class Tissue:
-    """One landmark tissue.
+class PixelTissue:
+    """A tissue clustered by pixels, whatever their size; DBSCAN on the pixel coordinates.
 
     Args:
-        name: as in `TissueClusters`.
         label: its value in a labelmap.
-        eps_px: DBSCAN's neighbourhood radius in pixels.
-        min_samples: neighbours, the point itself included, that make a core point.
-        usual_area_px: clustered pixels that the tissue usually shows, at 0.27 x 0.55 mm a pixel.
+        eps_px: neighbourhood radius in pixels.
+        min_samples: neighbours, the pixel itself included, that make a core pixel.
     """
 
-    name: str
     label: int
     eps_px: float
     min_samples: int
-    usual_area_px: float
 
     def __post_init__(self) -> None:
-        check_int(f"{self.name}: label", self.label, at_least=0, at_most=255)
-        check_float(f"{self.name}: eps_px", self.eps_px, above=0.0, at_most=1000.0)
-        check_int(f"{self.name}: min_samples", self.min_samples, at_least=1)
+        check_int("label", self.label, at_least=0, at_most=255)
+        check_float(f"eps_px of label {self.label}", self.eps_px, above=0.0, at_most=1000.0)
+        check_int(f"min_samples of label {self.label}", self.min_samples, at_least=1)
+
+    def neighbourhood(self, pixel_mm: tuple[float, float]) -> Neighbourhood:
+        """See `Tissue.neighbourhood`."""
+        return Neighbourhood(disc_half_widths(float(self.eps_px)), self.min_samples)
+
+
+@dataclass(frozen=True)
+class MetricTissue:
+    """A tissue clustered by millimetres, so that one setting serves every spacing; DBSCAN on coordinates in mm.
+
+    Args:
+        label: its value in a labelmap.
+        eps_mm: neighbourhood radius in mm.
+        density: tissue in mm2 for each mm2 of the neighbourhood that makes a core pixel, in (0, 1]: the share of the
+            pixels within `eps_mm` that must be of this tissue, the pixel itself included.
+    """
+
+    label: int
+    eps_mm: float
+    density: float
+
+    def __post_init__(self) -> None:
+        check_int("label", self.label, at_least=0, at_most=255)
+        check_float(f"eps_mm of label {self.label}", self.eps_mm, above=0.0, at_most=1000.0)
+        check_float(f"density of label {self.label}", self.density, above=0.0, at_most=1.0)
+
+    def neighbourhood(self, pixel_mm: tuple[float, float]) -> Neighbourhood:
+        """See `Tissue.neighbourhood`."""
+        across_mm, depth_mm = check_numbers("pixel_mm", pixel_mm, 2, "(across, depth) in mm")
+        if min(across_mm, depth_mm) <= 0:
+            raise InvalidValueError(f"pixel_mm is {pixel_mm!r}, but both must be above 0")
+        half_widths = disc_half_widths(float(self.eps_mm), across_mm, depth_mm)
+        return Neighbourhood(half_widths, math.ceil(self.density * count_disc_pixels(half_widths)))
+
+
+class Tissues(NamedTuple):
+    """The landmark tissues in their fixed order."""
+
+    bones: Tissue
+    tendons: Tissue
+    artery: Tissue
 
 
 # Tuned to pixels of about 0.27 mm across and 0.55 mm in depth.
-BONES = Tissue("bones", label=1, eps_px=4.1, min_samples=46, usual_area_px=3000.0)
-TENDONS = Tissue("tendons", label=2, eps_px=3.0, min_samples=18, usual_area_px=1000.0)
-ARTERY = Tissue("artery", label=3, eps_px=1.1, min_samples=4, usual_area_px=100.0)
-TISSUES = (BONES, TENDONS, ARTERY)
-USUAL_PIXEL_MM = (0.27, 0.55)
+BONES = PixelTissue(label=1, eps_px=4.1, min_samples=46)
+TENDONS = PixelTissue(label=2, eps_px=3.0, min_samples=18)
+ARTERY = PixelTissue(label=3, eps_px=1.1, min_samples=4)
+PIXEL_TISSUES = Tissues(BONES, TENDONS, ARTERY)
+
+# Finds what the pixel mode finds at its own spacing, and the same at others, for pixels of up to about 0.55 mm.
+METRIC_TISSUES = Tissues(
+    MetricTissue(label=1, eps_mm=1.6, density=0.94),
+    MetricTissue(label=2, eps_mm=1.2, density=0.62),
+    MetricTissue(label=3, eps_mm=0.6, density=0.8),
+)
+CLUSTERINGS: dict[str, Tissues] = {"pixels": PIXEL_TISSUES, "metric": METRIC_TISSUES}
+
+
+def checked_tissues(clustering: str | Tissues) -> Tissues:
+    """Returns the tissues, given as such or by the name of their clustering.
+
+    Raises:
+        InvalidValueError: if there is no clustering of that name, or what is given is no `Tissues`.
+    """
+    if isinstance(clustering, str) and clustering in CLUSTERINGS:
+        return CLUSTERINGS[clustering]
+    if not isinstance(clustering, Tissues):
+        raise InvalidValueError(
+            f"clustering is {clustering!r}, but it must be {' or '.join(CLUSTERINGS)}, or an armscan.anatomy.Tissues"
+        )
+    return clustering

@@ -1,9 +1,9 @@
-"""The Gymnasium environment: actions, observations, wrappers, rendering."""
+"""The Gymnasium environment: actions, observations, wrappers, its vector form, rendering."""
 
 from armscan.envs.actions import COMPONENTS, PROJECTIONS, ActionBounds
 from armscan.envs.env import ArmscanEnv
+from armscan.envs.making import EnvMaker, make_armscan_env, make_armscan_vector_env
 from armscan.envs.observations import (
-    OBSERVATIONS,
     ActionRewardObservation,
     ClusterObservation,
     MergedObservation,
@@ -12,24 +12,36 @@ from armscan.envs.observations import (
     View,
 )
 from armscan.envs.scene import RandomTransform, Scene
-from armscan.envs.wrappers import BestActionMemory, make_armscan_env
+from armscan.envs.slice_observations import SliceChannelsObservation, SliceObservation
+from armscan.envs.spaces import MultiBoxSpace
+from armscan.envs.vector_env import ArmscanVectorEnv
+from armscan.envs.vector_wrappers import VectorBestActionMemory, VectorFrameStack
+from armscan.envs.wrappers import BestActionMemory, FrameStack
 from armscan.volumes.plane import ManipulatorAction
 
 __all__ = [
     "COMPONENTS",
-    "OBSERVATIONS",
     "PROJECTIONS",
     "ActionBounds",
     "ActionRewardObservation",
     "ArmscanEnv",
+    "ArmscanVectorEnv",
     "BestActionMemory",
     "ClusterObservation",
+    "EnvMaker",
+    "FrameStack",
     "ManipulatorAction",
     "MergedObservation",
+    "MultiBoxSpace",
     "Observation",
     "RandomTransform",
     "Scene",
+    "SliceChannelsObservation",
     "SliceGeometry",
+    "SliceObservation",
+    "VectorBestActionMemory",
+    "VectorFrameStack",
     "View",
     "make_armscan_env",
+    "make_armscan_vector_env",
 ]

@@ -41,11 +41,13 @@ class ActionBounds:
         for name, bound in zip(("tx", "ty"), self.translation_mm, strict=True):
             check_float(f"translation bound of {name} in mm", bound, at_least=0.0)
 
-    def denormalised(self, normalised: FloatArray) -> ManipulatorAction:
-        """Returns the plane of a normalised vector, shape (4,)."""
-        rotation = normalised[:2] * self.rotation_deg
-        translation = (normalised[2:] + 1.0) / 2.0 * self.translation_mm
-        return ManipulatorAction((rotation[0], rotation[1]), (translation[0], translation[1]))
+    def denormalised(self, normalised: Sequence[float]) -> ManipulatorAction:
+        """Returns the plane of a normalised vector (rz, rx, tx, ty)."""
+        rz, rx, tx, ty = normalised
+        (bound_rz, bound_rx), (bound_tx, bound_ty) = self.rotation_deg, self.translation_mm
+        return ManipulatorAction(
+            (rz * bound_rz, rx * bound_rx), ((tx + 1.0) / 2.0 * bound_tx, (ty + 1.0) / 2.0 * bound_ty)
+        )
 
     def normalised(self, action: ManipulatorAction) -> FloatArray:
         """Returns the normalised vector of a plane, shape (4,); 0 (a translation: -1) where the bound is zero."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,22 +9,16 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from armscan.anatomy import PUBLISHED_TARGETS, TissueClusters, checked_targets, landmark_reward
-from armscan.checks import check_choice, check_float, check_int, check_numbers
-from armscan.envs.actions import free_components
-from armscan.envs.observations import FloatVector, Observation, View, flat_space, flattened, with_action_reward
-from armscan.envs.scene import RandomTransform, Scene, SceneSampler, slice_geometry
-from armscan.errors import InvalidValueError, ResetNeededError, listed
-from armscan.volumes import LabelVolume, load_phantoms, read_dataset
+from armscan.checks import check_choice
+from armscan.envs.episode import Episode, begin, checked_actions, look, wanted_volume
+from armscan.envs.scene import Scene
+from armscan.envs.task import Observed, Task, Volumes
+from armscan.errors import ResetNeededError
+from armscan.volumes import LabelVolume
 from armscan.volumes.plane import FloatArray, ManipulatorAction
 
-STARTS = ("middle", "random")
-DEFAULT_PHANTOMS = range(4)
 
-Volumes = Mapping[str, LabelVolume] | Sequence[LabelVolume] | str | Path | None
-
-
-class ArmscanEnv(gym.Env[FloatVector, FloatArray]):
+class ArmscanEnv(gym.Env[Observed, FloatArray]):
     """Moves a slicing plane through a labelmap of an arm until the slice shows the carpal tunnel.
 
     ## Description
@@ -39,16 +31,21 @@ class ArmscanEnv(gym.Env[FloatVector, FloatArray]):
     plane's. Values outside [-1, 1] are clipped; a NaN or infinity, or another shape, raises `InvalidValueError`.
 
     ## Observation space
-    A flat `Box` of 32-bit floats: the parts of the chosen observation, the last action (n_free), the reward (1).
+    The parts of the chosen observation, then `action`, the last one (n_free), and `reward` (1), of the current slice.
+    Where all of them are vectors, they come as one flat `Box` of 32-bit floats, otherwise as a `MultiBoxSpace`, a
+    `Dict` of boxes; `flat` decides otherwise.
 
-    | observation | parts before action and reward |
-    | --- | --- |
-    | `action_reward` | none |
-    | `cluster` | for bones, tendons, artery each: clusters, clustered pixels, mean centre (across, depth): 12 numbers |
+    | observation | part before action and reward | shape |
+    | --- | --- | --- |
+    | `action_reward` | none | |
+    | `cluster` | `clusters`: number, pixels, mean centre of bones, tendons, artery, normalised | (12,) |
+    | `slice` | `slice`: the labels, 0 to 4, uint8 | (across, depth) |
+    | `slice_channels` | `channels`: where bones, tendons, artery are, 0 or 1, uint8 | (3, across, depth) |
+    | a list of them | all of them | |
 
     ## Rewards
-    `landmark_reward` of the slice, in [-1, 0]: 0 where every count is on target, no tissue is missing, and the tendons
-    lie between bones and artery.
+    `LandmarkReward` of the slice, in [-1, 0]: 0 where every count is on target, no tissue is missing, and the tendons
+    lie between bones and artery; or another `reward`.
 
     ## Starting state
     The fixed components at the optimum; the free ones at normalised 0 (`start="middle"`) or drawn (`start="random"`).
@@ -65,16 +62,21 @@ class ArmscanEnv(gym.Env[FloatVector, FloatArray]):
 
     Args:
         volumes: volumes by name or in a sequence, or the folder of a dataset; four phantoms where it is None.
-        observation: what the agent sees, by name or as an object.
+        render_mode: `rgb_array` or None.
+        observation: what the agent sees: a name of the table above, a list of names, or an object with the methods of
+            `Observation`.
+        flat: whether the observation is one vector; None makes it one where every part is a vector.
         projection: which components are free: `x`, `y`, `xy`, `zy`, `full`, or a list of `rz`, `rx`, `tx`, `ty`.
-        targets: clusters of bones, tendons and artery that the wanted plane shows.
+        reward: an object with the methods of `armscan.anatomy.Reward`; the published one where it is None. One that
+            is fitted to labelled planes, and is not yet, is fitted to those of these volumes.
+        targets: clusters of bones, tendons and artery that the published reward wants.
+        clustering: `pixels`, as published, `metric`, which serves every spacing, or an `armscan.anatomy.Tissues`.
         delta: the episode ends above -delta.
         max_steps: steps after which an episode is truncated.
         start: `middle` or `random`.
         rotation_bounds_deg: bounds of rz and rx.
         translation_bounds_mm: bounds of tx and ty; the current volume's size where it is None.
         transform: the motions of the volume at reset; None leaves it as it is.
-        render_mode: `rgb_array` or None.
 
     Raises:
         InvalidValueError: if an argument is outside what is allowed.
@@ -86,107 +88,60 @@ class ArmscanEnv(gym.Env[FloatVector, FloatArray]):
         "render_fps": 4,
     }
 
-    def __init__(
-        self,
-        volumes: Volumes = None,
-        *,
-        observation: str | Observation = "cluster",
-        projection: str | Sequence[str] = "y",
-        targets: Sequence[int] = PUBLISHED_TARGETS,
-        delta: float = 0.05,
-        max_steps: int = 50,
-        start: str = "middle",
-        rotation_bounds_deg: tuple[float, float] = (180.0, 180.0),
-        translation_bounds_mm: tuple[float, float] | None = None,
-        transform: RandomTransform | None = RandomTransform(),  # noqa: B008 - it is immutable
-        render_mode: str | None = None,
-    ) -> None:
-        self.volumes = named_volumes(volumes)
-        self.targets = checked_targets(targets)
-        self.delta = check_float("delta", delta, above=0.0, at_most=1.0)
-        self.max_steps = check_int("max_steps", max_steps, at_least=1)
-        self.start = check_choice("start", start, STARTS)
+    def __init__(self, volumes: Volumes = None, *, render_mode: str | None = None, **rules: Any) -> None:
         self.render_mode = check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        rotation = check_numbers("rotation_bounds_deg", rotation_bounds_deg, 2, "for rz and rx")
-        if translation_bounds_mm is not None:
-            translation = check_numbers("translation_bounds_mm", translation_bounds_mm, 2, "for tx and ty")
-            translation_bounds_mm = (translation[0], translation[1])
-        self._sampler = SceneSampler(
-            rotation_bounds_deg=(rotation[0], rotation[1]),
-            translation_bounds_mm=translation_bounds_mm,
-            transform=transform,
-            delta=self.delta,
-            targets=self.targets,
-        )
-        for volume in self.volumes.values():
-            self._sampler.check(volume)
-        self._names = list(self.volumes)
-        self._free = list(free_components(projection))
-        self._observation = with_action_reward(observation)
-        parts = self._observation.spaces([slice_geometry(v) for v in self.volumes.values()], len(self._free))
-        self.observation_space: spaces.Box = flat_space(parts)  # type: ignore[assignment]
-        self.action_space: spaces.Box = spaces.Box(  # type: ignore[assignment]
-            -1.0, 1.0, (len(self._free),), np.float32
-        )
-        self._scene: Scene | None = None
-        self._running = False
+        self.task = Task(volumes, **rules)
+        self.observation_space = self.task.observation_space  # type: ignore[assignment]
+        self.action_space: spaces.Box = self.task.action_space  # type: ignore[assignment]
+        self._episode: Episode | None = None
 
     @property
-    def scene(self) -> Scene:
-        """The volume of the current episode and where its optimal plane lies.
+    def volumes(self) -> dict[str, LabelVolume]:
+        """The volumes by name."""
+        return self.task.volumes
+
+    @property
+    def episode(self) -> Episode:
+        """The current episode.
 
         Raises:
             ResetNeededError: before the first reset.
         """
-        if self._scene is None:
+        if self._episode is None:
             raise ResetNeededError("the environment has no episode yet: call reset() first")
-        return self._scene
+        return self._episode
+
+    @property
+    def scene(self) -> Scene:
+        """The volume of the current episode and where its optimal plane lies."""
+        return self.episode.scene
 
     @property
     def plane(self) -> ManipulatorAction:
         """The current plane, in the moved volume's frame."""
-        _ = self.scene
-        return self._plane
+        return self.episode.plane
 
     @property
     def slice_xz(self) -> NDArray[np.uint8]:
         """The current slice, indexed [across, depth]."""
-        _ = self.scene
-        return self._view.slice_xz
+        return self.episode.view.slice_xz
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatVector, dict[str, Any]]:
+    ) -> tuple[Observed, dict[str, Any]]:
         """Starts an episode; `options={"volume": name}` chooses its volume."""
         super().reset(seed=seed)
-        self._scene = self._sampler.draw(self._drawn_volume(options or {}), self.np_random)
-        n_free = len(self._free)
-        action = np.zeros(n_free) if self.start == "middle" else self.np_random.uniform(-1.0, 1.0, n_free)
-        self._n_steps = 0
-        self._running = True
-        self._starts_solved = False
-        self._place(action)
-        self._starts_solved = self._view.reward > -self.delta
-        return self._observed(), self._info()
+        (self._episode,) = begin(self.task, [self.np_random], wanted_volume(self.task, options))
+        return self._seen()
 
-    def step(self, action: FloatArray) -> tuple[FloatVector, float, bool, bool, dict[str, Any]]:
+    def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Places the plane; see the class for what comes back."""
-        if not self._running:
+        episode = self._episode
+        if episode is None or not episode.is_running:
             raise ResetNeededError("the episode has ended or not begun: call reset() before step()")
-        try:
-            received = np.asarray(action, dtype=np.float64)
-        except (TypeError, ValueError):
-            received = np.empty(0)
-        if received.shape != self.action_space.shape or not np.isfinite(received).all():
-            raise InvalidValueError(
-                f"action is {action!r}, but it must be an array of shape {self.action_space.shape} of finite numbers"
-            )
-        self._place(np.clip(received, -1.0, 1.0))
-        self._n_steps += 1
-        terminated = self._view.reward > -self.delta
-        truncated = not terminated and self._n_steps >= self.max_steps
-        self._running = not (terminated or truncated)
-        return self._observed(), self._view.reward, terminated, truncated, self._info()
+        episode.aim(checked_actions(action, self.action_space.shape))
+        observation, info = self._seen()
+        return observation, episode.view.reward, episode.is_solved, episode.is_truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Returns a picture of the current step, shape (height, width, 3), None without a render mode."""
@@ -196,71 +151,8 @@ class ArmscanEnv(gym.Env[FloatVector, FloatArray]):
         # Deferred: drawing is not needed to step.
         from armscan.envs.rendering import draw_frame
 
-        return draw_frame(self.scene, self._plane, self._view, self._n_steps)
+        return draw_frame(self.scene, self.plane, self.episode.view, self.episode.n_steps)
 
-    def _drawn_volume(self, options: dict[str, Any]) -> LabelVolume:
-        if not isinstance(options, dict):
-            raise InvalidValueError(
-                f"reset options are {options!r}, but they must be a dict such as {{'volume': name}}"
-            )
-        if unknown := sorted(map(str, options.keys() - {"volume"})):
-            raise InvalidValueError(f"reset option is {listed(unknown)}, but only 'volume' is known")
-        if "volume" in options:
-            return self.volumes[check_choice("reset option 'volume'", options["volume"], self._names)]
-        return self.volumes[self._names[int(self.np_random.integers(len(self._names)))]]
-
-    def _place(self, action: FloatArray) -> None:
-        """Moves the plane; the slice, its clusters and the reward are computed here, once a step."""
-        normalised = self.scene.optimum_normalised.copy()
-        normalised[self._free] = action
-        volume = self.scene.volume
-        self._plane = self.scene.bounds.denormalised(normalised)
-        slice_xz = volume.slice(self._plane, transform=self.scene.transform)
-        clusters = TissueClusters.from_slice(slice_xz)
-        reward = landmark_reward(clusters, self.targets)
-        self._view = View(slice_xz, clusters, slice_geometry(volume), action, reward)
-
-    def _observed(self) -> FloatVector:
-        return flattened(self._observation.observe(self._view))
-
-    def _info(self) -> dict[str, Any]:
-        distance_mm, distance_deg = self.scene.distance(self._plane)
-        return {
-            "volume": self.scene.volume.name,
-            "rotation_deg": np.array(self._plane.rotation),
-            "translation_mm": np.array(self._plane.translation),
-            "counts": np.array(self._view.clusters.counts),
-            "is_success": self._view.reward > -self.delta,
-            "starts_solved": self._starts_solved,
-            "action": self._view.action.astype(np.float32),
-            "reward": self._view.reward,
-            "distance_mm": distance_mm,
-            "distance_deg": distance_deg,
-        }
-
-
-def named_volumes(volumes: Volumes) -> dict[str, LabelVolume]:
-    """Returns volumes given in any of the ways that `ArmscanEnv` takes, by name.
-
-    Raises:
-        InvalidValueError: if there is none, something else is among them, or two have the same name.
-    """
-    if volumes is None:
-        return load_phantoms(DEFAULT_PHANTOMS)
-    if isinstance(volumes, str | Path):
-        return read_dataset(volumes)
-    if isinstance(volumes, Mapping):
-        listed_volumes = list(volumes.values())
-    elif isinstance(volumes, list | tuple):
-        listed_volumes = list(volumes)
-    else:
-        raise InvalidValueError(f"volumes is {volumes!r}, but it must be volumes by name or in a list, or a folder")
-    if not listed_volumes:
-        raise InvalidValueError("volumes is empty, but an environment needs at least one")
-    for volume in listed_volumes:
-        if not isinstance(volume, LabelVolume):
-            raise InvalidValueError(f"volumes holds {volume!r}, but each must be a LabelVolume")
-    named = {volume.name: volume for volume in listed_volumes}
-    if len(named) < len(listed_volumes):
-        raise InvalidValueError(f"volumes holds two of the same name among {listed(v.name for v in listed_volumes)}")
-    return named
+    def _seen(self) -> tuple[Observed, dict[str, Any]]:
+        look(self.task, [self.episode])
+        return self.task.observe(self.episode.view), self.episode.info()

@@ -1,22 +1,32 @@
-"""What an agent gets to see: named parts, each with its space, that can be merged and flattened."""
+"""What an agent gets to see: named parts, each with its space, that can be merged."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from armscan.anatomy import PUBLISHED_TARGETS, TISSUES, USUAL_PIXEL_MM, TissueClusters, checked_targets
+from armscan.anatomy import (
+    PUBLISHED_TARGETS,
+    USUAL_PIXEL_MM,
+    Landmarks,
+    TissueClusters,
+    Tissues,
+    checked_targets,
+)
 from armscan.checks import check_bool
+from armscan.envs.spaces import Parts
 from armscan.errors import InvalidValueError, listed
 from armscan.volumes.plane import FloatArray
 
-FloatVector = NDArray[np.float32]
-CENTRE_SCALE_MM = np.array([25.0, 12.0])
+# Of bones, tendons and artery, at the usual pixel size.
+USUAL_AREAS_PX = (3000.0, 1000.0, 100.0)
+CENTRE_SCALE_MM = (25.0, 12.0)
 
 
 @dataclass(frozen=True)
@@ -27,23 +37,37 @@ class SliceGeometry:
     pixel_mm: tuple[float, float]
 
 
-@dataclass(frozen=True, eq=False)
+def smallest_shape(geometries: Sequence[SliceGeometry]) -> tuple[int, int]:
+    """Returns the shape that slices of every geometry have at least."""
+    return min(g.shape[0] for g in geometries), min(g.shape[1] for g in geometries)
+
+
+@dataclass(eq=False)
 class View:
     """What the environment shows an observation at one step.
 
     Args:
         slice_xz: the slice's labels, indexed [across, depth].
-        clusters: its clusters.
-        geometry: its shape and pixel size.
+        landmarks: the summary of its clusters, shape (3, 4).
+        tissues: how they were clustered.
+        geometry: the slice's shape and pixel size.
+        smallest_shape: shape that the slices of every volume have at least, (across, depth).
         action: the free components of the last action, normalised, shape (n_free,).
         reward: the reward of the slice.
     """
 
     slice_xz: NDArray[np.uint8]
-    clusters: TissueClusters
+    landmarks: Landmarks
+    tissues: Tissues
     geometry: SliceGeometry
+    smallest_shape: tuple[int, int]
     action: FloatArray
     reward: float
+
+    @cached_property
+    def clusters(self) -> TissueClusters:
+        """The clusters themselves, found again when they are asked for."""
+        return TissueClusters.from_slice(self.slice_xz, **self.tissues._asdict(), pixel_mm=self.geometry.pixel_mm)
 
 
 class Observation(Protocol):
@@ -52,7 +76,7 @@ class Observation(Protocol):
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """Returns the space of each part, for every geometry that can occur and `n_free` action components."""
 
-    def observe(self, view: View) -> dict[str, FloatVector]:
+    def observe(self, view: View) -> Parts:
         """Returns the value of each part, within its space."""
 
 
@@ -66,7 +90,7 @@ class ActionRewardObservation:
             "reward": spaces.Box(-1.0, 0.0, (1,), np.float32),
         }
 
-    def observe(self, view: View) -> dict[str, FloatVector]:
+    def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
         return {"action": view.action.astype(np.float32), "reward": np.array([view.reward], dtype=np.float32)}
 
@@ -86,51 +110,63 @@ class ClusterObservation:
     def __init__(self, *, normalised: bool = True, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
         self.normalised = check_bool("normalised", normalised)
         self._targets = checked_targets(targets)
+        self._scales: dict[SliceGeometry, tuple[FloatArray, FloatArray]] = {}
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
-        highest = np.max([self._features(self._most(geometry), geometry) for geometry in geometries], axis=0)
+        highest = np.max([self._features(_most_landmarks(geometry), geometry) for geometry in geometries], axis=0)
         lowest = np.zeros_like(highest)
         if self.normalised:
             lowest[:, 2:] = -highest[:, 2:]
         return {"clusters": spaces.Box(lowest.ravel(), highest.ravel(), dtype=np.float32)}
 
-    def observe(self, view: View) -> dict[str, FloatVector]:
+    def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
-        raw = np.array([[len(tissue), tissue.n_points, *tissue.mean_centre] for tissue in view.clusters.each()])
-        return {"clusters": self._features(raw, view.geometry).ravel()}
+        return {"clusters": self._features(view.landmarks, view.geometry).ravel()}
 
-    @staticmethod
-    def _most(geometry: SliceGeometry) -> FloatArray:
-        """The largest raw features that a slice could have, shape (3, 4)."""
-        n_pixels = geometry.shape[0] * geometry.shape[1]
-        return np.array(
-            [[n_pixels, n_pixels, geometry.shape[0] - 1, geometry.shape[1] - 1]] * len(TISSUES), dtype=float
-        )
-
-    def _features(self, raw: FloatArray, geometry: SliceGeometry) -> FloatVector:
-        """Turns raw features, shape (3, 4), into the wanted form."""
+    def _features(self, landmarks: Landmarks, geometry: SliceGeometry) -> NDArray[np.float32]:
+        """Turns a summary of clusters, shape (3, 4), into the wanted form."""
         if not self.normalised:
-            return raw.astype(np.float32)
-        features = raw.copy()
-        features[:, 0] /= self._targets
-        pixel_scale = np.prod(geometry.pixel_mm) / np.prod(USUAL_PIXEL_MM)
-        features[:, 1] *= pixel_scale / np.array([tissue.usual_area_px for tissue in TISSUES])
-        middle_px = (np.array(geometry.shape) - 1) / 2
-        centres = (raw[:, 2:] - middle_px) * geometry.pixel_mm / CENTRE_SCALE_MM
-        features[:, 2:] = np.where(raw[:, :1] > 0, centres, 0.0)
+            return landmarks.astype(np.float32)
+        if geometry not in self._scales:
+            self._scales[geometry] = self._scale(geometry)
+        zero, scale = self._scales[geometry]
+        features = (landmarks - zero) * scale
+        features[landmarks[:, 0] == 0] = 0.0
         return features.astype(np.float32)
+
+    def _scale(self, geometry: SliceGeometry) -> tuple[FloatArray, FloatArray]:
+        """What is subtracted of a summary, and what it is then multiplied by, each shape (3, 4)."""
+        zero, scale = np.zeros((3, 4)), np.empty((3, 4))
+        zero[:, 2:] = (np.array(geometry.shape) - 1) / 2
+        scale[:, 0] = 1.0 / np.array(self._targets)
+        scale[:, 1] = np.prod(geometry.pixel_mm) / np.prod(USUAL_PIXEL_MM) / np.array(USUAL_AREAS_PX)
+        scale[:, 2:] = np.array(geometry.pixel_mm) / CENTRE_SCALE_MM
+        return zero, scale
+
+
+def _most_landmarks(geometry: SliceGeometry) -> Landmarks:
+    """The largest summary that a slice could have, shape (3, 4)."""
+    n_across, n_depth = geometry.shape
+    # At least 1, so that a slice of one pixel's thickness has a space that is not a single point.
+    most = [n_across * n_depth, n_across * n_depth, max(1, n_across - 1), max(1, n_depth - 1)]
+    return np.array([most] * len(USUAL_AREAS_PX), dtype=float)
 
 
 class MergedObservation:
     """Several observations as one.
 
     Args:
-        observations: what to merge; no two may have a part of the same name.
+        observations: what to merge, as objects or by name; no two may have a part of the same name.
+
+    Raises:
+        InvalidValueError: if there is none, or one is no observation.
     """
 
-    def __init__(self, observations: Sequence[Observation]) -> None:
-        self.observations = tuple(observations)
+    def __init__(self, observations: Sequence[str | Observation]) -> None:
+        if isinstance(observations, str) or not isinstance(observations, Sequence) or not observations:
+            raise InvalidValueError(f"observations is {observations!r}, but it must be a list of at least one")
+        self.observations = tuple(checked_observation(observation) for observation in observations)
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`.
@@ -146,49 +182,48 @@ class MergedObservation:
             merged.update(parts)
         return merged
 
-    def observe(self, view: View) -> dict[str, FloatVector]:
+    def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
         return {key: part for observation in self.observations for key, part in observation.observe(view).items()}
 
 
-OBSERVATIONS: Mapping[str, type[ActionRewardObservation] | type[ClusterObservation]] = {
-    "action_reward": ActionRewardObservation,
-    "cluster": ClusterObservation,
-}
+def named_observations() -> Mapping[str, type[Observation]]:
+    """Returns the observations that have a name."""
+    # Deferred: the module of the slices builds on this one.
+    from armscan.envs.slice_observations import SliceChannelsObservation, SliceObservation
+
+    return {
+        "action_reward": ActionRewardObservation,
+        "cluster": ClusterObservation,
+        "slice": SliceObservation,
+        "slice_channels": SliceChannelsObservation,
+    }
 
 
-def with_action_reward(observation: str | Observation) -> Observation:
-    """Returns the observation, given as such or by name, with action and reward, which are part of every one.
+def checked_observation(observation: str | Observation | Sequence[str | Observation]) -> Observation:
+    """Returns an observation given as such, by name, or as a list of those that are merged.
 
     Raises:
-        InvalidValueError: if there is no observation of that name.
+        InvalidValueError: if there is no observation of that name, or it is no observation.
     """
-    if isinstance(observation, str):
-        if observation not in OBSERVATIONS:
-            raise InvalidValueError(f"observation is {observation!r}, but it must be {listed(OBSERVATIONS)}")
-        observation = OBSERVATIONS[observation]()
-    is_class = isinstance(observation, type)
-    if (
-        is_class
-        or not callable(getattr(observation, "spaces", None))
-        or not callable(getattr(observation, "observe", None))
-    ):
+    names = named_observations()
+    if isinstance(observation, str) and observation in names:
+        return names[observation]()
+    if isinstance(observation, list | tuple):
+        return MergedObservation(observation)
+    has_methods = all(callable(getattr(observation, method, None)) for method in ("spaces", "observe"))
+    if isinstance(observation, str | type) or not has_methods:
         raise InvalidValueError(
-            f"observation is {observation!r}, but it must be {listed(OBSERVATIONS)}, or an object with the methods of "
-            "Observation"
+            f"observation is {observation!r}, but it must be {listed(names)}, a list of them, or an object with the "
+            "methods of Observation"
         )
-    if isinstance(observation, ActionRewardObservation):
-        return observation
-    return MergedObservation([observation, ActionRewardObservation()])
+    return observation  # type: ignore[return-value]
 
 
-def flat_space(parts: Mapping[str, spaces.Box]) -> spaces.Box:
-    """Returns the space of the flattened parts, in their order."""
-    low = np.concatenate([space.low.ravel() for space in parts.values()])
-    high = np.concatenate([space.high.ravel() for space in parts.values()])
-    return spaces.Box(low, high, dtype=np.float32)
-
-
-def flattened(parts: Mapping[str, FloatVector]) -> FloatVector:
-    """Returns the parts as one vector, in the order of `flat_space`."""
-    return np.concatenate([part.ravel() for part in parts.values()])
+def with_action_reward(observation: str | Observation | Sequence[str | Observation]) -> Observation:
+    """Returns the observation with action and reward, which are part of every one."""
+    checked = checked_observation(observation)
+    members = checked.observations if isinstance(checked, MergedObservation) else (checked,)
+    if any(isinstance(member, ActionRewardObservation) for member in members):
+        return checked
+    return MergedObservation([*members, ActionRewardObservation()])

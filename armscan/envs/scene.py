@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from armscan.anatomy import TissueClusters, landmark_reward
 from armscan.checks import check_choice, check_float
 from armscan.envs.actions import ActionBounds
 from armscan.envs.observations import SliceGeometry
@@ -16,7 +14,6 @@ from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, plane_distance, slid_into
 from armscan.volumes.volume import LabelVolume
 
-MAX_DRAWS = 1000
 MAX_SHIFT_MM = 10_000.0
 CENTRES = ("middle", "first_voxel")
 
@@ -76,6 +73,12 @@ class Scene:
         """The optimal plane as a normalised vector, shape (4,)."""
         return self.bounds.normalised(self.optimum)
 
+    def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
+        """Returns (M, b): a point p of the plane's frame lies at M p + b in the volume as it was read."""
+        if self.transform is None:
+            return action.matrix, action.offset_mm
+        return self.transform.plane_map(action)
+
     def distance(self, action: ManipulatorAction) -> tuple[float, float]:
         """Returns how far a plane is from the optimal one, as `plane_distance` does: (mm, degrees)."""
         centre_mm = self.volume.centre_mm
@@ -90,15 +93,11 @@ class SceneSampler:
         rotation_bounds_deg: bounds of rz and rx.
         translation_bounds_mm: bounds of tx and ty, None for each volume's own size.
         transform: the motions to draw from, None for none.
-        delta: the optimal plane of every scene scores above -delta.
-        targets: of the reward.
     """
 
     rotation_bounds_deg: tuple[float, float]
     translation_bounds_mm: tuple[float, float] | None
     transform: RandomTransform | None
-    delta: float
-    targets: Sequence[int]
 
     def __post_init__(self) -> None:
         if self.transform is not None and not isinstance(self.transform, RandomTransform):
@@ -109,8 +108,13 @@ class SceneSampler:
         size_mm = volume.size_mm
         return ActionBounds(self.rotation_bounds_deg, self.translation_bounds_mm or (size_mm[0], size_mm[1]))
 
-    def check(self, volume: LabelVolume) -> None:
-        """Raises `OptimalPlaneError` unless scenes of this volume can be drawn."""
+    def unmoved(self, volume: LabelVolume) -> Scene:
+        """Returns the scene of a volume as it is.
+
+        Raises:
+            OptimalPlaneError: if scenes of this volume cannot be drawn, because it has no labelled plane, or the plane
+                can leave the bounds of the rotations, or it misses the volume.
+        """
         if volume.optimal_action is None:
             raise OptimalPlaneError(f"{volume.name}: has no labelled optimal plane, which an environment needs")
         turns = (0.0, 0.0) if self.transform is None else (self.transform.rz_deg, self.transform.rx_deg)
@@ -129,30 +133,13 @@ class SceneSampler:
                 f"rotations within +-{self.rotation_bounds_deg} degrees, translations from 0 to "
                 f"{self.bounds(volume).translation_mm} mm"
             )
-        reward, counts = self._seen_at_optimum(scene)
-        if reward <= -self.delta:
-            raise OptimalPlaneError(
-                f"{volume.name}: the labelled optimal plane scores {reward:.3f} (bones, tendons, artery: {counts}), "
-                f"but it must score above -delta = {-self.delta:g}"
-            )
+        return scene
 
-    def draw(self, volume: LabelVolume, rng: np.random.Generator) -> Scene:
-        """Draws a scene of a volume that passes `check`.
-
-        Raises:
-            OptimalPlaneError: if no transform in a thousand leaves the optimal plane within the bounds and rewarded.
-        """
-        for _ in range(MAX_DRAWS):
-            scene = self._scene(volume, self.transform.draw(volume, rng) if self.transform else None)
-            if scene is not None and self._seen_at_optimum(scene)[0] > -self.delta:
-                return scene
-        raise OptimalPlaneError(
-            f"{volume.name}: no transform of {MAX_DRAWS} drawn from {self.transform} keeps the optimal plane within "
-            f"the bounds {self.bounds(volume)} and its reward above -delta = {-self.delta:g}"
-        )
+    def propose(self, volume: LabelVolume, rng: np.random.Generator) -> Scene | None:
+        """Draws a motion of the volume; None where it takes the optimal plane out of the bounds."""
+        return self._scene(volume, self.transform.draw(volume, rng) if self.transform else None)
 
     def _scene(self, volume: LabelVolume, transform: RigidTransform | None) -> Scene | None:
-        """Places the optimal plane; None where it falls outside the bounds."""
         assert volume.optimal_action is not None
         bounds = self.bounds(volume)
         optimum = volume.optimal_action if transform is None else transform.inverse_plane(volume.optimal_action)
@@ -160,10 +147,6 @@ class SceneSampler:
         if within is None or (np.abs(within.rotation) > self.rotation_bounds_deg).any():
             return None
         return Scene(volume, transform, within, bounds)
-
-    def _seen_at_optimum(self, scene: Scene) -> tuple[float, tuple[int, int, int]]:
-        clusters = TissueClusters.from_slice(scene.volume.slice(scene.optimum, transform=scene.transform))
-        return landmark_reward(clusters, self.targets), clusters.counts
 
 
 def slice_geometry(volume: LabelVolume) -> SliceGeometry:

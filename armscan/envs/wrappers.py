@@ -1,87 +1,135 @@
-"""What is put around the environment: memory of the best actions, and the making of a whole stack of wrappers."""
+"""What is put around the environment: frame stack and memory of the best actions.
+
+Gymnasium's own frame stack leaves out no part of an observation and copies every frame twice; with images that is most
+of a step.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
-from gymnasium.wrappers import FlattenObservation, FrameStackObservation
+from gymnasium.utils import RecordConstructorArgs
 
 from armscan.checks import check_int
-from armscan.envs.env import ArmscanEnv, Volumes
-from armscan.envs.observations import FloatVector
+from armscan.envs.history import (
+    FLAT,
+    BestPairs,
+    FrameHistory,
+    boxes_of,
+    observation_of,
+    parts_of,
+    space_of,
+)
+from armscan.envs.spaces import Parts, flat_space
+from armscan.envs.task import Observed
+from armscan.errors import InvalidValueError
 from armscan.volumes.plane import FloatArray
 
+Env = gym.Env[Any, FloatArray]
+MEMORY = "memory"
+# Of the one environment that is wrapped.
+ALL = np.array([True])
 
-class BestActionMemory(gym.Wrapper[FloatVector, FloatArray, FloatVector, FloatArray]):
-    """Appends the best (action, reward) pairs of the episode so far to a flat observation.
 
-    The pairs are ordered from the best to the worst, among equal rewards the earlier first. At reset all of them are
-    the first plane's; a new pair enters only if its reward beats the worst one kept.
-
-    Args:
-        env: an environment with a flat observation and an `info` with `action` and `reward`.
-        size: how many pairs are kept.
-
-    Raises:
-        InvalidValueError: if `size` is not a whole number of at least 1.
-    """
-
-    def __init__(self, env: gym.Env[FloatVector, FloatArray], size: int) -> None:
-        super().__init__(env)
-        self.size = check_int("memory", size, at_least=1)
-        flat, action = env.observation_space, env.action_space
-        assert isinstance(flat, spaces.Box)
-        assert isinstance(action, spaces.Box)
-        low = np.concatenate([flat.low, np.tile([*action.low, -1.0], self.size)]).astype(np.float32)
-        high = np.concatenate([flat.high, np.tile([*action.high, 0.0], self.size)]).astype(np.float32)
-        self.observation_space = spaces.Box(low, high, dtype=np.float32)
+class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs):
+    """A wrapper whose observation depends on those before it in the episode."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatVector, dict[str, Any]]:
-        """Starts an episode, every pair being the first plane's."""
+    ) -> tuple[Observed, dict[str, Any]]:
+        """Starts an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._pairs = np.tile(_pair(info), (self.size, 1))
-        return self._remembering(observation), info
+        return self._remembering(observation, info, is_first=True), info
 
-    def step(self, action: FloatArray) -> tuple[FloatVector, float, bool, bool, dict[str, Any]]:
-        """Steps, and remembers the plane if it is among the best."""
+    def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
+        """Takes a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        pair = _pair(info)
-        if pair[-1] > self._pairs[-1, -1]:
-            self._pairs[-1] = pair
-            self._pairs = self._pairs[np.argsort(-self._pairs[:, -1], kind="stable")]
-        return self._remembering(observation), float(reward), terminated, truncated, info
+        return self._remembering(observation, info, is_first=False), float(reward), terminated, truncated, info
 
-    def _remembering(self, observation: FloatVector) -> FloatVector:
-        return np.concatenate([observation, self._pairs.ravel()])
+    def _remembering(self, observation: Observed, info: dict[str, Any], *, is_first: bool) -> Observed:
+        raise NotImplementedError
 
 
-def _pair(info: dict[str, Any]) -> FloatVector:
-    """One row of the memory: the normalised free components, then the reward."""
-    return np.append(info["action"], np.float32(info["reward"])).astype(np.float32)
+class FrameStack(_Remembering):
+    """Stacks the last observations, from the oldest to the latest, the first one of an episode filling the stack.
 
-
-def make_armscan_env(
-    volumes: Volumes = None, *, stack: int = 1, memory: int = 0, **kwargs: Any
-) -> gym.Env[FloatVector, FloatArray]:
-    """Makes an environment with its wrappers; this is what `gymnasium.make("armscan/Armscan-v0", ...)` calls.
+    A vector of n numbers becomes one of `stack` * n; in a `Dict` each part gets a leading axis of length `stack`.
 
     Args:
-        volumes: as in `ArmscanEnv`.
-        stack: how many of the last observations are stacked, the first one filling the stack at reset.
-        memory: how many of the best (action, reward) pairs are appended, after the stack; 0 for none.
-        **kwargs: the other arguments of `ArmscanEnv`.
+        env: an environment whose observation is a vector or a `Dict` of boxes.
+        stack: how many observations.
+        exclude: parts of a `Dict` observation that are not stacked.
 
-    Returns:
-        The environment, its observation flat.
+    Raises:
+        InvalidValueError: if `stack` is not a whole number of at least 1, or a part to leave out does not exist.
     """
-    env: gym.Env[FloatVector, FloatArray] = ArmscanEnv(volumes, **kwargs)
-    if check_int("stack", stack, at_least=1) > 1:
-        env = FlattenObservation(FrameStackObservation(env, stack, padding_type="reset"))
-    if check_int("memory", memory, at_least=0) > 0:
-        env = BestActionMemory(env, memory)
-    return env
+
+    def __init__(self, env: Env, stack: int, *, exclude: Collection[str] = ()) -> None:
+        RecordConstructorArgs.__init__(self, stack=stack, exclude=exclude)
+        gym.Wrapper.__init__(self, env)
+        size = check_int("stack", stack, at_least=1)
+        self._history = FrameHistory(boxes_of(env.observation_space, "FrameStack"), size, exclude, 1)
+        self.observation_space = space_of(self._history.boxes)
+
+    def _remembering(self, observation: Observed, info: dict[str, Any], *, is_first: bool) -> Observed:
+        batch = {name: part[None] for name, part in parts_of(observation).items()}
+        if is_first:
+            self._history.refill(batch, ALL)
+        else:
+            self._history.push(batch)
+        return observation_of({name: part[0] for name, part in self._history.stacked(batch).items()})
+
+
+class BestActionMemory(_Remembering):
+    """Adds the best (action, reward) pairs of the episode so far, as `BestPairs` orders them, to the observation.
+
+    They are appended to a vector, and become the part `memory` of a `Dict`.
+
+    Args:
+        env: an environment whose observation is a vector or a `Dict` of boxes, and whose `info` has `action` and
+            `reward`.
+        memory: how many pairs.
+
+    Raises:
+        InvalidValueError: if `memory` is not a whole number of at least 1, or the observation has a part of that name.
+    """
+
+    def __init__(self, env: Env, memory: int) -> None:
+        RecordConstructorArgs.__init__(self, memory=memory)
+        gym.Wrapper.__init__(self, env)
+        n_free = int(np.prod(env.action_space.shape or ()))
+        self._best = BestPairs(check_int("memory", memory, at_least=1), n_free, 1)
+        self.observation_space = space_of(
+            with_memory_box(boxes_of(env.observation_space, "BestActionMemory"), self._best)
+        )
+
+    def _remembering(self, observation: Observed, info: dict[str, Any], *, is_first: bool) -> Observed:
+        actions, rewards = info["action"][None], np.array([info["reward"]])
+        if is_first:
+            self._best.refill(actions, rewards, ALL)
+        else:
+            self._best.push(actions, rewards)
+        return observation_of(with_memory(parts_of(observation), self._best.flat()[0]))
+
+
+def with_memory_box(boxes: dict[str, gym.spaces.Box], best: BestPairs) -> dict[str, gym.spaces.Box]:
+    """Returns the boxes of an observation with a memory.
+
+    Raises:
+        InvalidValueError: if there is a part of that name already.
+    """
+    if MEMORY in boxes:
+        raise InvalidValueError(f"the observation already has a part {MEMORY!r}, which BestActionMemory adds")
+    if FLAT in boxes:
+        return {FLAT: flat_space({FLAT: boxes[FLAT], MEMORY: best.box})}
+    return {**boxes, MEMORY: best.box}
+
+
+def with_memory(parts: Parts, pairs: np.ndarray[Any, np.dtype[np.float32]]) -> Parts:
+    """Returns the parts of an observation, or of a batch, with the pairs."""
+    if FLAT in parts:
+        return {FLAT: np.concatenate([parts[FLAT], pairs], axis=-1)}
+    return {**parts, MEMORY: pairs}

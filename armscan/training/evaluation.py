@@ -11,13 +11,13 @@ import gymnasium as gym
 
 from armscan.agents.protocols import Agent
 from armscan.checks import check_int
-from armscan.envs.observations import FloatVector
+from armscan.envs.task import Observed
 from armscan.volumes.plane import FloatArray
 
 # What evaluations are called by, after the volumes that they are on.
 TRAINED_ON, HELD_OUT = "training volumes", "held-out volumes"
 
-Env = gym.Env[FloatVector, FloatArray]
+Env = gym.Env[Observed, FloatArray]
 
 
 @dataclass(frozen=True, kw_only=True)

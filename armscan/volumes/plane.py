@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,16 +17,31 @@ from armscan.errors import InvalidValueError
 FloatArray = NDArray[np.float64]
 
 
-def rotation_z(angle_deg: float) -> FloatArray:
-    """Returns the 3 x 3 matrix of a rotation about Z by `angle_deg` degrees."""
-    cos, sin = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+@numba.njit(cache=True)
+def rotation_matrix(rz_deg: float, rx_deg: float) -> FloatArray:
+    """Returns Rz(rz) Rx(rx), 3 x 3: a rotation about X, then one about Z."""
+    cos_z, sin_z = math.cos(math.radians(rz_deg)), math.sin(math.radians(rz_deg))
+    cos_x, sin_x = math.cos(math.radians(rx_deg)), math.sin(math.radians(rx_deg))
+    matrix = np.empty((3, 3))
+    matrix[0] = cos_z, -sin_z * cos_x, sin_z * sin_x
+    matrix[1] = sin_z, cos_z * cos_x, -cos_z * sin_x
+    matrix[2] = 0.0, sin_x, cos_x
+    return matrix
 
 
-def rotation_x(angle_deg: float) -> FloatArray:
-    """Returns the 3 x 3 matrix of a rotation about X by `angle_deg` degrees."""
-    cos, sin = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
-    return np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
+@numba.njit(cache=True)
+def _composed(
+    outer: FloatArray, outer_mm: FloatArray, inner: FloatArray, inner_mm: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Returns (M, b) of the affine map p -> outer (inner p + inner_mm) + outer_mm."""
+    matrix, offset_mm = np.zeros((3, 3)), np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            offset_mm[i] += outer[i, k] * inner_mm[k]
+            for j in range(3):
+                matrix[i, j] += outer[i, k] * inner[k, j]
+        offset_mm[i] += outer_mm[i]
+    return matrix, offset_mm
 
 
 @dataclass(frozen=True)
@@ -63,7 +80,7 @@ class ManipulatorAction:
     @cached_property
     def matrix(self) -> FloatArray:
         """Rz(rz) Rx(rx), 3 x 3."""
-        return rotation_z(self.rotation[0]) @ rotation_x(self.rotation[1])
+        return rotation_matrix(*self.rotation)
 
     @property
     def offset_mm(self) -> FloatArray:
@@ -101,7 +118,7 @@ class RigidTransform:
     @cached_property
     def matrix(self) -> FloatArray:
         """R, 3 x 3."""
-        return rotation_z(self.rotation[0]) @ rotation_x(self.rotation[1])
+        return rotation_matrix(*self.rotation)
 
     @cached_property
     def offset_mm(self) -> FloatArray:
@@ -112,7 +129,7 @@ class RigidTransform:
 
     def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
         """Returns (M, b) with T(plane(p)) = M p + b: from the plane's frame into the unmoved volume."""
-        return self.matrix @ action.matrix, self.matrix @ action.offset_mm + self.offset_mm
+        return _composed(self.matrix, self.offset_mm, action.matrix, action.offset_mm)
 
     def inverse_plane(self, action: ManipulatorAction) -> ManipulatorAction:
         """Returns the plane of the moved volume that shows what `action` shows of the unmoved one.
@@ -180,7 +197,13 @@ def plane_distance(
         The offset in mm of the slice's centre from the optimal plane along its normal, and the angle in degrees, in
         [0, 90], between the planes' normals.
     """
-    centre = action.matrix @ np.array([centre_mm[0], 0.0, centre_mm[1]]) + action.offset_mm
-    offset_mm = abs(float(optimum.normal @ (centre - optimum.offset_mm)))
-    cos = min(1.0, abs(float(action.normal @ optimum.normal)))
-    return offset_mm, float(np.rad2deg(np.arccos(cos)))
+    # In plain numbers: for three of them an array costs more than it saves.
+    matrix, normal = action.matrix.tolist(), optimum.normal.tolist()
+    across_mm, depth_mm = centre_mm
+    origin_mm, optimal_origin_mm = (*action.translation, 0.0), (*optimum.translation, 0.0)
+    offset_mm = cos = 0.0
+    for axis in range(3):
+        centre = matrix[axis][0] * across_mm + matrix[axis][2] * depth_mm + origin_mm[axis]
+        offset_mm += normal[axis] * (centre - optimal_origin_mm[axis])
+        cos += matrix[axis][1] * normal[axis]
+    return abs(offset_mm), math.degrees(math.acos(min(1.0, abs(cos))))

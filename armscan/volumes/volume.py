@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,18 +67,18 @@ class LabelVolume:
         n_x, n_y, n_z = (n * s for n, s in zip(self.shape, self.spacing, strict=True))
         return n_x, n_y, n_z
 
-    @property
+    @cached_property
     def centre_mm(self) -> tuple[float, float, float]:
         """The middle between the first and the last voxel's centres."""
         c_x, c_y, c_z = ((n - 1) * s / 2 for n, s in zip(self.shape, self.spacing, strict=True))
         return c_x, c_y, c_z
 
-    @property
+    @cached_property
     def slice_shape(self) -> tuple[int, int]:
         """Shape of a slice where none is asked for: (nx, nz)."""
         return self.shape[0], self.shape[2]
 
-    @property
+    @cached_property
     def pixel_mm(self) -> tuple[float, float]:
         """Size of a slice's pixel: (sx, sz)."""
         return self.spacing[0], self.spacing[2]

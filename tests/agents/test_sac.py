@@ -7,16 +7,20 @@ import pytest
 import torch
 
 from armscan.agents import MLP, SAC, LearningSetup, checked_device
-from armscan.envs import make_armscan_env
+from armscan.envs import EnvMaker
 from armscan.errors import DivergedError, InvalidValueError
 
+MAKER = EnvMaker(projection="zy")
 SMALL = {"num_envs": 2, "random_env_steps": 20, "batch_size": 16, "env_steps_per_collection": 4}
 
 
 @pytest.fixture
 def setup(phantom):
     return LearningSetup(
-        make_env=partial(make_armscan_env, [phantom], projection="zy"), total_env_steps=100, seed=3, device="cpu"
+        make_envs=partial(MAKER.many, volumes=[phantom], autoreset_mode="Disabled"),
+        total_env_steps=100,
+        seed=3,
+        device="cpu",
     )
 
 
@@ -47,8 +51,8 @@ def test_learner_reports_episodes_losses_and_speed(make_learner):
         assert -50 <= metrics["train/return"] <= 0
 
 
-def test_learner_acts_without_exploration(make_learner, setup):
-    learner, env = make_learner(), setup.make_env()
+def test_learner_acts_without_exploration(make_learner, phantom):
+    learner, env = make_learner(), MAKER.one([phantom])
     observation, _ = env.reset(seed=0)
     action = learner.act(observation)
     assert env.action_space.contains(action)

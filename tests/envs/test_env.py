@@ -11,6 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import armscan
+from armscan.anatomy import LandmarkReward, Scanner
 from armscan.envs import ArmscanEnv, ClusterObservation, ManipulatorAction, RandomTransform
 from armscan.errors import InvalidValueError, ManifestError, ResetNeededError, VolumeError
 
@@ -133,12 +134,10 @@ def test_env_says_when_an_episode_starts_solved(dataset):
     assert 0 < sum(solved) < 40
 
 
-def test_env_computes_clusters_once_a_step(env, monkeypatch):
-    from armscan.envs import env as module
-
+def test_env_looks_once_a_step(env, monkeypatch):
     calls = []
-    from_slice = module.TissueClusters.from_slice
-    monkeypatch.setattr(module.TissueClusters, "from_slice", lambda s: calls.append(1) or from_slice(s))
+    look = Scanner.look
+    monkeypatch.setattr(Scanner, "look", lambda *arguments: calls.append(1) or look(*arguments))
     env.reset(seed=0)
     calls.clear()
     env.step(np.array([0.3]))
@@ -206,6 +205,11 @@ def test_reset_takes_the_volume_as_an_option(dataset):
         ({"rotation_bounds_deg": (400, 90)}, "rotation bound of rz"),
         ({"translation_bounds_mm": 5}, "translation_bounds_mm is 5"),
         ({"transform": 3}, "transform is 3"),
+        ({"clustering": "mm"}, "clustering is 'mm', but it must be pixels or metric"),
+        ({"flat": "yes"}, "flat is 'yes'"),
+        ({"reward": "best"}, "reward is 'best'"),
+        ({"reward": LandmarkReward}, "reward is <class"),
+        ({"reward": LandmarkReward(), "targets": (7, 5, 1)}, "only one of both"),
         ({"render_mode": "sound"}, "render_mode is 'sound'"),
         ({"volumes": []}, "volumes is empty"),
         ({"volumes": [1]}, "volumes holds 1"),

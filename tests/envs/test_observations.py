@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from armscan.anatomy import Clusters, TissueClusters
+from armscan.anatomy import PIXEL_TISSUES
 from armscan.envs import ActionRewardObservation, ClusterObservation, MergedObservation, SliceGeometry, View
-from armscan.envs.observations import flat_space, flattened, with_action_reward
+from armscan.envs.observations import with_action_reward
+from armscan.envs.spaces import flat_space, flattened
 from armscan.errors import InvalidValueError
 
 GEOMETRY = SliceGeometry((361, 81), (0.27, 0.55))
@@ -14,12 +15,20 @@ GEOMETRY = SliceGeometry((361, 81), (0.27, 0.55))
 def view_of(bones, tendons, artery, geometry=GEOMETRY):
     """A view of clusters given as lists of (across, depth, pixels)."""
 
-    def tissue(rows):
+    def summary(rows):
         table = np.array(rows, dtype=float).reshape(-1, 3)
-        return Clusters(np.zeros(geometry.shape, np.int32), table[:, :2], table[:, 2].astype(int))
+        centre = table[:, :2].mean(axis=0) if len(table) else (0.0, 0.0)
+        return [len(table), table[:, 2].sum(), *centre]
 
-    clusters = TissueClusters(tissue(bones), tissue(tendons), tissue(artery))
-    return View(np.zeros(geometry.shape, np.uint8), clusters, geometry, np.array([0.25]), -0.5)
+    return View(
+        slice_xz=np.zeros(geometry.shape, np.uint8),
+        landmarks=np.array([summary(tissue) for tissue in (bones, tendons, artery)]),
+        tissues=PIXEL_TISSUES,
+        geometry=geometry,
+        smallest_shape=geometry.shape,
+        action=np.array([0.25]),
+        reward=-0.5,
+    )
 
 
 def test_cluster_observation_normalises_counts_sizes_and_centres():
@@ -76,5 +85,8 @@ def test_merged_observations_refuse_duplicate_keys():
 
 
 def test_with_action_reward_names_what_there_is():
-    with pytest.raises(InvalidValueError, match="observation is 'slices', but it must be action_reward or cluster"):
+    with pytest.raises(
+        InvalidValueError,
+        match="observation is 'slices', but it must be action_reward, cluster, slice or slice_channels",
+    ):
         with_action_reward("slices")

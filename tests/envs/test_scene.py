@@ -5,29 +5,27 @@ import pytest
 
 from armscan.anatomy import TissueClusters, landmark_reward
 from armscan.envs import ManipulatorAction, RandomTransform
-from armscan.envs.scene import SceneSampler
+from armscan.envs.task import Task
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.volumes import LabelVolume
 
 from ..conftest import make_tiny_volume
 
 
-def sampler(**changes):
-    arguments = {
-        "rotation_bounds_deg": (90.0, 45.0),
-        "translation_bounds_mm": None,
-        "transform": RandomTransform(),
-        "delta": 0.05,
-        "targets": (4, 3, 1),
-    }
-    return SceneSampler(**(arguments | changes))
+def task(volume, **changes):
+    return Task([volume], **({"rotation_bounds_deg": (90.0, 45.0)} | changes))
+
+
+def draw(volume, rng, n_scenes=1, **changes):
+    """Draws scenes of a volume, one after another."""
+    rules = task(volume, **changes)
+    return [rules.draw_scenes([volume.name], [rng])[0] for _ in range(n_scenes)]
 
 
 def test_scene_optimum_is_rewarded_and_within_the_bounds(dataset, phantom):
     rng = np.random.default_rng(0)
     for volume in (*dataset.values(), phantom):
-        for _ in range(25):
-            scene = sampler().draw(volume, rng)
+        for scene in draw(volume, rng, 25):
             clusters = TissueClusters.from_slice(volume.slice(scene.optimum, transform=scene.transform))
             assert landmark_reward(clusters) > -0.05
             assert (np.abs(scene.optimum_normalised) <= 1).all()
@@ -37,7 +35,7 @@ def test_scene_optimum_is_rewarded_and_within_the_bounds(dataset, phantom):
 def test_scene_optimum_shows_the_labelled_plane(phantom):
     """The moved optimum is the labelled plane: every pixel both pictures have is the same, but for the shift across."""
     labelled = phantom.slice(phantom.optimal_action)
-    scene = sampler().draw(phantom, np.random.default_rng(1))
+    (scene,) = draw(phantom, np.random.default_rng(1))
     matrix, _offset_mm = scene.transform.plane_map(scene.optimum)
     assert abs(matrix[:, 1] @ phantom.optimal_action.normal) == pytest.approx(1.0)
     seen = TissueClusters.from_slice(phantom.slice(scene.optimum, transform=scene.transform))
@@ -46,24 +44,25 @@ def test_scene_optimum_shows_the_labelled_plane(phantom):
 
 def test_scene_optimum_stays_within_tight_rotation_bounds(phantom):
     rz, rx = phantom.optimal_action.rotation
-    tight = sampler(
+    tight = draw(
+        phantom,
+        np.random.default_rng(0),
+        200,
         rotation_bounds_deg=(abs(rz) + 10.0, abs(rx) + 20.0),
         transform=RandomTransform(rz_deg=10.0, rx_deg=20.0, tx_mm=0.0, ty_mm=0.0),
         delta=1.0,
     )
-    rng = np.random.default_rng(0)
-    assert max(np.abs(tight.draw(phantom, rng).optimum_normalised).max() for _ in range(200)) <= 1
+    assert max(np.abs(scene.optimum_normalised).max() for scene in tight) <= 1
 
 
 def test_scene_without_transform_is_the_volume_as_it_is(phantom):
-    scene = sampler(transform=None).draw(phantom, np.random.default_rng(0))
+    (scene,) = draw(phantom, np.random.default_rng(0), transform=None)
     assert scene.transform is None
     assert scene.optimum == phantom.optimal_action
 
 
 def test_bounds_do_not_depend_on_the_draw(phantom):
-    rng = np.random.default_rng(0)
-    assert len({sampler().draw(phantom, rng).bounds for _ in range(20)}) == 1
+    assert len({scene.bounds for scene in draw(phantom, np.random.default_rng(0), 20)}) == 1
 
 
 def test_random_transform_stays_within_its_limits(phantom):
@@ -86,34 +85,37 @@ def test_random_transform_refuses_impossible_limits(bad):
         RandomTransform(**bad)
 
 
-def test_sampler_refuses_a_volume_without_a_labelled_plane():
+def test_task_refuses_a_volume_without_a_labelled_plane():
     with pytest.raises(OptimalPlaneError, match="tiny: has no labelled optimal plane"):
-        sampler().check(make_tiny_volume())
+        task(make_tiny_volume())
 
 
-def test_sampler_refuses_a_plane_that_does_not_score():
+def test_task_refuses_a_plane_that_does_not_score():
     volume = make_tiny_volume(optimal_action=ManipulatorAction((0, 0), (0, 5)))
     with pytest.raises(OptimalPlaneError, match=r"tiny: the labelled optimal plane scores -0\.\d+"):
-        sampler().check(volume)
+        task(volume)
 
 
-def test_sampler_refuses_bounds_that_do_not_hold_the_turned_plane(phantom):
+def test_task_refuses_bounds_that_do_not_hold_the_turned_plane(phantom):
     rz = phantom.optimal_action.rotation[0]
     with pytest.raises(OptimalPlaneError, match=r"phantom-0: the optimal plane has rz = .* it must be at least"):
-        sampler(rotation_bounds_deg=(abs(rz) + 9.0, 45.0)).check(phantom)
-    sampler(rotation_bounds_deg=(abs(rz) + 10.1, 45.0)).check(phantom)
+        task(phantom, rotation_bounds_deg=(abs(rz) + 9.0, 45.0))
+    task(phantom, rotation_bounds_deg=(abs(rz) + 10.1, 45.0))
 
 
-def test_sampler_refuses_a_plane_outside_the_volume(phantom):
+def test_task_refuses_a_plane_outside_the_volume(phantom):
     moved = LabelVolume(phantom.labels, phantom.spacing, "moved", ManipulatorAction((0, 0), (0, 5000)))
     with pytest.raises(OptimalPlaneError, match=r"moved: the optimal plane, .* misses the volume"):
-        sampler().check(moved)
+        task(moved)
 
 
-def test_sampler_gives_up_where_no_transform_keeps_the_plane_in_view(phantom):
+def test_task_gives_up_where_no_transform_keeps_the_plane_in_view(phantom):
     with pytest.raises(OptimalPlaneError, match="phantom-0: no transform of 1000"):
-        sampler(translation_bounds_mm=(97.0, phantom.optimal_action.translation[1] + 0.01), delta=1e-9).draw(
-            phantom, _OutOfView()
+        draw(
+            phantom,
+            _OutOfView(),
+            translation_bounds_mm=(97.0, phantom.optimal_action.translation[1] + 0.01),
+            delta=1e-9,
         )
 
 

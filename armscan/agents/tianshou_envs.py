@@ -1,0 +1,126 @@
+"""The vector environment as Tianshou's collectors take it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+from tianshou.data import Batch
+from tianshou.env import BaseVectorEnv
+from tianshou.highlevel.env import ContinuousEnvironments, EnvFactory, EnvMode, VectorEnvType
+
+from armscan.agents.protocols import VectorEnvMaker
+from armscan.envs.task import Observed
+
+Ids = int | list[int] | NDArray[np.int64] | None
+
+
+class SideBySide(BaseVectorEnv):
+    """A Gymnasium vector environment without autoreset, under the interface of Tianshou's own ones.
+
+    `info` is left out, because a replay buffer would store it with every transition.
+
+    Args:
+        envs: steps all environments at once.
+    """
+
+    def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
+        self.env_num = envs.num_envs
+        self.is_async = False
+        self.is_closed = False
+        self._envs = envs
+        self._seeds: Sequence[int | None] | None = None
+        self._action_spaces = [deepcopy(envs.single_action_space) for _ in range(envs.num_envs)]
+
+    def get_env_attr(self, key: str, id: Ids = None) -> list[Any]:  # noqa: A002 - Tianshou's name
+        """Returns the spaces of each environment."""
+        if key == "action_space":
+            return list(self._action_spaces)
+        return [getattr(self._envs, f"single_{key}", getattr(self._envs, key, None))] * self.env_num
+
+    def reset(self, env_id: Ids = None, **kwargs: Any) -> tuple[Any, NDArray[Any]]:
+        """Starts episodes; returns the first observations of those environments, and no information."""
+        ids = np.arange(self.env_num) if env_id is None else np.atleast_1d(env_id)
+        mask = np.isin(np.arange(self.env_num), ids)
+        observations, _ = self._envs.reset(
+            seed=self._seeds,  # type: ignore[arg-type]
+            options={"reset_mask": mask},
+        )
+        self._seeds = None
+        return _batched(observations)[ids], self._no_info(ids)
+
+    def step(self, action: Any, id: Ids = None) -> tuple[Any, ...]:  # noqa: A002
+        """Takes a step in all environments."""
+        assert id is None or len(np.atleast_1d(id)) == self.env_num, "the environments are only stepped all at once"
+        observations, rewards, terminated, truncated, _ = self._envs.step(np.asarray(action))
+        return _batched(observations), rewards, terminated, truncated, self._no_info(np.arange(self.env_num))
+
+    def seed(self, seed: int | list[int] | None = None) -> list[list[int] | None]:
+        """Seeds the next reset and the random actions."""
+        seeds = [seed + i for i in range(self.env_num)] if isinstance(seed, int) else seed
+        self._seeds = seeds
+        if seeds is not None:
+            for space, one_seed in zip(self._action_spaces, seeds, strict=True):
+                space.seed(one_seed)
+        return [None if seeds is None else [one_seed] for one_seed in seeds or [0] * self.env_num]
+
+    def render(self, **kwargs: Any) -> list[Any]:
+        """Draws nothing."""
+        return []
+
+    def close(self) -> None:
+        """Closes the environments."""
+        self._envs.close()
+        self.is_closed = True
+
+    @staticmethod
+    def _no_info(ids: NDArray[np.int64]) -> NDArray[Any]:
+        return np.array([{"env_id": i} for i in ids])
+
+
+def _batched(observations: Observed) -> Any:
+    """Tianshou indexes a `Batch` as it does an array."""
+    return Batch(observations) if isinstance(observations, dict) else observations
+
+
+class SideBySideFactory(EnvFactory):
+    """Gives Tianshou the training environments.
+
+    Args:
+        make_envs: makes as many as are asked for.
+    """
+
+    def __init__(self, make_envs: VectorEnvMaker) -> None:
+        super().__init__(VectorEnvType.DUMMY)
+        self._make_envs = make_envs
+
+    def _create_env(self, mode: EnvMode) -> gym.Env[Any, Any]:
+        raise NotImplementedError("environments are made side by side")
+
+    def create_venv(self, num_envs: int, mode: EnvMode, seed: int | None = None) -> BaseVectorEnv:
+        """Makes environments with seeds drawn from the one given."""
+        envs = SideBySide(self._make_envs(num_envs))
+        rng = self._create_rng(seed)
+        envs.seed([self._next_seed(rng) for _ in range(num_envs)])
+        return envs
+
+    def create_envs(
+        self, num_training_envs: int, num_test_envs: int, create_watch_env: bool = False, seed: int | None = None
+    ) -> ContinuousEnvironments:
+        """Makes the training environments; testing is not left to Tianshou."""
+        training = self.create_venv(num_training_envs, EnvMode.TRAINING, seed)
+        spaces = _SpacesOnly(training.get_env_attr("observation_space")[0], training.get_env_attr("action_space")[0])
+        return ContinuousEnvironments(spaces, training, training)
+
+
+class _SpacesOnly(gym.Env[Any, Any]):
+    """What Tianshou reads the shapes of observations and actions from."""
+
+    def __init__(self, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
+        self.observation_space = observation_space
+        self.action_space = action_space

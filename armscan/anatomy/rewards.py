@@ -1,0 +1,206 @@
+"""What a slice is worth, computed from the summary of its clusters; each in [-1, 0], 0 at best."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from copy import copy
+from typing import NamedTuple, Protocol, Self
+
+import numpy as np
+
+from armscan.anatomy.landmarks import Landmarks, TissueClusters
+from armscan.anatomy.tissues import USUAL_PIXEL_MM
+from armscan.checks import check_float, check_int
+from armscan.errors import InvalidValueError, OptimalPlaneError
+from armscan.volumes.volume import LabelVolume
+
+PUBLISHED_TARGETS = (4, 3, 1)
+OTHER_PUBLISHED_TARGETS = (7, 5, 1)
+# Multiplying by it, where a division would do, gives the published figures to the last bit.
+THIRD = 1 / 3
+N_TISSUES = 3
+
+
+class Reward(Protocol):
+    """Scores slices; implement both methods to make one's own."""
+
+    def fitted_to(self, volumes: Iterable[LabelVolume]) -> Reward:
+        """Returns the reward with what it takes from labelled planes of training volumes, if it has nothing yet."""
+
+    def score(self, landmarks: Landmarks, pixel_mm: tuple[float, float]) -> float:
+        """Returns the reward, in [-1, 0], of a slice with this summary and pixels of this size, (across, depth)."""
+
+
+class LandmarkReward:
+    """The published reward: 0 where every landmark is there and in its place.
+
+    The mean of three terms, each 0 at best: how far the cluster counts are from their targets (over the targets' sum),
+    the share of tissues with no cluster, and 1 where the tendons are not between the bones and the single artery in
+    depth.
+
+    Args:
+        targets: how many clusters of bones, tendons and artery the wanted plane shows; (4, 3, 1), or (7, 5, 1), the
+            other published description.
+
+    Raises:
+        InvalidValueError: if `targets` is not three whole numbers of at least 1.
+    """
+
+    def __init__(self, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
+        self.targets = checked_targets(targets)
+
+    def fitted_to(self, volumes: Iterable[LabelVolume]) -> Self:
+        """Returns the reward as it is: it takes nothing from volumes."""
+        return self
+
+    def score(self, landmarks: Landmarks, pixel_mm: tuple[float, float]) -> float:
+        """See `Reward.score`."""
+        (n_bones, _, _, bones), (n_tendons, _, _, tendons), (n_artery, _, _, artery) = landmarks.tolist()
+        for_bones, for_tendons, for_artery = self.targets
+        off_target = abs(n_bones - for_bones) + abs(n_tendons - for_tendons) + abs(n_artery - for_artery)
+        missing = (n_bones == 0) + (n_tendons == 0) + (n_artery == 0)
+        in_place = missing == 0 and n_artery == 1 and (bones < tendons < artery or artery < tendons < bones)
+        return float(max(-1.0, 0.0 - (off_target / sum(self.targets) + missing / 3 + (not in_place)) * THIRD))
+
+
+class AgreementReward:
+    """The mean of the published reward and of how well sizes and positions agree with the labelled planes.
+
+    The published reward is 0 up to 10 mm and 15 degrees away from a labelled plane. This one also looks at seven
+    features of a slice: the clustered area of each tissue, and how far the mean centres of tendons and artery are from
+    that of the bones, across and in depth. A feature costs nothing inside the range that the labelled planes of the
+    training volumes span, and the more the further outside, up to 1; the agreement is minus the mean of the costs. So
+    a labelled plane of the training volumes scores 0.
+
+    Distances are between tissues and without sign, so that they are the same for left and right hands, and do not
+    change when the picture is shifted.
+
+    Args:
+        targets: of the published reward.
+        area_tolerance: how far outside its range an area has its full cost, as a share of the nearer end.
+        distance_tolerance_mm: how far outside its range a distance has.
+        slack: by which share of an area's ends its range is widened: the pixels of the same plane differ a little from
+            one motion of the volume to another.
+        slack_mm: by how much the range of a distance is widened.
+    """
+
+    def __init__(
+        self,
+        targets: Sequence[int] = PUBLISHED_TARGETS,
+        *,
+        area_tolerance: float = 0.5,
+        distance_tolerance_mm: float = 5.0,
+        slack: float = 0.1,
+        slack_mm: float = 0.5,
+    ) -> None:
+        self.published = LandmarkReward(targets)
+        self.area_tolerance = check_float("area_tolerance", area_tolerance, above=0.0)
+        self.distance_tolerance_mm = check_float("distance_tolerance_mm", distance_tolerance_mm, above=0.0)
+        self.slack = check_float("slack", slack, at_least=0.0, at_most=1.0)
+        self.slack_mm = check_float("slack_mm", slack_mm, at_least=0.0)
+        self._ranges: list[Range] | None = None
+
+    def fitted_to(self, volumes: Iterable[LabelVolume]) -> Self:
+        """See `Reward.fitted_to`.
+
+        Raises:
+            OptimalPlaneError: if a volume has no labelled plane, or a tissue has no cluster on it.
+        """
+        if self._ranges is not None:
+            return self
+        features = np.array([self._labelled_features(volume) for volume in volumes])
+        if not len(features):
+            raise InvalidValueError("volumes is empty, but a reward is fitted to at least one")
+        fitted = copy(self)
+        fitted._ranges = [
+            self._range(lowest, highest, is_area=feature < N_TISSUES)
+            for feature, (lowest, highest) in enumerate(zip(features.min(axis=0), features.max(axis=0), strict=True))
+        ]
+        return fitted
+
+    def score(self, landmarks: Landmarks, pixel_mm: tuple[float, float]) -> float:
+        """See `Reward.score`.
+
+        Raises:
+            InvalidValueError: if the reward has not been fitted to volumes.
+        """
+        if self._ranges is None:
+            raise InvalidValueError("the reward has no ranges yet: call fitted_to(volumes) with the training volumes")
+        costs = 0.0
+        for feature, range_ in zip(_features(landmarks, pixel_mm), self._ranges, strict=True):
+            costs += 1.0 if feature is None else range_.cost(feature)
+        return 0.5 * (self.published.score(landmarks, pixel_mm) - costs / len(self._ranges))
+
+    def _range(self, lowest: float, highest: float, *, is_area: bool) -> Range:
+        if is_area:
+            return Range(
+                (1.0 - self.slack) * lowest,
+                (1.0 + self.slack) * highest,
+                self.area_tolerance * lowest,
+                self.area_tolerance * highest,
+            )
+        tolerance = self.distance_tolerance_mm
+        return Range(lowest - self.slack_mm, highest + self.slack_mm, tolerance, tolerance)
+
+    @staticmethod
+    def _labelled_features(volume: LabelVolume) -> list[float]:
+        if volume.optimal_action is None:
+            raise OptimalPlaneError(f"{volume.name}: has no labelled optimal plane, which the reward is fitted to")
+        clusters = TissueClusters.from_slice(volume.slice(volume.optimal_action), pixel_mm=volume.pixel_mm)
+        features = _features(clusters.landmarks, volume.pixel_mm)
+        known = [feature for feature in features if feature is not None]
+        if len(known) < len(features):
+            raise OptimalPlaneError(
+                f"{volume.name}: the labelled optimal plane shows {clusters.counts} clusters of bones, tendons and "
+                "artery, but a reward can only be fitted to planes that show each of them"
+            )
+        return known
+
+
+class Range(NamedTuple):
+    """Where a feature costs nothing, and how far below and above it has its full cost of 1."""
+
+    lowest: float
+    highest: float
+    below: float
+    above: float
+
+    def cost(self, feature: float) -> float:
+        """Returns the cost of a feature, in [0, 1]."""
+        if feature < self.lowest:
+            return min(1.0, (self.lowest - feature) / self.below)
+        return min(1.0, max(0.0, feature - self.highest) / self.above)
+
+
+def _features(landmarks: Landmarks, pixel_mm: tuple[float, float]) -> list[float | None]:
+    """Areas of bones, tendons and artery in mm2; distances in mm of tendons and artery from the bones; None: absent."""
+    across_mm, depth_mm = pixel_mm
+    bones, *others = landmarks.tolist()
+    features: list[float | None] = [n_pixels * across_mm * depth_mm for _, n_pixels, _, _ in (bones, *others)]
+    for count, _, across, depth in others:
+        if count and bones[0]:
+            features += [abs(across - bones[2]) * across_mm, abs(depth - bones[3]) * depth_mm]
+        else:
+            features += [None, None]
+    return features
+
+
+def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED_TARGETS) -> float:
+    """Returns the published reward, `LandmarkReward`, of what a slice shows.
+
+    Args:
+        clusters: what it shows.
+        targets: how many clusters of bones, tendons and artery the wanted plane shows.
+
+    Raises:
+        InvalidValueError: if `targets` is not three whole numbers of at least 1.
+    """
+    return LandmarkReward(targets).score(clusters.landmarks, USUAL_PIXEL_MM)
+
+
+def checked_targets(targets: Sequence[int]) -> tuple[int, int, int]:
+    """Returns the targets as a tuple of three ints, each at least 1."""
+    if isinstance(targets, str) or not isinstance(targets, Sequence) or len(targets) != 3:
+        raise InvalidValueError(f"targets is {targets!r}, but it must be 3 whole numbers (bones, tendons, artery)")
+    bones, tendons, artery = (check_int("each of targets", target, at_least=1) for target in targets)
+    return bones, tendons, artery

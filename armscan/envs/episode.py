@@ -1,0 +1,132 @@
+"""One episode as it goes on: the scene, the current plane, and what has been seen of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from armscan.checks import check_choice
+from armscan.envs.observations import View
+from armscan.envs.scene import Scene
+from armscan.envs.task import Task
+from armscan.errors import InvalidValueError, listed
+from armscan.volumes.plane import FloatArray, ManipulatorAction
+
+
+class Episode:
+    """One episode of a task.
+
+    Each plane comes in two steps, so that many environments can be looked at together between them: `aim` at it, then
+    `see` what is there. The first plane is the start, every further one a step.
+
+    Args:
+        task: the rules.
+        scene: the episode's volume.
+        start: the first action.
+    """
+
+    view: View
+
+    def __init__(self, task: Task, scene: Scene, start: FloatArray) -> None:
+        self.task = task
+        self.scene = scene
+        self.n_steps = -1
+        self.is_solved = self.starts_solved = self.is_truncated = False
+        self.rewards: list[float] = []
+        self.aim(start)
+
+    def aim(self, action: FloatArray) -> None:
+        """Places the plane; `action` holds the free components, normalised and within [-1, 1]."""
+        normalised = self.scene.optimum_normalised.tolist()
+        for component, value in zip(self.task.free, action.tolist(), strict=True):
+            normalised[component] = value
+        self.action = action
+        self.plane: ManipulatorAction = self.scene.bounds.denormalised(normalised)
+
+    def see(self, view: View) -> None:
+        """Takes what the plane shows."""
+        view.action = self.action
+        self.view = view
+        self.n_steps += 1
+        self.rewards.append(view.reward)
+        self.is_solved = self.task.is_solved(view)
+        if self.n_steps == 0:
+            self.starts_solved = self.is_solved
+        self.is_truncated = not self.is_solved and self.n_steps >= self.task.max_steps
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a step can be taken; an episode that starts solved still takes its first."""
+        return self.n_steps == 0 or not (self.is_solved or self.is_truncated)
+
+    def info(self) -> dict[str, Any]:
+        """Returns `info`, as `ArmscanEnv` describes it."""
+        distance_mm, distance_deg = self.scene.distance(self.plane)
+        return {
+            "volume": self.scene.volume.name,
+            "rotation_deg": np.array(self.plane.rotation),
+            "translation_mm": np.array(self.plane.translation),
+            "counts": self.view.landmarks[:, 0].astype(np.int64),
+            "is_success": self.is_solved,
+            "starts_solved": self.starts_solved,
+            "action": self.action.astype(np.float32),
+            "reward": self.view.reward,
+            "distance_mm": distance_mm,
+            "distance_deg": distance_deg,
+        }
+
+
+def begin(task: Task, rngs: Sequence[np.random.Generator], volume_name: str | None = None) -> list[Episode]:
+    """Begins an episode for each generator, which everything of it is drawn from; on the named volume, if there is one.
+
+    The episodes have been started but not seen: their first planes are still to be looked at.
+    """
+    drawn = [volume_name or task.names[int(rng.integers(len(task.names)))] for rng in rngs]
+    scenes = task.draw_scenes(drawn, rngs)
+    n_free = len(task.free)
+    return [
+        Episode(task, scene, np.zeros(n_free) if task.start == "middle" else rng.uniform(-1.0, 1.0, n_free))
+        for scene, rng in zip(scenes, rngs, strict=True)
+    ]
+
+
+def look(task: Task, episodes: Sequence[Episode]) -> None:
+    """Looks at the current plane of each episode."""
+    views = task.look([episode.scene for episode in episodes], [episode.plane for episode in episodes])
+    for episode, view in zip(episodes, views, strict=True):
+        episode.see(view)
+
+
+def checked_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
+    """Returns an action, or a batch of them, as numbers within [-1, 1]; values outside are clipped.
+
+    Raises:
+        InvalidValueError: if the shape is another, or a value is not finite.
+    """
+    try:
+        # A copy: what the caller does with the array afterwards must not change what was done.
+        received = np.array(actions, dtype=np.float64)
+        if received.shape == shape and (np.abs(received) <= 1.0).all():
+            return received
+    except (TypeError, ValueError):
+        received = np.empty(0)
+    if received.shape != shape or not np.isfinite(received).all():
+        raise InvalidValueError(f"action is {actions!r}, but it must be an array of shape {shape} of finite numbers")
+    return np.minimum(np.maximum(received, -1.0), 1.0)
+
+
+def wanted_volume(task: Task, options: Any) -> str | None:
+    """Returns the volume that the options of a reset name, None where they name none.
+
+    Raises:
+        InvalidValueError: if the options are no dict, hold anything else, or name no volume of the task.
+    """
+    if options is None:
+        return None
+    if not isinstance(options, dict):
+        raise InvalidValueError(f"reset options are {options!r}, but they must be a dict such as {{'volume': name}}")
+    if unknown := sorted(map(str, options.keys() - {"volume"})):
+        raise InvalidValueError(f"reset option is {listed(unknown)}, but only 'volume' is known")
+    return check_choice("reset option 'volume'", options["volume"], task.names) if "volume" in options else None

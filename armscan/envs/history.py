@@ -1,0 +1,166 @@
+"""What wrappers remember of an episode, for a batch of environments: the last observations, the best actions."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from armscan.envs.spaces import MultiBoxSpace, Parts
+from armscan.errors import InvalidValueError, listed
+
+FLAT = ""
+"""The name that a flat observation goes by among parts."""
+
+Mask = NDArray[np.bool_]
+
+
+def boxes_of(space: spaces.Space[Any], who: str) -> dict[str, spaces.Box]:
+    """Returns the boxes of a space by name; a single one goes by `FLAT`.
+
+    Raises:
+        InvalidValueError: if the space is neither a vector nor a `Dict` of boxes; `who` cannot wrap it.
+    """
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        return {FLAT: space}
+    if isinstance(space, spaces.Dict) and all(isinstance(box, spaces.Box) for box in space.values()):
+        return dict(space.items())  # type: ignore[arg-type]
+    raise InvalidValueError(f"{who} wraps observations that are vectors or a Dict of boxes, but the space is {space}")
+
+
+def space_of(boxes: Mapping[str, spaces.Box]) -> spaces.Box | MultiBoxSpace:
+    """Returns the space that `boxes_of` takes apart."""
+    return boxes[FLAT] if FLAT in boxes else MultiBoxSpace(boxes)
+
+
+def parts_of(observation: NDArray[Any] | Parts) -> Parts:
+    """Returns an observation by name."""
+    return observation if isinstance(observation, dict) else {FLAT: observation}
+
+
+def observation_of(parts: Parts) -> NDArray[Any] | Parts:
+    """Returns the observation that `parts_of` takes apart."""
+    return parts.get(FLAT, parts)
+
+
+class FrameHistory:
+    """The last observations of a batch of environments, from the oldest to the latest.
+
+    Args:
+        boxes: space of each part of one environment.
+        size: how many are kept.
+        excluded: parts that are not stacked.
+        n_envs: environments of the batch.
+
+    Raises:
+        InvalidValueError: if a part to leave out does not exist.
+    """
+
+    def __init__(self, boxes: Mapping[str, spaces.Box], size: int, excluded: Collection[str], n_envs: int) -> None:
+        named = [name for name in boxes if name != FLAT]
+        if isinstance(excluded, str) or not set(excluded) <= set(named):
+            raise InvalidValueError(
+                f"stack_exclude is {excluded!r}, but it must be a list of "
+                f"{listed(named) if named else 'nothing, because the observation is one vector'}"
+            )
+        self._size = size
+        self._excluded = frozenset(excluded)
+        # Every frame is written twice, `size` apart, so that the last ones always lie in one piece.
+        self._frames = {
+            name: np.empty((2 * size, n_envs, *box.shape), dtype=box.dtype)
+            for name, box in boxes.items()
+            if name not in self._excluded
+        }
+        self._latest = size - 1
+        self.boxes = {name: self._stacked_box(name, box) for name, box in boxes.items()}
+
+    def refill(self, parts: Parts, is_first: Mask) -> None:
+        """Fills the stacks of environments whose episode begins with its first observation.
+
+        Args:
+            parts: by name, shape (n_envs, ...).
+            is_first: which environments. Shape (n_envs,).
+        """
+        for name, frames in self._frames.items():
+            frames[:, is_first] = parts[name][is_first]
+
+    def push(self, parts: Parts) -> None:
+        """Adds the latest observation of every environment; parts by name, shape (n_envs, ...)."""
+        self._latest = (self._latest + 1) % self._size
+        for name, frames in self._frames.items():
+            frames[self._latest] = frames[self._latest + self._size] = parts[name]
+
+    def stacked(self, parts: Parts) -> Parts:
+        """Returns the latest observations, shape (n_envs, ...), with what is stacked of them as (n_envs, size, ...)."""
+        return {name: self._stack(name) if name in self._frames else part for name, part in parts.items()}
+
+    def _stack(self, name: str) -> NDArray[Any]:
+        frames = self._frames[name][self._latest + 1 : self._latest + 1 + self._size]
+        # A copy in any case: what is given away must not change any more.
+        stack = frames.swapaxes(0, 1).copy()
+        return stack.reshape(len(stack), -1) if name == FLAT else stack
+
+    def _stacked_box(self, name: str, box: spaces.Box) -> spaces.Box:
+        if name in self._excluded:
+            return box
+        low, high = (np.repeat(bound[None], self._size, axis=0) for bound in (box.low, box.high))
+        if name == FLAT:
+            low, high = low.ravel(), high.ravel()
+        return spaces.Box(low, high, dtype=box.dtype)
+
+
+class BestPairs:
+    """The best (action, reward) pairs of the current episode of each environment of a batch.
+
+    They are ordered from the best to the worst, among equal rewards the earlier first. At first all of them are the
+    first plane's; a new pair enters only if its reward beats the worst one kept.
+
+    Args:
+        size: how many are kept.
+        n_free: components of an action.
+        n_envs: environments of the batch.
+    """
+
+    def __init__(self, size: int, n_free: int, n_envs: int) -> None:
+        self.pairs = np.zeros((n_envs, size, n_free + 1), dtype=np.float32)
+        self._size, self._n_free = size, n_free
+
+    @property
+    def box(self) -> spaces.Box:
+        """Space of one environment's pairs, in a row: (action, reward) of the best, then of the next."""
+        low, high = [-1.0] * (self._n_free + 1), [1.0] * self._n_free + [0.0]
+        return spaces.Box(
+            np.tile(low, self._size).astype(np.float32), np.tile(high, self._size).astype(np.float32), dtype=np.float32
+        )
+
+    def refill(self, actions: NDArray[Any], rewards: NDArray[Any], is_first: Mask) -> None:
+        """Makes all pairs of environments whose episode begins those of its first plane.
+
+        Args:
+            actions: shape (n_envs, n_free).
+            rewards: shape (n_envs,).
+            is_first: which environments. Shape (n_envs,).
+        """
+        self.pairs[is_first] = self._paired(actions, rewards)[is_first, None]
+
+    def push(self, actions: NDArray[Any], rewards: NDArray[Any]) -> None:
+        """Adds the latest pair of every environment where it is good enough; shapes as in `refill`."""
+        latest = self._paired(actions, rewards)
+        enters = latest[:, -1] > self.pairs[:, -1, -1]
+        if enters.any():
+            self.pairs[enters, -1] = latest[enters]
+            order = np.argsort(-self.pairs[enters, :, -1], axis=1, kind="stable")
+            self.pairs[enters] = np.take_along_axis(self.pairs[enters], order[:, :, None], axis=1)
+
+    def flat(self) -> NDArray[np.float32]:
+        """Returns the pairs of each environment in a row, shape (n_envs, size * (n_free + 1))."""
+        return self.pairs.reshape(len(self.pairs), -1).copy()
+
+    def _paired(self, actions: NDArray[Any], rewards: NDArray[Any]) -> NDArray[np.float32]:
+        pairs = np.empty((len(rewards), self._n_free + 1), dtype=np.float32)
+        pairs[:, :-1] = actions
+        pairs[:, -1] = rewards
+        return pairs

@@ -1,0 +1,99 @@
+"""The making of environments with their wrappers, one or many by the same rules."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from gymnasium.vector import VectorEnv
+
+from armscan.checks import check_bool, check_int
+from armscan.envs.env import ArmscanEnv
+from armscan.envs.task import Volumes
+from armscan.envs.vector_env import ArmscanVectorEnv
+from armscan.envs.vector_wrappers import VectorBestActionMemory, VectorFrameStack
+from armscan.envs.wrappers import BestActionMemory, Env, FrameStack
+
+
+class EnvMaker:
+    """Makes environments that differ in nothing but their volumes.
+
+    Args:
+        **rules: of every environment, as in `make_armscan_env`.
+    """
+
+    def __init__(self, **rules: Any) -> None:
+        self.rules = rules
+
+    def one(self, volumes: Volumes, *, render_mode: str | None = None) -> Env:
+        """Makes one environment."""
+        return make_armscan_env(volumes, render_mode=render_mode, **self.rules)
+
+    def many(self, num_envs: int, volumes: Volumes, *, autoreset_mode: str = "NextStep") -> VectorEnv[Any, Any, Any]:
+        """Makes many environments on the same volumes."""
+        return make_armscan_vector_env(num_envs, volumes, autoreset_mode=autoreset_mode, **self.rules)
+
+
+def make_armscan_env(
+    volumes: Volumes = None,
+    *,
+    stack: int = 1,
+    stack_exclude: Sequence[str] = (),
+    memory: int = 0,
+    stack_memory: bool = False,
+    **kwargs: Any,
+) -> Env:
+    """Makes an environment with its wrappers; this is what `gymnasium.make("armscan/Armscan-v0", ...)` calls.
+
+    Args:
+        volumes: as in `ArmscanEnv`.
+        stack: how many of the last observations are stacked; 1 for none but the latest.
+        stack_exclude: parts of a `Dict` observation that are not stacked.
+        memory: how many of the best (action, reward) pairs are added; 0 for none.
+        stack_memory: whether the memory is stacked with the rest; otherwise it is added after the stack.
+        **kwargs: the other arguments of `ArmscanEnv`.
+    """
+    env: Env = ArmscanEnv(volumes, **kwargs)
+    for wrapper in _wrapper_order(stack, memory, stack_memory):
+        env = FrameStack(env, stack, exclude=stack_exclude) if wrapper == "stack" else BestActionMemory(env, memory)
+    return env
+
+
+def make_armscan_vector_env(
+    num_envs: int = 1,
+    volumes: Volumes = None,
+    *,
+    stack: int = 1,
+    stack_exclude: Sequence[str] = (),
+    memory: int = 0,
+    stack_memory: bool = False,
+    **kwargs: Any,
+) -> VectorEnv[Any, Any, Any]:
+    """Makes many environments with their wrappers; what `gymnasium.make_vec("armscan/Armscan-v0", ...)` calls.
+
+    Args:
+        num_envs: how many.
+        volumes: as in `ArmscanEnv`.
+        stack: as in `make_armscan_env`.
+        stack_exclude: likewise.
+        memory: likewise.
+        stack_memory: likewise.
+        **kwargs: the other arguments of `ArmscanVectorEnv`.
+    """
+    env: VectorEnv[Any, Any, Any] = ArmscanVectorEnv(num_envs, volumes, **kwargs)
+    for wrapper in _wrapper_order(stack, memory, stack_memory):
+        if wrapper == "stack":
+            env = VectorFrameStack(env, stack, exclude=stack_exclude)
+        else:
+            env = VectorBestActionMemory(env, memory)
+    return env
+
+
+def _wrapper_order(stack: int, memory: int, stack_memory: bool) -> list[str]:
+    """Returns which wrappers are put around an environment, the innermost first: `stack`, `memory`."""
+    wanted = {
+        "stack": check_int("stack", stack, at_least=1) > 1,
+        "memory": check_int("memory", memory, at_least=0) > 0,
+    }
+    order = ("memory", "stack") if check_bool("stack_memory", stack_memory) else ("stack", "memory")
+    return [name for name in order if wanted[name]]

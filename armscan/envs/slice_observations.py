@@ -1,0 +1,141 @@
+"""The slice itself as an observation: one image of labels, or one channel for each landmark tissue."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from armscan.checks import check_int
+from armscan.envs.observations import SliceGeometry, View, smallest_shape
+from armscan.envs.spaces import Parts
+from armscan.errors import InvalidValueError
+from armscan.volumes.volume import LABEL_NAMES, LANDMARK_LABELS
+
+Shape = tuple[int, int]
+# Which label a reduced pixel shows when several meet in it: the one that is rarer, and so would get lost, first.
+RANKS = np.array([0, 1, 2, 4, 3], dtype=np.uint8)
+LABEL_OF_RANK = np.argsort(RANKS).astype(np.uint8)
+
+
+class SliceFrame:
+    """Brings slices of different volumes to one shape.
+
+    A slice is cropped about its middle to `crop`; for an odd surplus the larger half goes from the low side. Then,
+    where `shape` is given, it is reduced (or repeated) to that shape: pixel i of m stands for the pixels from i n / m
+    to (i + 1) n / m of the n there were, and shows the highest value among them, so that thin structures stay visible.
+
+    Args:
+        crop: (across, depth) in pixels; None for the smallest slice of all volumes.
+        shape: (across, depth) of what is observed; None to leave what was cropped as it is.
+
+    Raises:
+        InvalidValueError: if a shape is not two whole numbers of at least 1.
+    """
+
+    def __init__(self, crop: Sequence[int] | None, shape: Sequence[int] | None) -> None:
+        self.crop = None if crop is None else _checked_shape("crop", crop)
+        self.shape = None if shape is None else _checked_shape("shape", shape)
+
+    def observed_shape(self, smallest: Shape) -> Shape:
+        """Returns the shape of what is observed of slices of at least the shape `smallest`."""
+        return self.shape or self.crop or smallest
+
+    def check(self, smallest: Shape) -> None:
+        """Raises `InvalidValueError` if the crop is larger than the smallest slice."""
+        if self.crop is not None and (self.crop[0] > smallest[0] or self.crop[1] > smallest[1]):
+            raise InvalidValueError(
+                f"crop is {self.crop}, but it must be at most {smallest}, the smallest slice (across, depth) of the "
+                "volumes"
+            )
+
+    def cropped(self, view: View) -> NDArray[np.uint8]:
+        """Returns the middle of a slice."""
+        crop = self.crop or view.smallest_shape
+        first = [(n - wanted + 1) // 2 for n, wanted in zip(view.slice_xz.shape, crop, strict=True)]
+        return view.slice_xz[first[0] : first[0] + crop[0], first[1] : first[1] + crop[1]]
+
+
+@numba.njit(cache=True, nogil=True)
+def _reduce(image: NDArray[np.uint8], reduced: NDArray[np.uint8]) -> None:
+    """Fills each pixel with the highest value of the pixels that it stands for."""
+    (n_rows, n_cols), (m_rows, m_cols) = image.shape, reduced.shape
+    for i in range(m_rows):
+        for k in range(m_cols):
+            highest = np.uint8(0)
+            for row in range(i * n_rows // m_rows, ((i + 1) * n_rows + m_rows - 1) // m_rows):
+                for col in range(k * n_cols // m_cols, ((k + 1) * n_cols + m_cols - 1) // m_cols):
+                    highest = max(highest, image[row, col])
+            reduced[i, k] = highest
+
+
+class SliceObservation:
+    """The slice as one image of labels, uint8: 0 background, 1 bones, 2 tendons, 3 artery, 4 nerve.
+
+    Reduced, a pixel shows the rarest tissue of those that meet in it: artery, nerve, tendons, bones, in this order.
+
+    Args:
+        crop: as in `SliceFrame`.
+        shape: as in `SliceFrame`.
+    """
+
+    def __init__(self, *, crop: Sequence[int] | None = None, shape: Sequence[int] | None = None) -> None:
+        self._frame = SliceFrame(crop, shape)
+
+    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
+        """See `Observation.spaces`."""
+        smallest = smallest_shape(geometries)
+        self._frame.check(smallest)
+        return {"slice": spaces.Box(0, max(LABEL_NAMES), self._frame.observed_shape(smallest), np.uint8)}
+
+    def observe(self, view: View) -> Parts:
+        """See `Observation.observe`."""
+        cropped = self._frame.cropped(view)
+        if self._frame.shape is None:
+            return {"slice": cropped.copy()}
+        reduced = np.empty(self._frame.shape, dtype=np.uint8)
+        _reduce(RANKS[cropped], reduced)
+        return {"slice": LABEL_OF_RANK[reduced]}
+
+
+class SliceChannelsObservation:
+    """The slice as one channel for each of bones, tendons and artery, uint8: 1 where that tissue is, 0 elsewhere.
+
+    Reduced, a pixel is 1 where any of the pixels it stands for is.
+
+    Args:
+        crop: as in `SliceFrame`.
+        shape: as in `SliceFrame`.
+    """
+
+    def __init__(self, *, crop: Sequence[int] | None = None, shape: Sequence[int] | None = None) -> None:
+        self._frame = SliceFrame(crop, shape)
+
+    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
+        """See `Observation.spaces`."""
+        smallest = smallest_shape(geometries)
+        self._frame.check(smallest)
+        shape = (len(LANDMARK_LABELS), *self._frame.observed_shape(smallest))
+        return {"channels": spaces.Box(0, 1, shape, np.uint8)}
+
+    def observe(self, view: View) -> Parts:
+        """See `Observation.observe`."""
+        cropped = self._frame.cropped(view)
+        channels = np.empty((len(LANDMARK_LABELS), *self._frame.observed_shape(view.smallest_shape)), dtype=np.uint8)
+        for channel, label in zip(channels, LANDMARK_LABELS, strict=True):
+            if self._frame.shape is None:
+                np.equal(cropped, label, out=channel.view(np.bool_))
+            else:
+                _reduce((cropped == label).view(np.uint8), channel)
+        return {"channels": channels}
+
+
+def _checked_shape(name: str, shape: Any) -> Shape:
+    if isinstance(shape, str) or not isinstance(shape, Sequence) or len(shape) != 2:
+        raise InvalidValueError(f"{name} is {shape!r}, but it must be 2 whole numbers (across, depth)")
+    across, depth = (check_int(f"each of {name}", n_pixels, at_least=1, at_most=65536) for n_pixels in shape)
+    return across, depth

@@ -1,0 +1,62 @@
+"""The spaces of observations: boxes by name, and one flat box."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from armscan.errors import InvalidValueError
+
+Parts = dict[str, NDArray[Any]]
+"""What is observed, by name."""
+
+
+class MultiBoxSpace(spaces.Dict):
+    """A `Dict` space every value of which is a `Box`.
+
+    Args:
+        boxes: the boxes by name.
+
+    Raises:
+        InvalidValueError: if there is none, or a value is no `Box`.
+    """
+
+    def __init__(self, boxes: Mapping[str, spaces.Box]) -> None:
+        if not isinstance(boxes, Mapping) or not boxes:
+            raise InvalidValueError(f"boxes is {boxes!r}, but it must be at least one Box by name")
+        for name, box in boxes.items():
+            if not isinstance(name, str) or not isinstance(box, spaces.Box):
+                raise InvalidValueError(f"{name!r} is {box!r}, but a MultiBoxSpace holds a Box under each name")
+        super().__init__(dict(boxes))
+
+    @property
+    def shape(self) -> list[tuple[int, ...]]:  # type: ignore[override]
+        """The boxes' shapes, in the order of the names."""
+        return list(self.shapes.values())
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """The boxes' shapes by name."""
+        return {name: box.shape for name, box in self.boxes.items()}
+
+    @property
+    def boxes(self) -> dict[str, spaces.Box]:
+        """The boxes by name, in the space's order, which is that of the alphabet."""
+        return self.spaces  # type: ignore[return-value]
+
+
+def flat_space(boxes: Mapping[str, spaces.Box]) -> spaces.Box:
+    """Returns the space of `flattened` parts, their bounds in the order of the data."""
+    low = np.concatenate([box.low.ravel() for box in boxes.values()])
+    high = np.concatenate([box.high.ravel() for box in boxes.values()])
+    return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+
+def flattened(parts: Parts) -> NDArray[np.float32]:
+    """Returns the parts as one vector of 32-bit floats, in their order."""
+    # Of 32-bit floats already, unless an image is among them.
+    return np.concatenate([part.ravel() for part in parts.values()]).astype(np.float32, copy=False)

@@ -1,0 +1,172 @@
+"""Many environments as one: their planes are looked at together, on all cores, without subprocesses."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from armscan.checks import check_int
+from armscan.envs.episode import Episode, begin, checked_actions, look, wanted_volume
+from armscan.envs.history import Mask, observation_of, parts_of
+from armscan.envs.task import Observed, Task, Volumes
+from armscan.errors import InvalidValueError, ResetNeededError
+from armscan.volumes.plane import FloatArray
+
+VectorStep = tuple[Observed, FloatArray, Mask, Mask, dict[str, Any]]
+
+
+class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
+    """`num_envs` environments on the same volumes, each with a random generator of its own.
+
+    Environment i gives bit for bit what an `ArmscanEnv` with the same seed gives. In the autoreset mode `NextStep` the
+    step after an episode's end resets that environment, its action ignored and its reward 0, as Gymnasium defines it;
+    with `Disabled` whoever steps resets the ended ones by `reset(options={"reset_mask": mask})`.
+
+    Args:
+        num_envs: how many.
+        volumes: as in `ArmscanEnv`.
+        autoreset_mode: `NextStep` or `Disabled`.
+        render_mode: none is supported.
+        **rules: the other arguments of `ArmscanEnv`.
+
+    Raises:
+        InvalidValueError: if an argument is outside what is allowed.
+    """
+
+    metadata: dict[str, Any]
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        volumes: Volumes = None,
+        *,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: None = None,
+        **rules: Any,
+    ) -> None:
+        self.num_envs = check_int("num_envs", num_envs, at_least=1)
+        if render_mode is not None:
+            raise InvalidValueError(f"render_mode is {render_mode!r}, but many environments are not drawn: use one")
+        self._autoreset_mode = _checked_mode(autoreset_mode)
+        self.metadata = {"autoreset_mode": self._autoreset_mode}
+        self.task = Task(volumes, **rules)
+        self.single_observation_space = self.task.observation_space
+        self.single_action_space = self.task.action_space
+        self.observation_space = batch_space(self.task.observation_space, self.num_envs)
+        self.action_space = batch_space(self.task.action_space, self.num_envs)
+        self._rngs = [seeding.np_random()[0] for _ in range(self.num_envs)]
+        self._episodes: list[Episode | None] = [None] * self.num_envs
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observed, dict[str, Any]]:
+        """Starts an episode in each environment, or in those that `options["reset_mask"]` marks.
+
+        Args:
+            seed: of the first environment, the next has the next seed; or one for each, None to leave it as it is.
+            options: `volume`, the name of a volume for all of them; `reset_mask`, truth values, shape (num_envs,).
+
+        Returns:
+            The observations and `info` of all environments; only those that were reset are marked in `info`.
+        """
+        options = dict(options) if isinstance(options, dict) else options
+        chosen = np.flatnonzero(self._popped_mask(options))
+        for i, one_seed in zip(range(self.num_envs), self._seeds(seed), strict=True):
+            if one_seed is not None and i in chosen:
+                self._rngs[i] = seeding.np_random(one_seed)[0]
+        self._begin(chosen, wanted_volume(self.task, options))
+        look(self.task, [self._episode(int(i)) for i in chosen])
+        return self._observed(), self._infos(chosen)
+
+    def step(self, actions: Any) -> VectorStep:
+        """Takes a step in every environment."""
+        episodes = [self._episode(i) for i in range(self.num_envs)]
+        is_over = np.array([not episode.is_running for episode in episodes])
+        if self._autoreset_mode is AutoresetMode.DISABLED and is_over.any():
+            raise ResetNeededError(
+                f"the episodes of environments {np.flatnonzero(is_over).tolist()} have ended: reset them by "
+                "reset(options={'reset_mask': mask}) before step()"
+            )
+        for episode, action in zip(episodes, checked_actions(actions, self._action_shape), strict=True):
+            if episode.is_running:
+                episode.aim(action)
+        self._begin(np.flatnonzero(is_over))
+        episodes = [self._episode(i) for i in range(self.num_envs)]
+        look(self.task, episodes)
+        rewards = np.array([0.0 if over else e.view.reward for e, over in zip(episodes, is_over, strict=True)])
+        terminated = np.array([episode.is_solved for episode in episodes]) & ~is_over
+        truncated = np.array([episode.is_truncated for episode in episodes]) & ~is_over
+        return self._observed(), rewards, terminated, truncated, self._infos(range(self.num_envs))
+
+    @property
+    def _action_shape(self) -> tuple[int, ...]:
+        return (self.num_envs, *self.task.action_space.shape)
+
+    def _episode(self, i: int) -> Episode:
+        episode = self._episodes[i]
+        if episode is None:
+            raise ResetNeededError(f"environment {i} has no episode yet: call reset() first")
+        return episode
+
+    def _begin(self, chosen: NDArray[np.int64], volume_name: str | None = None) -> None:
+        if len(chosen):
+            begun = begin(self.task, [self._rngs[i] for i in chosen], volume_name)
+            for i, episode in zip(chosen, begun, strict=True):
+                self._episodes[i] = episode
+
+    def _observed(self) -> Observed:
+        observations = [parts_of(self.task.observe(self._episode(i).view)) for i in range(self.num_envs)]
+        return observation_of(
+            {name: np.stack([observation[name] for observation in observations]) for name in observations[0]}
+        )
+
+    def _infos(self, chosen: Collection[int]) -> dict[str, Any]:
+        """Returns `info` as arrays, and under `_key` which environments it is given for, as Gymnasium has it."""
+        infos = {i: self._episode(i).info() for i in chosen}
+        is_given = np.isin(np.arange(self.num_envs), list(chosen))
+        batched: dict[str, Any] = {}
+        for key, example in next(iter(infos.values())).items():
+            values = np.array([info[key] for info in infos.values()], dtype=object if key == "volume" else None)
+            batched[key] = np.zeros((self.num_envs, *np.shape(example)), dtype=values.dtype)
+            batched[key][is_given] = values
+            batched[f"_{key}"] = is_given
+        return batched
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + i for i in range(self.num_envs)]
+        if not isinstance(seed, list | tuple) or len(seed) != self.num_envs:
+            raise InvalidValueError(
+                f"seed is {seed!r}, but it must be a whole number, or a list of one for each of {self.num_envs}"
+            )
+        return seed
+
+    def _popped_mask(self, options: Any) -> Mask:
+        if not isinstance(options, dict) or "reset_mask" not in options:
+            return np.ones(self.num_envs, dtype=np.bool_)
+        mask = options.pop("reset_mask")
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
+            raise InvalidValueError(
+                f"reset option 'reset_mask' is {mask!r}, but it must be an array of {self.num_envs} truth values"
+            )
+        if not mask.any():
+            raise InvalidValueError("reset option 'reset_mask' marks no environment, but it must mark at least one")
+        return mask
+
+
+def _checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    allowed = (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
+    found = [known for known in allowed if mode in (known, known.value)]
+    if not found:
+        raise InvalidValueError(
+            f"autoreset_mode is {mode!r}, but it must be {' or '.join(known.value for known in allowed)}"
+        )
+    return found[0]

@@ -1,0 +1,113 @@
+"""Many environments at once give what each alone gives."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import armscan
+from armscan.envs import ArmscanVectorEnv
+from armscan.errors import InvalidValueError, ResetNeededError
+from armscan.volumes import LabelVolume
+
+VARIANTS = [
+    {},
+    {"projection": "zy", "stack": 3, "memory": 2},
+    {"projection": "zy", "stack": 2, "memory": 2, "stack_memory": True, "start": "random"},
+    {"observation": "slice_channels", "projection": "full", "stack": 2, "stack_exclude": ["action"], "memory": 2},
+    {"observation": ["cluster", "slice"], "projection": ["rz", "tx"], "memory": 1},
+    {"clustering": "metric", "observation": "action_reward", "transform": None},
+]
+
+
+def assert_same(ours, theirs):
+    assert type(ours) is type(theirs)
+    if isinstance(ours, dict):
+        assert ours.keys() == theirs.keys()
+        for key in ours:
+            assert_same(ours[key], theirs[key])
+    elif isinstance(ours, tuple):
+        assert len(ours) == len(theirs)
+        for our, their in zip(ours, theirs, strict=True):
+            assert_same(our, their)
+    elif isinstance(ours, np.ndarray):
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_array_equal(ours, theirs)
+    else:
+        assert ours == theirs
+
+
+@pytest.fixture(scope="module")
+def volumes(dataset):
+    """Two volumes whose slices have different shapes."""
+    first, second = list(dataset.values())[:2]
+    return [first, LabelVolume(second.labels[10:-3], second.spacing, "narrow", second.optimal_action)]
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=str)
+def test_vector_env_gives_bit_for_bit_what_single_environments_give(volumes, variant):
+    """Gymnasium's own vector environment of single ones is the measure: same seeds, same actions, several episodes."""
+    arguments = {"volumes": volumes, "max_steps": 4} | variant
+    ours = gym.make_vec(armscan.ENV_ID, num_envs=3, **arguments)
+    theirs = SyncVectorEnv([lambda: gym.make(armscan.ENV_ID, **arguments)] * 3)
+    assert isinstance(ours.unwrapped, ArmscanVectorEnv)
+    assert ours.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP is theirs.metadata["autoreset_mode"]
+    assert ours.single_observation_space == theirs.single_observation_space
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert_same(ours.reset(seed=7), theirs.reset(seed=7))
+    ours.action_space.seed(0)
+    n_ended = 0
+    for _ in range(14):
+        actions = ours.action_space.sample()
+        step = ours.step(actions)
+        assert_same(step, theirs.step(actions))
+        assert ours.observation_space.contains(step[0])
+        n_ended += (step[2] | step[3]).sum()
+    assert n_ended > 3
+
+
+def test_vector_env_resets_only_those_that_are_marked(phantom):
+    arguments = {"volumes": [phantom], "projection": "zy", "max_steps": 3, "stack": 3, "memory": 2}
+    ours = gym.make_vec(armscan.ENV_ID, num_envs=3, autoreset_mode="Disabled", **arguments)
+    theirs = SyncVectorEnv([lambda: gym.make(armscan.ENV_ID, **arguments)] * 3, autoreset_mode=AutoresetMode.DISABLED)
+    assert_same(ours.reset(seed=[4, 5, 9]), theirs.reset(seed=[4, 5, 9]))
+    ours.action_space.seed(1)
+    for _ in range(12):
+        actions = ours.action_space.sample()
+        step = ours.step(actions)
+        assert_same(step, theirs.step(actions))
+        ended = step[2] | step[3]
+        if ended.any():
+            assert_same(ours.reset(options={"reset_mask": ended}), theirs.reset(options={"reset_mask": ended.copy()}))
+
+
+def test_vector_env_takes_a_volume_for_all(dataset):
+    envs = ArmscanVectorEnv(2, dataset)
+    name = list(dataset)[2]
+    assert envs.reset(seed=0, options={"volume": name})[1]["volume"].tolist() == [name, name]
+
+
+def test_vector_env_refuses_what_is_impossible(phantom):
+    with pytest.raises(InvalidValueError, match="num_envs is 0"):
+        ArmscanVectorEnv(0, [phantom])
+    with pytest.raises(InvalidValueError, match="autoreset_mode is 'SameStep', but it must be NextStep or Disabled"):
+        ArmscanVectorEnv(2, [phantom], autoreset_mode="SameStep")
+    with pytest.raises(InvalidValueError, match="render_mode is 'human'"):
+        ArmscanVectorEnv(2, [phantom], render_mode="human")
+    envs = ArmscanVectorEnv(2, [phantom], autoreset_mode="Disabled", max_steps=1)
+    with pytest.raises(ResetNeededError, match="environment 0 has no episode yet"):
+        envs.step(np.zeros((2, 1)))
+    for options in ({"reset_mask": [True, False]}, {"reset_mask": np.array([True])}, {"reset_mask": np.zeros(2, bool)}):
+        with pytest.raises(InvalidValueError, match="'reset_mask'"):
+            envs.reset(options=options)
+    for seed in ([1], "ab c", 1.5):
+        with pytest.raises(InvalidValueError, match="seed is"):
+            envs.reset(seed=seed)
+    envs.reset(seed=0)
+    for actions in (np.zeros(2), np.full((2, 1), np.nan), "up", None):
+        with pytest.raises(InvalidValueError, match=r"(?s)action is .*\(2, 1\)"):
+            envs.step(actions)
+    envs.step(np.full((2, 1), -1.0))
+    with pytest.raises(ResetNeededError, match=r"environments \[0, 1\] have ended"):
+        envs.step(np.zeros((2, 1)))
