@@ -45,7 +45,7 @@ def test_read_dataset_refuses_an_empty_folder(tmp_path):
 
 def test_read_dataset_names_a_missing_manifest(write_labelmap, tmp_path):
     write_labelmap("a.nii.gz")
-    with pytest.raises(ManifestError, match=r"optimal_actions\.json: the manifest .* does not exist"):
+    with pytest.raises(ManifestError, match=r"has no manifest \(manifest\.yaml, .* or optimal_actions\.json\)"):
         read_dataset(tmp_path)
 
 
