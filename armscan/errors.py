@@ -24,6 +24,10 @@ class ManifestError(ArmscanError, ValueError):
     """The manifest of a dataset is damaged or disagrees with the files beside it."""
 
 
+class MarkupError(ArmscanError, ValueError):
+    """A markups file of 3D Slicer is damaged, or its plane is none that an agent can move to."""
+
+
 class OptimalPlaneError(ArmscanError, ValueError):
     """A volume's labelled optimal plane is missing, out of bounds, or does not show the landmarks."""
 

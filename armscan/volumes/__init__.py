@@ -3,6 +3,7 @@
 from armscan.volumes.dataset import Dataset, open_dataset, read_dataset
 from armscan.volumes.labelmap import LabelMap
 from armscan.volumes.manifest import MANIFEST_NAMES, record_planes
+from armscan.volumes.markups import read_markup, write_markup
 from armscan.volumes.phantom import load_phantom, load_phantoms, make_phantom
 from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance, slid_into
 from armscan.volumes.reading import read_volume
@@ -23,7 +24,9 @@ __all__ = [
     "open_dataset",
     "plane_distance",
     "read_dataset",
+    "read_markup",
     "read_volume",
     "record_planes",
     "slid_into",
+    "write_markup",
 ]
