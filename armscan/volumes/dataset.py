@@ -10,11 +10,16 @@ from typing import TYPE_CHECKING
 from armscan.checks import check_path
 from armscan.errors import ManifestError, listed
 from armscan.volumes.manifest import MANIFEST_NAMES, find_manifest, read_manifest, volume_entries, volume_files
-from armscan.volumes.reading import read_volume
+from armscan.volumes.reading import ReadingOptions, read_stored
+from armscan.volumes.report import VolumeReport
+from armscan.volumes.resampling import finest_spacing, resampled
 from armscan.volumes.volume import LabelVolume
 
 if TYPE_CHECKING:
     from armscan.volumes.schema import Splits
+
+# What an entry and the whole manifest can say.
+SHARED_KEYS = ("labels", "orientation", "axes", "overlap")
 
 
 @dataclass(frozen=True)
@@ -23,6 +28,7 @@ class Dataset:
 
     Args:
         volumes: by file name, without the excluded ones.
+        reports: what was found in the file of each of them, and what became of it.
         subjects: whose arm each of them is, by file name; a volume without a subject is its own.
         splits: names of the volumes under `train`, `validation` and `test`, None where the manifest has no splits.
         excluded: why a volume of the folder was left out, by file name.
@@ -32,6 +38,7 @@ class Dataset:
     """
 
     volumes: dict[str, LabelVolume]
+    reports: dict[str, VolumeReport]
     subjects: dict[str, str]
     splits: dict[str, tuple[str, ...]] | None = None
     excluded: Mapping[str, str] | None = None
@@ -69,14 +76,21 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
     used = {name: entry for name, entry in entries.items() if not entry.exclude}
     if not used:
         raise ManifestError(f"{found}: excludes every volume of the folder")
-    volumes = {
-        name: read_volume(files[name], optimal_action=entry.plane, axes=manifest.setting(entry, "axes"))
-        for name, entry in used.items()
-    }
+    volumes, stored = {}, {}
+    for name, entry in used.items():
+        volumes[name], stored[name] = read_stored(
+            files[name],
+            ReadingOptions(crop_mm=entry.crop_mm, **{key: manifest.setting(entry, key) for key in SHARED_KEYS}),
+            optimal_action=entry.plane,
+        )
+    if manifest.spacing == "finest":
+        spacing = finest_spacing(volumes.values())
+        volumes = {name: resampled(volume, spacing) for name, volume in volumes.items()}
     subjects = {name: entry.subject or name for name, entry in entries.items()}
     splits = None if manifest.splits is None else _volumes_of(manifest.splits, subjects, used, f"{found}: splits")
     return Dataset(
         volumes=volumes,
+        reports={name: VolumeReport.of(volume, stored[name]) for name, volume in volumes.items()},
         subjects={name: subjects[name] for name in used},
         splits=splits,
         excluded={name: str(entry.exclude) for name, entry in entries.items() if entry.exclude},

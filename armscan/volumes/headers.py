@@ -56,24 +56,34 @@ def check_nifti(path: Path) -> None:
 
 
 def check_nrrd(path: Path) -> None:
-    """Raises `VolumeError` if a NRRD header gives a spacing that is not finite and positive."""
-    given = re.search(rb"^spacings:(.*)$", _text_header(path), re.MULTILINE)
+    """Raises `VolumeError` if a NRRD header gives no spacing, or one that is not finite and positive."""
+    header = _text_header(path).replace(b"\r\n", b"\n").partition(b"\n\n")[0]
+    given = re.search(rb"^spacings:(.*)$", header, re.MULTILINE | re.IGNORECASE)
+    directions = re.search(rb"^space directions:(.*)$", header, re.MULTILINE | re.IGNORECASE)
     if given:
         _check_spacing(path, [_number(word) for word in given.group(1).split()])
-    directions = re.search(rb"^space directions:(.*)$", _text_header(path), re.MULTILINE)
-    if directions:
+    elif directions:
         vectors = re.findall(rb"\(([^)]*)\)|(none)", directions.group(1))
+        # The layers of a segmentation have no direction; an axis of space must have one.
+        if len(vectors) > 3 and vectors[0][1]:
+            vectors = vectors[1:]
         _check_spacing(path, [math.hypot(*map(_number, v.split(b","))) if v else math.nan for v, _ in vectors])
+    else:
+        raise VolumeError(f"{path}: the file gives no spacing (spacings or space directions), but a volume needs one")
 
 
 def check_metaimage(path: Path) -> None:
-    """Raises `VolumeError` if a MetaImage header gives a spacing that is not finite and positive."""
-    given = re.search(rb"^Element(?:Spacing|Size)\s*=(.*)$", _text_header(path), re.MULTILINE)
-    if given:
-        _check_spacing(path, [_number(word) for word in given.group(1).split()])
+    """Raises `VolumeError` if a MetaImage header gives no spacing, or one that is not finite and positive."""
+    header = _text_header(path).partition(b"ElementDataFile")[0]
+    given = re.search(rb"^Element(?:Spacing|Size)\s*=(.*)$", header, re.MULTILINE | re.IGNORECASE)
+    if not given:
+        raise VolumeError(f"{path}: the file gives no spacing (ElementSpacing), but a volume needs one")
+    _check_spacing(path, [_number(word) for word in given.group(1).split()])
 
 
+# By ending; the first that fits a name is the file's.
 CHECKS: dict[str, Callable[[Path], None]] = {
+    ".seg.nrrd": check_nrrd,
     ".nii.gz": check_nifti,
     ".nii": check_nifti,
     ".nrrd": check_nrrd,
