@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.errors import VolumeError
+from armscan.checks import check_numbers
+from armscan.errors import InvalidValueError, VolumeError
 from armscan.volumes.volume import LabelVolume
 
 Spacing = tuple[float, float, float]
@@ -36,8 +37,13 @@ def resampled(volume: LabelVolume, spacing: Spacing) -> LabelVolume:
         The volume with as many voxels of that spacing as have their centres in it.
 
     Raises:
+        InvalidValueError: if the spacing is not three numbers above 0.
         VolumeError: if the volume would have more than 2^30 voxels.
     """
+    s_x, s_y, s_z = check_numbers("spacing", spacing, 3, "(sx, sy, sz) in mm")
+    if min(s_x, s_y, s_z) <= 0:
+        raise InvalidValueError(f"spacing is {spacing!r}, but each must be above 0 mm")
+    spacing = (s_x, s_y, s_z)
     # Files keep spacings with some six digits.
     if np.allclose(volume.spacing, spacing, rtol=1e-5, atol=0.0):
         return volume
