@@ -100,8 +100,8 @@ class PlaneGrid:
 def find_optimal_plane(
     volume: LabelVolume,
     *,
-    rz_deg: float = 30.0,
-    rx_deg: float = 15.0,
+    rz_deg: float = 45.0,
+    rx_deg: float = 20.0,
     step_deg: float = 5.0,
     step_mm: float = 3.0,
     delta: float = 0.05,

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from armscan.checks import check_path
-from armscan.errors import ManifestError, listed
+from armscan.checks import check_choice, check_path
+from armscan.errors import InvalidValueError, ManifestError, listed
 from armscan.volumes.manifest import MANIFEST_NAMES, find_manifest, read_manifest, volume_entries, volume_files
-from armscan.volumes.reading import read_volume
+from armscan.volumes.reading import ReadingOptions, read_stored
+from armscan.volumes.report import VolumeReport
+from armscan.volumes.resampling import finest_spacing, resampled
 from armscan.volumes.volume import LabelVolume
 
 if TYPE_CHECKING:
     from armscan.volumes.schema import Splits
+
+SPLITS = ("train", "validation", "test")
+# What an entry and the whole manifest can say.
+SHARED_KEYS = ("labels", "orientation", "axes", "overlap")
 
 
 @dataclass(frozen=True)
@@ -23,18 +29,33 @@ class Dataset:
 
     Args:
         volumes: by file name, without the excluded ones.
+        reports: what was found in the file of each of them, and what became of it.
         subjects: whose arm each of them is, by file name; a volume without a subject is its own.
-        splits: names of the volumes under `train`, `validation` and `test`, None where the manifest has no splits.
+        splits: `train`, `validation` or `test` by file name, None where the manifest has no splits.
         excluded: why a volume of the folder was left out, by file name.
 
     Raises:
-        InvalidValueError: if a mapping is no mapping, or `subjects` and `volumes` have other keys.
+        InvalidValueError: if one of them is something else, or `reports`, `subjects` or `splits` are of other volumes.
     """
 
     volumes: dict[str, LabelVolume]
+    reports: dict[str, VolumeReport]
     subjects: dict[str, str]
-    splits: dict[str, tuple[str, ...]] | None = None
-    excluded: Mapping[str, str] | None = None
+    splits: dict[str, str] | None = None
+    excluded: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, kind in (("volumes", LabelVolume), ("reports", VolumeReport), ("subjects", str), ("excluded", str)):
+            _check_mapping(name, getattr(self, name), kind, None if name == "excluded" else self.volumes)
+        if self.splits is not None:
+            _check_mapping("splits", self.splits, str, self.volumes)
+            for split in self.splits.values():
+                check_choice("a split", split, SPLITS)
+
+    def volumes_of(self, split: str) -> dict[str, LabelVolume]:
+        """Returns the volumes of `train`, `validation` or `test` by file name; none where there are no splits."""
+        check_choice("split", split, SPLITS)
+        return {name: volume for name, volume in self.volumes.items() if self.splits and self.splits[name] == split}
 
 
 def read_dataset(path: str | Path) -> dict[str, LabelVolume]:
@@ -69,25 +90,38 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
     used = {name: entry for name, entry in entries.items() if not entry.exclude}
     if not used:
         raise ManifestError(f"{found}: excludes every volume of the folder")
-    volumes = {
-        name: read_volume(files[name], optimal_action=entry.plane, axes=manifest.setting(entry, "axes"))
-        for name, entry in used.items()
-    }
+    volumes, stored = {}, {}
+    for name, entry in used.items():
+        volumes[name], stored[name] = read_stored(
+            files[name],
+            ReadingOptions(crop_mm=entry.crop_mm, **{key: manifest.setting(entry, key) for key in SHARED_KEYS}),
+            optimal_action=entry.plane,
+        )
+    if manifest.spacing == "finest":
+        spacing = finest_spacing(volumes.values())
+        volumes = {name: resampled(volume, spacing) for name, volume in volumes.items()}
     subjects = {name: entry.subject or name for name, entry in entries.items()}
-    splits = None if manifest.splits is None else _volumes_of(manifest.splits, subjects, used, f"{found}: splits")
+    splits = None if manifest.splits is None else _split_of(manifest.splits, subjects, used, f"{found}: splits")
     return Dataset(
         volumes=volumes,
+        reports={name: VolumeReport.of(volume, stored[name]) for name, volume in volumes.items()},
         subjects={name: subjects[name] for name in used},
         splits=splits,
         excluded={name: str(entry.exclude) for name, entry in entries.items() if entry.exclude},
     )
 
 
-def _volumes_of(
-    splits: Splits, subjects: Mapping[str, str], used: Mapping[str, object], where: str
-) -> dict[str, tuple[str, ...]]:
-    """Returns the volumes of each split; `subjects` also holds those whose volumes are all excluded."""
-    split_of = {subject: split for split in type(splits).model_fields for subject in getattr(splits, split)}
+def _check_mapping(name: str, value: Any, kind: type, volumes: dict[str, LabelVolume] | None) -> None:
+    """Raises `InvalidValueError` unless `value` holds one of a kind for each of the volumes, where they are given."""
+    if not isinstance(value, dict) or not all(isinstance(each, kind) for each in value.values()):
+        raise InvalidValueError(f"{name} is {value!r}, but it must be a dict with a {kind.__name__} by file name")
+    if volumes is not None and value.keys() != volumes.keys():
+        raise InvalidValueError(f"{name} is of {list(value)}, but it must be of the volumes: {list(volumes)}")
+
+
+def _split_of(splits: Splits, subjects: Mapping[str, str], used: Mapping[str, object], where: str) -> dict[str, str]:
+    """Returns the split of each volume; `subjects` also holds those whose volumes are all excluded."""
+    split_of = {subject: split for split in SPLITS for subject in getattr(splits, split)}
     if unknown := [subject for subject in split_of if subject not in subjects.values()]:
         raise ManifestError(
             f"{where} names {listed(unknown)}, but the subjects are {listed(dict.fromkeys(subjects.values()))}"
@@ -97,6 +131,4 @@ def _volumes_of(
             f"{where} does not name {subjects[left_out[0]]!r}, the subject of {left_out[0]}, but every subject must be "
             "in one split (or its volumes excluded)"
         )
-    return {
-        split: tuple(name for name in used if split_of[subjects[name]] == split) for split in type(splits).model_fields
-    }
+    return {name: split_of[subjects[name]] for name in used}

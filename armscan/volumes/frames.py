@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from armscan.checks import check_numbers
 from armscan.errors import InvalidValueError
+from armscan.volumes.plane import FloatArray
 
 AXES = "xyz"
-# Towards right or left, anterior or posterior, superior or inferior.
-WORLD_AXES = ("RL", "AP", "SI")
+# Each world axis runs from the first towards the second: right, left, anterior, posterior, inferior, superior.
+WORLD_AXES = ("RL", "AP", "IS")
 
 # From and to along each axis that is cropped, in mm.
 Crop = dict[str, tuple[float, float]]
@@ -51,3 +54,13 @@ def check_crop(value: Any) -> Crop | None:
             raise InvalidValueError(f"crop_mm of {axis} is {bounds!r}, but it must begin before it ends")
         crop[axis] = (low, high)
     return crop
+
+
+def orientation_of(direction: FloatArray) -> str:
+    """Returns what the axes run towards, such as 'LPS', by their largest components where they are oblique.
+
+    Args:
+        direction: 3 x 3, the columns are the axes' directions in the world (left, posterior, superior).
+    """
+    largest = np.abs(direction).argmax(axis=0)
+    return "".join(WORLD_AXES[world][int(direction[world, axis] > 0)] for axis, world in enumerate(largest))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from armscan.checks import check_path
-from armscan.errors import InvalidValueError, MarkupError, VolumeError
+from armscan.errors import InvalidValueError, MarkupError
 from armscan.files import write_whole
 from armscan.volumes.plane import FloatArray, ManipulatorAction, slid_into
 from armscan.volumes.slicer_plane import SlicerPlane, read_slicer_plane
@@ -46,7 +46,6 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
     Raises:
         InvalidValueError: if an argument is of another type.
         MarkupError: if the file cannot be written.
-        VolumeError: if the volume's origin or direction is no frame in the world.
     """
     path = check_path("the markups file", path)
     if not isinstance(volume, LabelVolume) or not isinstance(action, ManipulatorAction) or not isinstance(name, str):
@@ -80,13 +79,12 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     Raises:
         InvalidValueError: if an argument is of another type.
         MarkupError: naming the file and the key, if the file does not say which plane, or no action is this plane.
-        VolumeError: if the volume's origin and direction are no frame in the world.
     """
     path = check_path("the markups file", path)
     if not isinstance(volume, LabelVolume):
         raise InvalidValueError(f"volume is {volume!r}, but it must be a LabelVolume")
     plane = read_slicer_plane(path)
-    origin_mm, axes = _world_frame(volume)
+    origin_mm, axes = np.asarray(volume.origin), volume.direction
     point_mm, normal = np.linalg.solve(axes, plane.point_mm - origin_mm), axes.T @ plane.normal
     # Of a plane's two descriptions the one that looks along the arm, so that the picture is not mirrored.
     normal *= -1.0 if normal[1] < 0 else 1.0
@@ -121,7 +119,7 @@ def _is_slice(plane: SlicerPlane, volume: LabelVolume) -> bool:
 
 
 def _markup(volume: LabelVolume, action: ManipulatorAction, name: str) -> dict[str, Any]:
-    origin_mm, axes = _world_frame(volume)
+    origin_mm, axes = np.asarray(volume.origin), volume.direction
     across_mm, _, depth_mm = volume.size_mm
     centre = origin_mm + axes @ (action.matrix @ _slice_centre(volume) + action.offset_mm)
     x_axis, y_axis = axes @ action.matrix[:, 0], axes @ action.matrix[:, 2]
@@ -152,15 +150,3 @@ def _markup(volume: LabelVolume, action: ManipulatorAction, name: str) -> dict[s
 def _slice_centre(volume: LabelVolume) -> FloatArray:
     """The middle of a slice in the plane's frame, which is also the middle of the rectangle that its pixels fill."""
     return np.array([volume.centre_mm[0], 0.0, volume.centre_mm[2]])
-
-
-def _world_frame(volume: LabelVolume) -> tuple[FloatArray, FloatArray]:
-    """Where the volume's first voxel lies in the world, and the directions of its axes there, as columns."""
-    origin, axes = np.asarray(volume.origin, dtype=float), np.asarray(volume.direction, dtype=float)
-    is_frame = origin.shape == (3,) and axes.shape == (3, 3) and np.isfinite(origin).all() and np.isfinite(axes).all()
-    if not is_frame or not np.allclose(axes.T @ axes, np.eye(3), atol=1e-3):
-        raise VolumeError(
-            f"{volume.name}: origin is {origin.tolist()} and direction {axes.tolist()}, but they must be 3 finite "
-            "numbers and 3 perpendicular unit columns"
-        )
-    return origin, axes

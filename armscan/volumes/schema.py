@@ -12,8 +12,6 @@ from armscan.volumes.frames import Crop, check_axes, check_crop, check_orientati
 from armscan.volumes.labelmap import LabelMap
 from armscan.volumes.plane import ManipulatorAction
 
-SPLITS = ("train", "validation", "test")
-
 
 def _rotation(value: Any) -> tuple[float, ...]:
     return check_numbers("rotation", value, 2, "(rz, rx) in degrees")
@@ -85,7 +83,7 @@ class Splits(_Strict):
     @model_validator(mode="after")
     def _has_no_subject_twice(self) -> Splits:
         seen: dict[str, str] = {}
-        for split in SPLITS:
+        for split in type(self).model_fields:
             for subject in getattr(self, split):
                 if subject in seen:
                     raise InvalidValueError(f"has the subject {subject!r} in {seen[subject]} and in {split}")

@@ -73,7 +73,9 @@ def test_manifest_splits_by_subject(folder, write_labelmap):
     write_labelmap("c.nii.gz")
     volumes = {"a.nii.gz": {"subject": "S1"}, "b.nrrd": {"subject": "S2"}, "c.nii.gz": {"subject": "S1"}}
     written(folder, {"splits": {"train": ["S1"], "test": ["S2"]}, "volumes": volumes})
-    assert open_dataset(folder).splits == {"train": ("a.nii.gz", "c.nii.gz"), "validation": (), "test": ("b.nrrd",)}
+    dataset = open_dataset(folder)
+    assert dataset.splits == {"a.nii.gz": "train", "b.nrrd": "test", "c.nii.gz": "train"}
+    assert list(dataset.volumes_of("train")) == ["a.nii.gz", "c.nii.gz"]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from armscan.errors import InvalidValueError, MarkupError, VolumeError
+from armscan.errors import InvalidValueError, MarkupError
 from armscan.volumes import ManipulatorAction, RigidTransform, plane_distance, read_markup, read_volume, write_markup
 from tests.conftest import make_tiny_volume
 
@@ -345,9 +345,3 @@ def test_markup_refuses_arguments_of_other_types(tmp_path):
         write_markup(path, TINY, (0, 0, 0, 0))
     with pytest.raises(InvalidValueError, match="must be a LabelVolume"):
         read_markup(path, TINY.labels)
-
-
-@pytest.mark.parametrize("geometry", [{"direction": np.zeros((3, 3))}, {"direction": np.eye(2)}, {"origin": (0, 0)}])
-def test_markup_refuses_a_volume_that_lies_nowhere(tmp_path, geometry):
-    with pytest.raises(VolumeError, match="tiny: origin is"):
-        write_markup(tmp_path / "plane.mrk.json", replace(TINY, **geometry), ACTION)
