@@ -147,6 +147,9 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
     except RuntimeError as error:
         reason = " ".join(str(error).split("ERROR:")[-1].split())[:200]
         raise VolumeError(f"{path}: the file is truncated or damaged, or no image ({reason})") from error
+    if stored.GetDimension() == 4 and stored.GetSize()[3] == 1:
+        # A single point in time.
+        stored = stored[:, :, :, 0]
     if 0 in stored.GetSize():
         raise VolumeError(f"{path}: the image has the size {stored.GetSize()}, but a labelmap must not be empty")
     if stored.GetDimension() != 3 or stored.GetNumberOfComponentsPerPixel() != 1:
