@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -129,7 +130,7 @@ def _drawn(
     drawn = iter(np.random.default_rng(check_seed("data.split_seed", split_seed)).permutation(len(left)))
     n_subjects = len(set(subjects.values()))
     for part, share in shares.items():
-        chosen = {left[index] for _, index in zip(range(math.ceil(share * n_subjects)), drawn, strict=False)}
+        chosen = {left[index] for index in islice(drawn, math.ceil(share * n_subjects))}
         parts |= {volume: part for volume, subject in subjects.items() if subject in chosen}
     parts = {volume: parts.get(volume, "train") for volume in subjects}
     _check_subjects(parts, subjects)

@@ -4,9 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given
 
 from armscan.errors import InvalidValueError
 from armscan.training import Split, nifti_data, phantom_data
+
+from ..volumes.test_damaged import SETTINGS, anything, refuses
 
 
 def test_phantom_data_has_phantoms_of_other_seeds_for_each_purpose():
@@ -111,6 +114,20 @@ def test_nifti_data_refuses_a_manifest_without_a_split_for_everything(folder):
 
 def test_nifti_data_reads_the_shared_manifest_as_it_is(data_folder):
     assert [len(part) for part in names(nifti_data(str(data_folder)))] == [2, 1, 1]
+
+
+@SETTINGS
+@given(anything, anything, anything)
+def test_nifti_data_answers_any_argument(folder, validation, test, split_seed):
+    refuses(lambda: nifti_data(folder(), validation, test, split_seed))
+    refuses(lambda: nifti_data(folder(), validation="U", test=test))
+    refuses(lambda: nifti_data(validation))
+
+
+@SETTINGS
+@given(anything, anything)
+def test_split_answers_any_argument(tiny_volume, training, validation):
+    refuses(lambda: Split(training, validation, {"a": tiny_volume}))
 
 
 @pytest.mark.parametrize("volumes", [None, [], {"a": np.zeros(3)}])

@@ -124,6 +124,13 @@ def test_read_volume_refuses_a_file_that_gives_no_spacing(write_labelmap):
             read_volume(path)
 
 
+def test_read_volume_refuses_a_name_that_is_no_text(write_labelmap):
+    path = write_labelmap("wrist.nrrd")
+    renamed = path.rename(path.with_name("wrist\udcff.nrrd"))
+    with pytest.raises(VolumeError, match=r"wrist\\udcff\.nrrd': the file's name must be a text in UTF-8"):
+        read_volume(renamed)
+
+
 def test_read_volume_refuses_grey_values(write_labelmap):
     grey = np.random.default_rng(0).normal(100, 30, (10, 10, 10)).astype(np.float32)
     with pytest.raises(VolumeError, match=r"wrist\.nii\.gz: .*grey values"):
