@@ -15,7 +15,7 @@ from armscan.envs.observations import FloatVector
 from armscan.volumes.plane import FloatArray
 
 # What evaluations are called by, after the volumes that they are on.
-TRAINED_ON, HELD_OUT = "training volumes", "held-out volumes"
+TRAINING, VALIDATION, TEST = "training volumes", "validation volumes", "test volumes"
 
 Env = gym.Env[FloatVector, FloatArray]
 

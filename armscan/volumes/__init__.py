@@ -7,6 +7,7 @@ from armscan.volumes.markups import read_markup, write_markup
 from armscan.volumes.phantom import load_phantom, load_phantoms, make_phantom
 from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance, slid_into
 from armscan.volumes.reading import read_volume
+from armscan.volumes.report import VolumeReport
 from armscan.volumes.volume import LABEL_NAMES, LANDMARK_LABELS, LabelVolume
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "LabelVolume",
     "ManipulatorAction",
     "RigidTransform",
+    "VolumeReport",
     "load_phantom",
     "load_phantoms",
     "make_phantom",

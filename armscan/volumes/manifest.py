@@ -116,12 +116,14 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
     if document.get("volumes") is None:
         document["volumes"] = {name: {} for name in files}
     for name, keys in recorded.items():
-        document["volumes"].setdefault(name, {}).update(keys)
+        # A new object: in YAML, two entries can be one and the same.
+        document["volumes"][name] = document["volumes"].get(name, {}) | keys
     contents = document["volumes"] if path.name == ENTRIES_ONLY else document
     try:
-        write_whole(path, lambda file: file.write(_dumped(contents, path).encode()))
-    except OSError as error:
-        raise ManifestError(f"{path}: the manifest cannot be written ({error.strerror or error})") from error
+        text = _dumped(contents, path).encode()
+        write_whole(path, lambda file: file.write(text))
+    except (OSError, UnicodeError) as error:
+        raise ManifestError(f"{path}: the manifest cannot be written ({error})") from error
     return path
 
 

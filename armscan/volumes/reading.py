@@ -45,6 +45,15 @@ class ReadingOptions:
         check_choice("overlap", self.overlap, OVERLAPS)
 
 
+def is_text(name: str) -> bool:
+    """Whether a name can be written; the names of files may hold any bytes."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def volume_suffix(path: Path) -> str | None:
     """Returns the ending that says a file is a volume ('.nii.gz', ...), None for any other file."""
     return next((suffix for suffix in CHECKS if path.name.endswith(suffix)), None)
@@ -137,6 +146,9 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
     try:
         if not path.is_file():
             raise VolumeError(f"{path}: there is no such file")
+        if not is_text(str(path)):
+            # SimpleITK would end the process.
+            raise VolumeError(f"{str(path)!a}: the file's name must be a text in UTF-8")
         CHECKS[suffix](path)
         if suffix == SEGMENTATION_SUFFIX:
             labels, matrix, found = read_segmentation(path, options.labels, options.overlap)
@@ -147,6 +159,11 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
     except RuntimeError as error:
         reason = " ".join(str(error).split("ERROR:")[-1].split())[:200]
         raise VolumeError(f"{path}: the file is truncated or damaged, or no image ({reason})") from error
+    if stored.GetDimension() == 4 and stored.GetSize()[3] == 1:
+        # A single point in time.
+        stored = stored[:, :, :, 0]
+    if 0 in stored.GetSize():
+        raise VolumeError(f"{path}: the image has the size {stored.GetSize()}, but a labelmap must not be empty")
     if stored.GetDimension() != 3 or stored.GetNumberOfComponentsPerPixel() != 1:
         raise VolumeError(
             f"{path}: the image is {stored.GetDimension()}-D with {stored.GetNumberOfComponentsPerPixel()} value(s) a "

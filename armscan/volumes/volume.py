@@ -23,6 +23,8 @@ RIGHT_ANGLE_TOLERANCE = 1e-3
 class LabelVolume:
     """An integer labelmap of an arm with its spacing and, where one is known, the plane to find.
 
+    It may be one voxel thick along an axis; a plane beside it shows background, as beside any volume.
+
     Args:
         labels: integers over (x, y, z), shape (nx, ny, nz): X across the palm, Y along the arm, Z through the depth;
             0 background, 1 bones, 2 flexor tendons, 3 ulnar artery, 4 median nerve. Kept as C-contiguous uint8.
@@ -35,8 +37,6 @@ class LabelVolume:
     Raises:
         VolumeError: naming the volume, if the labels are not a 3-D array of the labels above, a landmark is missing,
             the spacing is not finite and positive, or the way back is no position and axes at right angles.
-
-    A volume may be one voxel thick along an axis; planes beside it show background.
     """
 
     labels: NDArray[np.uint8]

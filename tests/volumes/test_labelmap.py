@@ -151,7 +151,8 @@ def test_report_tells_what_the_file_held_and_what_became_of_it(write_labelmap, t
     assert (report.shape, report.orientation, report.stored.orientation) == (tiny_volume.shape, "LPS", "LPS")
 
 
-def test_volume_of_one_voxels_thickness_is_a_volume(write_labelmap):
+@pytest.mark.parametrize("name", ["thin.nrrd", "thin.nii.gz", "thin.mha"])
+def test_volume_of_one_voxels_thickness_is_a_volume(write_labelmap, name):
     """Along any axis; a plane beside it shows background."""
     from armscan.volumes import ManipulatorAction
 
@@ -160,7 +161,7 @@ def test_volume_of_one_voxels_thickness_is_a_volume(write_labelmap):
         shape[axis] = 1
         labels = np.zeros(shape, np.uint8)
         labels.flat[:3] = (1, 2, 3)
-        volume = read_volume(write_labelmap("thin.nrrd", labels=labels))
+        volume = read_volume(write_labelmap(name, labels=labels))
         np.testing.assert_array_equal(volume.labels, labels)
         assert isinstance(volume, LabelVolume)
         assert not volume.slice(ManipulatorAction((0.0, 0.0), (0.0, 50.0))).any()

@@ -2,12 +2,15 @@
 
 import json
 import math
+import re
+from dataclasses import fields
+from pathlib import Path
 
 import pytest
 import yaml
 
 from armscan.errors import InvalidValueError, ManifestError
-from armscan.volumes import ManipulatorAction, open_dataset, record_planes
+from armscan.volumes import LabelMap, ManipulatorAction, open_dataset, record_planes
 
 PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
 NAMES = ["manifest.yaml", "manifest.yml", "manifest.json"]
@@ -158,6 +161,15 @@ def test_record_planes_keeps_what_else_the_manifest_says(folder, name):
     assert {file.name for file in folder.iterdir()} == {"a.nii.gz", "b.nrrd", name}
 
 
+def test_record_planes_tells_entries_apart_that_yaml_has_as_one(folder):
+    written(folder, "volumes: {a.nii.gz: &same {subject: S1}, b.nrrd: *same}")
+    record_planes(folder, {"a.nii.gz": (ACTION, -0.01)})
+    dataset = open_dataset(folder)
+    assert dataset.volumes["a.nii.gz"].optimal_action == ACTION
+    assert dataset.volumes["b.nrrd"].optimal_action is None
+    assert dataset.subjects == {"a.nii.gz": "S1", "b.nrrd": "S1"}
+
+
 @pytest.mark.parametrize("contents", [None, "axes: xyz", ""])
 def test_record_planes_makes_what_is_missing(folder, contents):
     if contents is not None:
@@ -189,3 +201,21 @@ def test_record_planes_leaves_a_damaged_manifest_alone(folder):
     with pytest.raises(ManifestError, match="has the key 'axis'"):
         record_planes(folder, {"a.nii.gz": (ACTION, 0.0)})
     assert (folder / "manifest.yaml").read_text() == "axis: 3"
+
+
+def test_manifest_page_names_every_key_and_its_example_is_one(tmp_path):
+    from armscan.volumes.manifest import read_manifest
+    from armscan.volumes.schema import Manifest, Splits, VolumeEntry
+
+    page = (Path(__file__).parents[2] / "docs" / "manifest.md").read_text()
+    keys = [
+        *Manifest.model_fields,
+        *VolumeEntry.model_fields,
+        *Splits.model_fields,
+        *(f.name for f in fields(LabelMap)),
+    ]
+    assert [key for key in keys if f"`{key}`" not in page and f"`{key}:" not in page] == []
+    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    manifest = read_manifest(written(tmp_path, example) / "manifest.yaml")
+    used = {key for entry in manifest.volumes.values() for key in entry.model_fields_set}
+    assert used == set(VolumeEntry.model_fields)
