@@ -24,15 +24,18 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from yaml import YAMLError
 
 from armscan.checks import check_bool
-from armscan.errors import ArmscanError, InvalidValueError, listed
+from armscan.errors import ArmscanError, InvalidValueError, is_interruption, listed
 from armscan.labelling import DELTA, Labelled, Request, label
 from armscan.volumes.markups import MARKUP_SUFFIX
 
 # Within the folder of the data, where no other is asked for.
 PICTURES = "labelling"
+# Keys whose values are taken as they are written, whatever a path looks like; lists and truth values are parsed.
+TEXTS = ("data", "pictures", "markup", "volume")
 
 
 def parse(words: Sequence[str]) -> Request:
@@ -43,45 +46,47 @@ def parse(words: Sequence[str]) -> Request:
     """
     allowed = [field.name for field in fields(Request)]
     for word in words:
-        if "=" not in word:
+        key, equals, text = word.partition("=")
+        if not equals:
             raise InvalidValueError(f"{word!r} cannot be read: give key=value, with a key of {listed(allowed)}")
-    try:
-        values: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(words)), resolve=True)
-    except (OmegaConfBaseException, YAMLError) as error:
-        raise InvalidValueError(f"{' '.join(words)!r} cannot be read ({' '.join(str(error).split())})") from error
-    if unknown := [key for key in values if key not in allowed]:
-        raise InvalidValueError(f"there is no key {unknown[0]!r}, but only {listed(allowed)}")
-    if "data" not in values:
+        if key not in allowed:
+            raise InvalidValueError(f"there is no key {key!r}, but only {listed(allowed)}")
+        if not text:
+            raise InvalidValueError(f"{key} is empty, but it must have a value")
+    texts = {word.partition("=")[0]: word.partition("=")[2] for word in words}
+    values = _values([word for word in words if word.partition("=")[0] not in TEXTS])
+    if "data" not in texts:
         raise InvalidValueError("data is not set, but it must be: give data=FOLDER (--help explains)")
-    if ("markup" in values) != ("volume" in values):
+    if ("markup" in texts) != ("volume" in texts):
         raise InvalidValueError("markup and volume must be given together: which file, and for which volume")
-    if idle := [key for key in ("volumes", "overwrite") if key in values and "markup" in values]:
+    if idle := [key for key in ("volumes", "overwrite") if key in texts and "markup" in texts]:
         raise InvalidValueError(f"{idle[0]} is for a search, but markup and volume say which plane and for what")
-    data = Path(_text("data", values["data"]))
-    names = values.get("volumes")
+    data = Path(texts["data"])
     return Request(
         data=data,
-        volumes=None if names is None else _names(names),
+        volumes=_names(values["volumes"]) if "volumes" in values else None,
         overwrite=check_bool("overwrite", values.get("overwrite", False)),
-        pictures=Path(_text("pictures", values["pictures"])) if "pictures" in values else data / PICTURES,
+        pictures=Path(texts["pictures"]) if "pictures" in texts else data / PICTURES,
         markups=check_bool("markups", values.get("markups", False)),
-        markup=Path(_text("markup", values["markup"])) if "markup" in values else None,
-        volume=_text("volume", values["volume"]) if "volume" in values else None,
+        markup=Path(texts["markup"]) if "markup" in texts else None,
+        volume=texts.get("volume"),
     )
 
 
-def _text(key: str, value: Any) -> str:
-    # A folder that is called 2024 is read as a number.
-    if isinstance(value, bool) or not isinstance(value, str | int) or value == "":
-        raise InvalidValueError(f"{key} is {value!r}, but it must be a text")
-    return str(value)
+def _values(words: list[str]) -> dict[str, Any]:
+    """What words whose values are no plain texts say."""
+    try:
+        values: Any = OmegaConf.to_container(OmegaConf.from_dotlist(words), resolve=True)
+    except (OmegaConfBaseException, YAMLError) as error:
+        raise InvalidValueError(f"{' '.join(words)!r} cannot be read ({' '.join(str(error).split())})") from error
+    return dict(values)
 
 
 def _names(value: Any) -> tuple[str, ...]:
     names = value if isinstance(value, list) else [value]
-    if not names:
-        raise InvalidValueError("volumes is [], but it must name at least one")
-    return tuple(_text("each of volumes", name) for name in names)
+    if not names or not all(isinstance(name, str) for name in names):
+        raise InvalidValueError(f"volumes is {value!r}, but it must be the names of some volumes: [A,B]")
+    return tuple(names)
 
 
 def print_report(request: Request, labelled: Sequence[Labelled]) -> None:
@@ -93,7 +98,7 @@ def print_report(request: Request, labelled: Sequence[Labelled]) -> None:
     for plane in labelled:
         rz, rx, tx, ty = plane.action.to_array()
         table.add_row(
-            plane.volume.name,
+            Text(plane.volume.name),
             f"{plane.score:.3f}",
             ", ".join(map(str, plane.counts)),
             f"{rz:.1f}, {rx:.1f}",
@@ -123,10 +128,13 @@ def main(words: Sequence[str] | None = None) -> int:
     try:
         request = parse(words)
         labelled, failures = label(request)
-    except KeyboardInterrupt:
-        print("\ninterrupted; the planes found so far are in the manifest", file=sys.stderr)
-        return 130
-    except ArmscanError as error:
+    # Raised inside compiled code, an interrupt can come out as any other error.
+    except (KeyboardInterrupt, Exception) as error:
+        if is_interruption(error):
+            print("\ninterrupted; the planes found so far are in the manifest", file=sys.stderr)
+            return 130
+        if not isinstance(error, ArmscanError):
+            raise
         print(f"error: {error}", file=sys.stderr)
         return 2
     if labelled:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,20 +87,17 @@ def label(request: Request) -> tuple[list[Labelled], list[OptimalPlaneError]]:
     labelled: list[Labelled] = []
     failures: list[OptimalPlaneError] = []
     for number, (name, volume) in enumerate(volumes.items(), 1):
-        start_s = time.perf_counter()
-        print(f"{number}/{len(volumes)}  {name}", end="", flush=True)
+        print(f"{number}/{len(volumes)}  {name}", flush=True)
         try:
             plane = _found(volume) if request.markup is None else _drawn(volume, request.markup)
         except OptimalPlaneError as error:
             failures.append(error)
-            print("  no plane", flush=True)
             continue
         # The manifest last: no plane stands there that nobody can look at.
         _write_picture(request.pictures / f"{name}.png", plane)
         if request.markups:
             write_markup(request.pictures / f"{name}{MARKUP_SUFFIX}", volume, plane.action)
         record_planes(request.data, {name: (plane.action, plane.score)})
-        print(f"  score {plane.score:.3f}, {time.perf_counter() - start_s:.1f} s", flush=True)
         labelled.append(plane)
     return labelled, failures
 
