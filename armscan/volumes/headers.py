@@ -24,6 +24,19 @@ from armscan.errors import VolumeError
 TEXT_HEADER_BYTES = 65536
 # Bytes of a voxel by the code of its type; the header's own figure can be anything and is not what is read.
 NIFTI_VOXEL_BYTES = {2: 1, 4: 2, 8: 4, 16: 4, 64: 8, 256: 1, 512: 2, 768: 4, 1024: 8, 1280: 8}
+METAIMAGE_FIELDS = (b"NDims", b"DimSize", b"ElementType", b"ElementDataFile")
+METAIMAGE_VOXEL_BYTES = {
+    b"MET_CHAR": 1,
+    b"MET_UCHAR": 1,
+    b"MET_SHORT": 2,
+    b"MET_USHORT": 2,
+    b"MET_INT": 4,
+    b"MET_UINT": 4,
+    b"MET_LONG_LONG": 8,
+    b"MET_ULONG_LONG": 8,
+    b"MET_FLOAT": 4,
+    b"MET_DOUBLE": 8,
+}
 NIFTI_FLOATS = {16: "f4", 64: "f8"}
 # No header is longer, extensions included.
 LARGEST_OFFSET = 1 << 24
@@ -113,12 +126,31 @@ def check_segmentation(path: Path) -> None:
 
 
 def check_metaimage(path: Path) -> None:
-    """Raises `VolumeError` if a MetaImage header gives no spacing, or one that is not finite and positive."""
-    header = _text_header(path).partition(b"ElementDataFile")[0]
-    given = re.search(rb"^Element(?:Spacing|Size)\s*=(.*)$", header, re.MULTILINE | re.IGNORECASE)
-    if not given:
+    """Raises `VolumeError` if a MetaImage is cut off, or its header gives no finite and positive spacing."""
+    text = _text_header(path)
+    start, found, rest = text.partition(b"ElementDataFile")
+    fields = {
+        name.strip(): value.strip()
+        for name, _, value in (line.partition(b"=") for line in (start + found + rest.partition(b"\n")[0]).splitlines())
+    }
+    if missing := [name for name in METAIMAGE_FIELDS if name not in fields]:
+        raise VolumeError(f"{path}: the header gives no {missing[0].decode()}, but a MetaImage needs it")
+    spacing = fields.get(b"ElementSpacing", fields.get(b"ElementSize"))
+    if spacing is None:
         raise VolumeError(f"{path}: the file gives no spacing (ElementSpacing), but a volume needs one")
-    _check_spacing(path, [_number(word) for word in given.group(1).split()])
+    _check_spacing(path, [_number(word) for word in spacing.split()])
+    data_file = path if fields[b"ElementDataFile"] == b"LOCAL" else path.parent / _decoded(fields[b"ElementDataFile"])
+    voxel_bytes = METAIMAGE_VOXEL_BYTES.get(fields[b"ElementType"])
+    # The other kinds are met by the reading library.
+    if fields.get(b"CompressedData", b"False") != b"False" or voxel_bytes is None or not data_file.is_file():
+        return
+    n_header = len(start + found) + rest.index(b"\n") + 1 if data_file == path and b"\n" in rest else 0
+    n_bytes = data_file.stat().st_size - n_header
+    expected = math.prod(_number(word) for word in fields[b"DimSize"].split()) * voxel_bytes
+    if not n_bytes >= expected:
+        raise VolumeError(
+            f"{path}: the file is truncated: it holds {n_bytes} bytes of voxels, but its header promises {expected:g}"
+        )
 
 
 # By ending; the first that fits a name is the file's.
@@ -155,6 +187,10 @@ def _nrrd_header(path: Path) -> bytes:
 def _nrrd_field(header: bytes, name: bytes) -> bytes | None:
     field = re.search(rb"^" + name + rb":(?!=)(.*)$", header, re.MULTILINE | re.IGNORECASE)
     return field.group(1) if field else None
+
+
+def _decoded(name: bytes) -> str:
+    return name.decode(errors="surrogateescape").replace("\0", "")
 
 
 def _number(word: bytes) -> float:

@@ -148,7 +148,7 @@ def _load(path: Path) -> Document:
     """Reads the file as it is, whichever of the two languages it is in."""
     language, load = ("JSON", _load_json) if path.suffix == ".json" else ("YAML", _load_yaml)
     try:
-        document = load(path.read_text(encoding="utf-8"))
+        document = load(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ManifestError(f"{path}: the manifest cannot be read ({error.strerror or error})") from error
     # PyYAML reports some damaged texts by whatever exception its constructors meet first: KeyError, AttributeError, ...
@@ -178,17 +178,21 @@ def _load_yaml(text: str) -> Any:
     class Loader(yaml.SafeLoader):
         """Refuses a key that is there twice."""
 
-        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-            own = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
-            _check_no_duplicates([self.construct_object(key, deep=True) for key in own])
-            return super().construct_mapping(node, deep=deep)
+        def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+            node = super().compose_mapping_node(anchor)
+            keys = (key for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+            _check_no_duplicates([key.value for key in keys if key.tag != "tag:yaml.org,2002:merge"])
+            return node
 
     return yaml.load(text, Loader)
 
 
-def _check_no_duplicates(keys: list[Any]) -> None:
-    if twice := next((key for position, key in enumerate(keys) if key in keys[:position]), None):
-        raise ValueError(f"the key {twice!r} is there twice")
+def _check_no_duplicates(keys: list[str]) -> None:
+    seen: set[str] = set()
+    for key in keys:
+        if key in seen:
+            raise ValueError(f"the key {key!r} is there twice")
+        seen.add(key)
 
 
 def _dumped(contents: Document, path: Path) -> str:

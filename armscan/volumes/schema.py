@@ -51,7 +51,7 @@ class VolumeEntry(_Strict):
     translation: Annotated[tuple[float, ...], BeforeValidator(_translation)] | None = None
     score: Annotated[float, BeforeValidator(_score)] | None = None
     subject: str | None = Field(default=None, min_length=1, description="a text that is not empty (quote numbers)")
-    exclude: bool | str = Field(default=False, description="true, false or the reason")
+    exclude: bool | Annotated[str, Field(min_length=1)] = Field(default=False, description="true, false or the reason")
     labels: Labels | None = None
     orientation: Orientation = None
     axes: Axes = "xyz"

@@ -125,6 +125,8 @@ def test_manifest_refuses_impossible_splits(folder, splits, message):
         ("volumes: {a.nii.gz: {subject: 3}}", "entry 'a.nii.gz': subject is 3, but it must be a text"),
         ("volumes: {a.nii.gz: {subject: ''}}", "entry 'a.nii.gz': subject is '', but it must be a text"),
         ("volumes: {a.nii.gz: {exclude: 1}}", "entry 'a.nii.gz': exclude is 1, but it must be true, false or the"),
+        ("volumes: {a.nii.gz: {exclude: ''}}", "entry 'a.nii.gz': exclude is '', but it must be true, false or the"),
+        ("? ''\n: 1\n? ''\n: 2", "the key '' is there twice"),
         ("volumes: {a.nii.gz: {score: 0.1}}", "entry 'a.nii.gz': score is 0.1, but it must be"),
         ("volumes: {a.nii.gz: {score: .nan}}", "entry 'a.nii.gz': score is nan, but it must be"),
         ("volumes: {a.nii.gz: {rotation: [.inf, 0]}}", r"entry 'a.nii.gz': rotation is \[inf, 0\], but it must be"),
@@ -159,6 +161,13 @@ def test_record_planes_keeps_what_else_the_manifest_says(folder, name):
     assert volumes["b.nrrd"].optimal_action == ACTION
     assert volumes["a.nii.gz"].optimal_action.rotation == (1.5, -0.5)
     assert {file.name for file in folder.iterdir()} == {"a.nii.gz", "b.nrrd", name}
+
+
+def test_manifest_may_repeat_itself_as_yaml_allows(folder):
+    written(folder, "\ufeffvolumes: {a.nii.gz: &one {subject: S1, axes: xyz}, b.nrrd: {<<: *one, axes: zyx}}")
+    dataset = open_dataset(folder)
+    assert dataset.subjects == {"a.nii.gz": "S1", "b.nrrd": "S1"}
+    assert dataset.volumes["b.nrrd"].shape == dataset.volumes["a.nii.gz"].shape[::-1]
 
 
 def test_record_planes_tells_entries_apart_that_yaml_has_as_one(folder):
