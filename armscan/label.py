@@ -93,7 +93,7 @@ def print_report(request: Request, labelled: Sequence[Labelled]) -> None:
     """Prints a table of the planes, and what the person who looks at them can do next."""
     table = Table(title="planes written into the manifest", title_justify="left")
     table.add_column("volume", overflow="fold")
-    for heading in ("score", "clusters", "rz, rx in °", "tx, ty in mm", "as good over"):
+    for heading in ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "as good over\n°, °, mm"):
         table.add_column(heading, justify="right")
     for plane in labelled:
         rz, rx, tx, ty = plane.action.to_array()
@@ -103,7 +103,7 @@ def print_report(request: Request, labelled: Sequence[Labelled]) -> None:
             ", ".join(map(str, plane.counts)),
             f"{rz:.1f}, {rx:.1f}",
             f"{tx:.1f}, {ty:.1f}",
-            "-" if plane.spread is None else "{:.0f}°, {:.0f}°, {:.0f} mm".format(*plane.spread),
+            "-" if plane.spread is None else "{:.0f}, {:.0f}, {:.0f}".format(*plane.spread),
         )
     Console().print(table)
     for plane in labelled:

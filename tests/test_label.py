@@ -12,6 +12,7 @@ from PIL import Image
 
 import armscan.labelling
 from armscan.anatomy import find_optimal_plane
+from armscan.envs import ArmscanEnv
 from armscan.label import main
 from armscan.volumes import ManipulatorAction, open_dataset, plane_distance, read_markup, read_volume, write_markup
 
@@ -63,6 +64,7 @@ def test_label_writes_planes_pictures_and_markups_and_says_what_to_do(bare, name
             assert picture.size == (860, 480)
         markup = read_markup(bare / "labelling" / f"{name}.mrk.json", dataset[name])
         np.testing.assert_allclose(markup.to_array(), found[name].to_array(), atol=1e-6)
+    ArmscanEnv(list(open_dataset(bare).volumes.values()), projection="zy").reset(seed=0)
     said = capsys.readouterr().out
     for word in ("0.000", "4, 3, 1", "accept", "reject", "exclude", "markup=FILE.mrk.json"):
         assert word in said
