@@ -59,7 +59,8 @@ def check_bool(name: str, value: Any) -> bool:
 
 def check_choice(name: str, value: T, allowed: Sequence[T]) -> T:
     """Returns `value` if it is one of `allowed`."""
-    if value not in allowed:
+    # An array is never a choice, and cannot be compared with one.
+    if isinstance(value, np.ndarray) or value not in allowed:
         raise InvalidValueError(f"{name} is {value!r}, but it must be {listed(allowed)}")
     return value
 

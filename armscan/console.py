@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from armscan.multirun import Outcome
-from armscan.training import HELD_OUT, Callback, EpochReport, Evaluation
+from armscan.training import TEST, Callback, EpochReport, Evaluation
 
 RESULT_ROWS = (
     ("success rate", "success_rate", "{:.1%}"),
@@ -110,12 +110,12 @@ def print_results(title: str, evaluations: Mapping[str, Evaluation]) -> None:
 
 def print_jobs(outcomes: Mapping[str, Outcome]) -> None:
     """Prints the table of a multirun's jobs, by their numbers."""
-    table = Table(title="jobs (held-out volumes)", title_justify="left")
+    table = Table(title=f"jobs ({TEST})", title_justify="left")
     for heading in ("job", "overrides", "outcome", "success rate", "mean steps"):
         table.add_column(heading)
     for number, outcome in outcomes.items():
-        held_out = outcome.figures.get(HELD_OUT, {})
-        figures = [f"{held_out['success_rate']:.1%}", f"{held_out['mean_steps']:.2f}"] if held_out else ["-", "-"]
+        judged = outcome.figures.get(TEST, {})
+        figures = [f"{judged['success_rate']:.1%}", f"{judged['mean_steps']:.2f}"] if judged else ["-", "-"]
         table.add_row(number, outcome.varied, "failed" if outcome.is_failed else outcome.failure or "done", *figures)
     Console().print(table)
 

@@ -11,6 +11,10 @@ from collections.abc import Iterable
 class ArmscanError(Exception):
     """Base of every error that armscan raises on purpose."""
 
+    def __str__(self) -> str:
+        """One line, also where a received value, such as an array, is written in several."""
+        return " ".join(line.strip() for line in super().__str__().splitlines())
+
 
 class InvalidValueError(ArmscanError, ValueError):
     """An argument or configuration value is outside what is allowed."""
@@ -22,6 +26,10 @@ class VolumeError(ArmscanError, ValueError):
 
 class ManifestError(ArmscanError, ValueError):
     """The manifest of a dataset is damaged or disagrees with the files beside it."""
+
+
+class MarkupError(ArmscanError, ValueError):
+    """A markups file of 3D Slicer is damaged, or its plane is none that an agent can move to."""
 
 
 class OptimalPlaneError(ArmscanError, ValueError):

@@ -52,7 +52,7 @@ except KeyboardInterrupt:
     raise SystemExit(130)
 """
 # First seeds of the episodes that are played for each purpose, so that none is played for two.
-TEST_SEED, TRAINING_VOLUMES_SEED, HELD_OUT_VOLUMES_SEED, FILM_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
+VALIDATION_SEED, TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED, FILM_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
 
     from armscan.agents import LearningSetup, checked_device
     from armscan.console import print_results, print_where_to_look, progress_reporter
-    from armscan.training import HELD_OUT, TRAINED_ON, evaluate, film_episode, train
+    from armscan.training import TEST, TRAINING, evaluate, film_episode, train
 
     quieten_libraries()
     torch.set_num_threads(1)
@@ -110,8 +110,8 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     # Everything is built, and so checked, before anything is tracked.
     split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
     maker = instantiate(config.env, _convert_="object")
-    training_env, held_out_env = maker.one(split.training), maker.one(split.held_out)
-    film_env = maker.one(split.held_out, render_mode="rgb_array")
+    training_env, validation_env, test_env = map(maker.one, (split.training, split.validation, split.test))
+    film_env = maker.one(split.test, render_mode="rgb_array")
     setup = LearningSetup(
         make_envs=partial(maker.many, volumes=split.training, autoreset_mode="Disabled"),
         total_env_steps=budget.env_steps,
@@ -119,14 +119,16 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
         device=checked_device(config.device),
     )
     learner = instantiate(config.agent, _convert_="object").learner(setup)
-    test = partial(evaluate, learner, held_out_env, n_episodes=budget.test_episodes, seed=TEST_SEED + seed)
+    validate = partial(
+        evaluate, learner, validation_env, n_episodes=budget.validation_episodes, seed=VALIDATION_SEED + seed
+    )
 
     with tracked_run(config, invocation, split) as tracked:
         progress = progress_reporter(job.label if job else None)
-        result = train(learner, budget, test, folder, callbacks=[progress, tracked])
+        result = train(learner, budget, validate, folder, callbacks=[progress, tracked])
         evaluations = {
-            TRAINED_ON: evaluate(learner, training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),
-            HELD_OUT: evaluate(learner, held_out_env, n_episodes=n_episodes, seed=HELD_OUT_VOLUMES_SEED + seed),
+            TRAINING: evaluate(learner, training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),
+            TEST: evaluate(learner, test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED + seed),
         }
         film_episode(learner, film_env, folder / "episode.gif", seed=FILM_SEED + seed)
         tracked.keep_results(result, evaluations, folder)
@@ -161,7 +163,8 @@ def tracked_run(config: DictConfig, invocation: Invocation, split: Split) -> Tra
             "overrides": " ".join(invocation.overrides),
             **{f"choice.{group}": choices[group] for group in CHOICES_IN_TAGS},
             "volumes.training": " ".join(split.training)[:MAX_TAG_CHARS],
-            "volumes.held_out": " ".join(split.held_out)[:MAX_TAG_CHARS],
+            "volumes.validation": " ".join(split.validation)[:MAX_TAG_CHARS],
+            "volumes.test": " ".join(split.test)[:MAX_TAG_CHARS],
         },
         parent_id=invocation.job.parent_run_id if invocation.job else None,
     )

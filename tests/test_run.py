@@ -18,10 +18,11 @@ from armscan.multirun import Multirun
 
 SMALL = [
     "data.n_training=1",
-    "data.n_held_out=1",
+    "data.n_validation=1",
+    "data.n_test=1",
     "training.env_steps=400",
     "training.epoch_env_steps=200",
-    "training.test_episodes=2",
+    "training.validation_episodes=2",
     "evaluation.episodes=3",
     "env.max_steps=8",
     "agent.random_env_steps=100",
@@ -72,7 +73,7 @@ def test_run_trains_evaluates_and_tracks(tmp_path):
     ended = armscan_run(*SMALL, "seed=3", cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
-    for word in ("400/400 steps", "return", "success", "left", "held-out volumes", "mlflow ui", "episode.gif"):
+    for word in ("400/400 steps", "return", "success", "left", "test volumes", "mlflow ui", "episode.gif"):
         assert word in ended.stdout
     client, (tracked,) = runs_in(tmp_path)
     assert tracked.info.status == "FINISHED"
@@ -80,18 +81,19 @@ def test_run_trains_evaluates_and_tracks(tmp_path):
     assert tracked.data.params["env.transform.rz_deg"] == "10.0"
     assert {"git.commit", "git.dirty", "overrides"} <= tracked.data.tags.keys()
     assert tracked.info.run_name == "sac-cluster-y-phantom-seed3"
-    assert tracked.data.tags["volumes.held_out"] == "phantom-1000000"
-    for volumes in ("training_volumes", "held_out_volumes"):
+    assert tracked.data.tags["volumes.validation"] == "phantom-1000000"
+    assert tracked.data.tags["volumes.test"] == "phantom-2000000"
+    for volumes in ("training_volumes", "test_volumes"):
         for figure in ("success_rate", "mean_steps", "mean_distance_mm", "mean_distance_deg"):
             assert f"{volumes}/{figure}" in tracked.data.metrics
-    steps = [point.step for point in client.get_metric_history(tracked.info.run_id, "test/mean_return")]
+    steps = [point.step for point in client.get_metric_history(tracked.info.run_id, "validation/mean_return")]
     assert steps == sorted(set(steps))
     assert steps[-1] >= 400
     artifacts = {file.path for file in client.list_artifacts(tracked.info.run_id)}
     assert artifacts == {"best.pt", "last.pt", "config.yaml", "episode.gif", "evaluation.json", "learning_curve.png"}
     (folder,) = (tmp_path / "outputs").glob("*/*")
     evaluation = json.loads((folder / "evaluation.json").read_text())
-    assert len(evaluation["held-out volumes"]["episodes"]) == 3
+    assert len(evaluation["test volumes"]["episodes"]) == 3
 
 
 def test_run_of_the_same_seed_gives_the_same_figures(tmp_path):
@@ -138,7 +140,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["agent.lrr=1"], "there is no key 'lrr' in agent, but only network, lr, "),
         (["agnet=sac"], "there is no key 'agnet' at the top, but only data, obs, agent, "),
         (["+agent.foo=1"], "there is no key 'foo' in agent, but only "),
-        (["data=nifti", "data.pth=x"], "there is no key 'pth' in data, but only path, held_out or split_seed"),
+        (["data=nifti", "data.pth=x"], "there is no key 'pth' in data, but only path, validation, test or split_seed"),
         (["data=nifti"], "data.path is not set"),
         (["data=nifti", "data.path=/nowhere"], "/nowhere: the folder of volumes does not exist"),
         (["seed=["], "'seed=[' cannot be read: what follows the options must be key=value"),
@@ -173,7 +175,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_run_answers_a_mistake_in_one_line_and_leaves_nothing(answer, tmp_path, arguments, line):
-    few_phantoms = [] if "data=nifti" in arguments else ["data.n_training=1", "data.n_held_out=1"]
+    few_phantoms = [] if "data=nifti" in arguments else ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
     code, printed = answer(*arguments, *few_phantoms)
     assert code == 2
     assert printed.startswith(f"error: {line}")

@@ -1,6 +1,7 @@
 """What is seen in a slice: tissues, their clusters, and the rewards computed from them."""
 
 from armscan.anatomy.landmarks import Clusters, Landmarks, TissueClusters
+from armscan.anatomy.optimum import FoundPlane, Judge, find_optimal_plane
 from armscan.anatomy.rewards import (
     OTHER_PUBLISHED_TARGETS,
     PUBLISHED_TARGETS,
@@ -36,6 +37,8 @@ __all__ = [
     "USUAL_PIXEL_MM",
     "AgreementReward",
     "Clusters",
+    "FoundPlane",
+    "Judge",
     "LandmarkReward",
     "Landmarks",
     "MetricTissue",
@@ -47,5 +50,6 @@ __all__ = [
     "Tissues",
     "checked_targets",
     "checked_tissues",
+    "find_optimal_plane",
     "landmark_reward",
 ]

@@ -23,7 +23,9 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
     figure = Figure(figsize=(8, 5.4), layout="constrained")
     FigureCanvasAgg(figure)
     lengths, successes = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
-    lengths.plot(steps, [report.evaluation.mean_steps for report in reports], marker="o", label="test, deterministic")
+    lengths.plot(
+        steps, [report.evaluation.mean_steps for report in reports], marker="o", label="validation, deterministic"
+    )
     trained = [
         (report.n_env_steps, report.metrics["train/length"]) for report in reports if "train/length" in report.metrics
     ]
@@ -35,7 +37,7 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
     lengths.set_ylim(bottom=0)
     lengths.legend()
     successes.plot(steps, [100 * report.evaluation.success_rate for report in reports], marker="o", color="tab:green")
-    successes.set_ylabel("success in tests (%)")
+    successes.set_ylabel("success in validation (%)")
     successes.set_ylim(-3, 103)
     successes.set_xlabel("environment steps")
     for axes in (lengths, successes):

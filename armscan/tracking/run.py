@@ -60,7 +60,7 @@ class TrackedRun:
 
     def on_epoch(self, report: EpochReport) -> None:
         """Logs an epoch's figures by environment step."""
-        figures = {f"test/{name}": value for name, value in report.evaluation.metrics().items()}
+        figures = {f"validation/{name}": value for name, value in report.evaluation.metrics().items()}
         figures |= report.metrics | {"wall_s": report.wall_s}
         self.log_figures(figures, n_env_steps=report.n_env_steps)
 

@@ -4,15 +4,16 @@ from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
 from armscan.training.data import Split, nifti_data, phantom_data
-from armscan.training.evaluation import HELD_OUT, TRAINED_ON, Episode, Evaluation, evaluate
+from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Evaluation, evaluate
 from armscan.training.film import film_episode
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
 
 __all__ = [
     "BEST_CHECKPOINT",
-    "HELD_OUT",
     "LAST_CHECKPOINT",
-    "TRAINED_ON",
+    "TEST",
+    "TRAINING",
+    "VALIDATION",
     "Budget",
     "Callback",
     "Episode",

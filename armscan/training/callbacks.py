@@ -17,7 +17,7 @@ class EpochReport:
         n_env_steps: environment steps taken so far.
         wall_s: seconds since training began.
         metrics: means of the epoch's training, by name.
-        evaluation: on the test volumes.
+        evaluation: on the validation volumes.
         is_best: whether no epoch before was as good.
     """
 

@@ -1,18 +1,22 @@
-"""Which volumes an agent is trained on, and which are held out to judge it."""
+"""Which volumes an agent is trained on, which choose its checkpoint, and which judge it at the end."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
-from armscan.checks import check_int, check_path, check_seed
+from armscan.checks import check_float, check_int, check_path, check_seed
 from armscan.errors import InvalidValueError, listed
-from armscan.volumes import LabelVolume, load_phantoms, read_dataset
+from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
+from armscan.volumes.dataset import SPLITS
 
-HELD_OUT_FIRST_SEED = 1_000_000
+# No phantom of one purpose has the seed of another.
+VALIDATION_FIRST_SEED, TEST_FIRST_SEED = 1_000_000, 2_000_000
+DEFAULT_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -21,69 +25,143 @@ class Split:
 
     Args:
         training: what the agent moves through while it learns.
-        held_out: what it never saw; tests at the end of an epoch and the final evaluation use them.
+        validation: what it is tested on after each epoch; these choose the checkpoint and stop the training.
+        test: what has no part in training at all; the final evaluation judges by them.
+
+    Raises:
+        InvalidValueError: if one of the three has no volume, or two have the same.
     """
 
     training: dict[str, LabelVolume]
-    held_out: dict[str, LabelVolume]
+    validation: dict[str, LabelVolume]
+    test: dict[str, LabelVolume]
+
+    def __post_init__(self) -> None:
+        seen: dict[str, str] = {}
+        for part in ("training", "validation", "test"):
+            volumes = getattr(self, part)
+            if not isinstance(volumes, dict) or not all(isinstance(each, LabelVolume) for each in volumes.values()):
+                raise InvalidValueError(f"the {part} volumes are {volumes!r}, but they must be volumes by name")
+            if not volumes:
+                raise InvalidValueError(
+                    f"of {len(self.training)} volumes for training, {len(self.validation)} for validation and "
+                    f"{len(self.test)} for the test, each must be at least 1"
+                )
+            for name in volumes:
+                if name in seen:
+                    raise InvalidValueError(f"{name} is in {seen[name]} and in {part}, but it must be in one split")
+                seen[name] = part
 
 
-def phantom_data(n_training: int = 16, n_held_out: int = 8, first_seed: int = 0, cache_dir: str | None = None) -> Split:
-    """Phantom wrists; the held-out ones come from seeds that no training phantom has.
+def phantom_data(
+    n_training: int = 16, n_validation: int = 4, n_test: int = 8, first_seed: int = 0, cache_dir: str | None = None
+) -> Split:
+    """Phantom wrists; those for validation and test come from seeds that no training phantom has.
 
     Args:
         n_training: phantoms to train on.
-        n_held_out: phantoms to judge on.
+        n_validation: phantoms that choose the checkpoint.
+        n_test: phantoms to judge on.
         first_seed: of the training phantoms, which have consecutive seeds.
         cache_dir: where phantoms are kept; the user's cache folder where it is None.
+
+    Raises:
+        InvalidValueError: if a number is out of range.
     """
     check_int("data.n_training", n_training, at_least=1)
-    check_int("data.n_held_out", n_held_out, at_least=1)
+    check_int("data.n_validation", n_validation, at_least=1, at_most=TEST_FIRST_SEED - VALIDATION_FIRST_SEED)
+    check_int("data.n_test", n_test, at_least=1)
     check_int("data.first_seed", first_seed, at_least=0)
-    if first_seed + n_training > HELD_OUT_FIRST_SEED:
+    if first_seed + n_training > VALIDATION_FIRST_SEED:
         raise InvalidValueError(
             f"data.first_seed + data.n_training is {first_seed + n_training}, but it must be at most "
-            f"{HELD_OUT_FIRST_SEED}, where the held-out phantoms begin"
+            f"{VALIDATION_FIRST_SEED}, where the validation phantoms begin"
         )
     folder = None if cache_dir is None else check_path("data.cache_dir", cache_dir)
     return Split(
         training=load_phantoms(range(first_seed, first_seed + n_training), folder),
-        held_out=load_phantoms(range(HELD_OUT_FIRST_SEED, HELD_OUT_FIRST_SEED + n_held_out), folder),
+        validation=load_phantoms(range(VALIDATION_FIRST_SEED, VALIDATION_FIRST_SEED + n_validation), folder),
+        test=load_phantoms(range(TEST_FIRST_SEED, TEST_FIRST_SEED + n_test), folder),
     )
 
 
-def nifti_data(path: str, held_out: float | Sequence[str] = 0.25, split_seed: int = 0) -> Split:
-    """The volumes of a folder, as `read_dataset` reads them.
+def nifti_data(
+    path: str,
+    validation: float | str | Sequence[str] | None = None,
+    test: float | str | Sequence[str] | None = None,
+    split_seed: int = 0,
+) -> Split:
+    """The volumes of a folder, as `open_dataset` reads them, split by subject.
 
     Args:
         path: the folder.
-        held_out: names of the volumes to hold out, or the share of them, in (0, 1), rounded up to whole volumes.
-        split_seed: draws which volumes make up the share.
+        validation: a share of the subjects, in (0, 1), rounded up; or the names of subjects or volumes. None: as the
+            manifest's splits say; where it has none, or `test` is given, a quarter.
+        test: likewise, with `validation` the other way round.
+        split_seed: draws which subjects make up the shares.
 
     Raises:
-        InvalidValueError: if nothing would be left to train on, or to judge on.
+        InvalidValueError: if one of the three splits would have no volume, or a subject would be in two of them.
     """
-    volumes = read_dataset(check_path("data.path", path))
-    names = list(volumes)
-    if isinstance(held_out, float | int) and not isinstance(held_out, bool):
-        if not 0 < held_out < 1:
-            raise InvalidValueError(f"data.held_out is {held_out!r}, but as a share it must be above 0 and below 1")
-        drawn = np.random.default_rng(check_seed("data.split_seed", split_seed)).permutation(len(names))
-        chosen = {names[index] for index in drawn[: math.ceil(held_out * len(names))]}
-    elif isinstance(held_out, str):
-        chosen = {held_out}
-    elif isinstance(held_out, Sequence) and all(isinstance(name, str) for name in held_out):
-        chosen = set(held_out)
+    dataset = open_dataset(check_path("data.path", path))
+    if validation is None and test is None and dataset.splits is not None:
+        parts = dataset.splits
     else:
-        raise InvalidValueError(f"data.held_out is {held_out!r}, but it must be a share, or a list of volumes' names")
-    if unknown := sorted(chosen - set(names)):
-        raise InvalidValueError(f"data.held_out names {listed(unknown)}, but {path} holds {listed(names)}")
-    if not chosen or len(chosen) == len(names):
+        parts = _drawn(dataset, {"test": test, "validation": validation}, path, split_seed)
+    return Split(*({n: v for n, v in dataset.volumes.items() if parts[n] == part} for part in SPLITS))
+
+
+def _drawn(
+    dataset: Dataset, wanted: dict[str, float | str | Sequence[str] | None], path: str, split_seed: int
+) -> dict[str, str]:
+    """Returns the split of each volume: first what is named, then shares of the subjects that are left."""
+    subjects = dataset.subjects
+    parts: dict[str, str] = {}
+    shares: dict[str, float] = {}
+    for part, given in wanted.items():
+        if isinstance(given, str | list | tuple):
+            for volume in _named(dataset, [given] if isinstance(given, str) else given, part, path):
+                if parts.setdefault(volume, part) != part:
+                    raise InvalidValueError(f"data.{part} and data.{parts[volume]} both name {volume}")
+        else:
+            shares[part] = DEFAULT_SHARE if given is None else _share(f"data.{part}", given)
+    taken = {subjects[volume] for volume in parts}
+    left = [subject for subject in dict.fromkeys(subjects.values()) if subject not in taken]
+    drawn = iter(np.random.default_rng(check_seed("data.split_seed", split_seed)).permutation(len(left)))
+    n_subjects = len(set(subjects.values()))
+    for part, share in shares.items():
+        chosen = {left[index] for index in islice(drawn, math.ceil(share * n_subjects))}
+        parts |= {volume: part for volume, subject in subjects.items() if subject in chosen}
+    parts = {volume: parts.get(volume, "train") for volume in subjects}
+    _check_subjects(parts, subjects)
+    return parts
+
+
+def _named(dataset: Dataset, names: Sequence[str], part: str, path: str) -> list[str]:
+    """Returns the volumes that are named, themselves or by their subject."""
+    known = [*dataset.volumes, *dataset.subjects.values()]
+    if not all(isinstance(name, str) for name in names):
+        raise InvalidValueError(f"data.{part} is {names!r}, but it must be a share, or names of subjects or volumes")
+    if unknown := [name for name in names if name not in known]:
+        raise InvalidValueError(f"data.{part} names {listed(unknown)}, but {path} holds {listed(dict.fromkeys(known))}")
+    return [volume for volume, subject in dataset.subjects.items() if volume in names or subject in names]
+
+
+def _share(name: str, given: object) -> float:
+    try:
+        return check_float(name, given, above=0.0, at_most=1.0)
+    except InvalidValueError as error:
         raise InvalidValueError(
-            f"data.held_out = {held_out!r} leaves {len(names) - len(chosen)} of the {len(names)} volumes of {path} to "
-            "train on and the others to judge on, but each needs at least one"
-        )
-    return Split(
-        training={name: volumes[name] for name in names if name not in chosen},
-        held_out={name: volumes[name] for name in names if name in chosen},
-    )
+            f"{name} is {given!r}, but it must be a share above 0 and below 1, or names of subjects or volumes"
+        ) from error
+
+
+def _check_subjects(parts: dict[str, str], subjects: dict[str, str]) -> None:
+    first: dict[str, str] = {}
+    for volume, subject in subjects.items():
+        part = parts[first.setdefault(subject, volume)]
+        if part != parts[volume]:
+            raise InvalidValueError(
+                f"{first[subject]} is for {part} and {volume} for {parts[volume]}, but both are of the subject "
+                f"{subject}, which must be in one split: name all of its volumes, or the subject"
+            )

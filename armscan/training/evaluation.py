@@ -15,7 +15,7 @@ from armscan.envs.task import Observed
 from armscan.volumes.plane import FloatArray
 
 # What evaluations are called by, after the volumes that they are on.
-TRAINED_ON, HELD_OUT = "training volumes", "held-out volumes"
+TRAINING, VALIDATION, TEST = "training volumes", "validation volumes", "test volumes"
 
 Env = gym.Env[Observed, FloatArray]
 

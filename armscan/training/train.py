@@ -1,4 +1,4 @@
-"""One training: epochs of learning, each followed by a test, until the budget is spent or the task is solved."""
+"""One training: epochs of learning, each followed by a validation, until the budget is spent or the task is solved."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SolvedCriterion:
     """When training may stop before its budget is spent.
 
     Args:
-        success_rate: at least this share of the test episodes succeeds,
+        success_rate: at least this share of the validation episodes succeeds,
         mean_steps: in at most this many steps on average,
         n_epochs: in this many epochs one after another.
     """
@@ -46,22 +46,22 @@ class SolvedCriterion:
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """How long to train, and how often to test.
+    """How long to train, and how often to validate.
 
     Args:
         env_steps: environment steps to take at most, all of them counted.
-        epoch_env_steps: environment steps between two tests.
-        test_episodes: episodes of a test.
+        epoch_env_steps: environment steps between two validations.
+        validation_episodes: episodes of a validation.
         solved: stop as soon as this holds; None to spend the whole budget.
     """
 
     env_steps: int
     epoch_env_steps: int
-    test_episodes: int
+    validation_episodes: int
     solved: SolvedCriterion | None = None
 
     def __post_init__(self) -> None:
-        for name in ("env_steps", "epoch_env_steps", "test_episodes"):
+        for name in ("env_steps", "epoch_env_steps", "validation_episodes"):
             check_int(f"training.{name}", getattr(self, name), at_least=1)
         if self.solved is not None and not isinstance(self.solved, SolvedCriterion):
             raise InvalidValueError(f"training.solved is {self.solved!r}, but it must be a SolvedCriterion or null")
@@ -74,7 +74,7 @@ class TrainingResult:
     Args:
         reports: one an epoch.
         is_solved: whether it stopped because the task was solved.
-        wall_s: seconds of learning and testing.
+        wall_s: seconds of learning and validating.
     """
 
     reports: tuple[EpochReport, ...]
@@ -90,7 +90,7 @@ class TrainingResult:
 def train(
     learner: Learner,
     budget: Budget,
-    test: Callable[[], Evaluation],
+    validate: Callable[[], Evaluation],
     folder: Path,
     callbacks: Sequence[Callback] = (),
 ) -> TrainingResult:
@@ -99,7 +99,7 @@ def train(
     Args:
         learner: to train.
         budget: how long.
-        test: evaluates the learner on the test volumes.
+        validate: evaluates the learner on the validation volumes.
         folder: where `best.pt` and `last.pt` are kept.
         callbacks: who is told.
 
@@ -115,7 +115,7 @@ def train(
         learner.warm_up()
         while learner.n_env_steps < budget.env_steps and not is_solved:
             metrics = learner.learn(min(budget.epoch_env_steps, budget.env_steps - learner.n_env_steps))
-            evaluation = test()
+            evaluation = validate()
             report = EpochReport(
                 epoch=len(reports) + 1,
                 n_env_steps=learner.n_env_steps,

@@ -1,23 +1,34 @@
 """What the agent moves through: labelmap volumes, their files, phantom wrists, and the slicing plane."""
 
-from armscan.volumes.dataset import MANIFEST_NAME, read_dataset
+from armscan.volumes.dataset import Dataset, open_dataset, read_dataset
+from armscan.volumes.labelmap import LabelMap
+from armscan.volumes.manifest import MANIFEST_NAMES, record_planes
+from armscan.volumes.markups import read_markup, write_markup
 from armscan.volumes.phantom import load_phantom, load_phantoms, make_phantom
 from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance, slid_into
 from armscan.volumes.reading import read_volume
+from armscan.volumes.report import VolumeReport
 from armscan.volumes.volume import LABEL_NAMES, LANDMARK_LABELS, LabelVolume
 
 __all__ = [
     "LABEL_NAMES",
     "LANDMARK_LABELS",
-    "MANIFEST_NAME",
+    "MANIFEST_NAMES",
+    "Dataset",
+    "LabelMap",
     "LabelVolume",
     "ManipulatorAction",
     "RigidTransform",
+    "VolumeReport",
     "load_phantom",
     "load_phantoms",
     "make_phantom",
+    "open_dataset",
     "plane_distance",
     "read_dataset",
+    "read_markup",
     "read_volume",
+    "record_planes",
     "slid_into",
+    "write_markup",
 ]

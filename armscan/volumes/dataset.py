@@ -1,98 +1,134 @@
-"""A folder of labelmaps with a manifest that gives the optimal plane of each."""
+"""A folder of labelmaps with a manifest that says what they are."""
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from armscan.checks import check_path
-from armscan.errors import InvalidValueError, ManifestError, VolumeError, listed
-from armscan.volumes.headers import CHECKS
-from armscan.volumes.plane import ManipulatorAction
-from armscan.volumes.reading import read_volume, volume_suffix
+from armscan.checks import check_choice, check_path
+from armscan.errors import InvalidValueError, ManifestError, listed
+from armscan.volumes.manifest import MANIFEST_NAMES, find_manifest, read_manifest, volume_entries, volume_files
+from armscan.volumes.reading import ReadingOptions, read_stored
+from armscan.volumes.report import VolumeReport
+from armscan.volumes.resampling import finest_spacing, resampled
 from armscan.volumes.volume import LabelVolume
 
-MANIFEST_NAME = "optimal_actions.json"
-REQUIRED_KEYS = ("rotation", "translation")
-OPTIONAL_KEYS = ("axes",)
+if TYPE_CHECKING:
+    from armscan.volumes.schema import Splits
+
+SPLITS = ("train", "validation", "test")
+# What an entry and the whole manifest can say.
+SHARED_KEYS = ("labels", "orientation", "axes", "overlap")
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """The volumes of a folder, and what its manifest says about them.
+
+    Args:
+        volumes: by file name, without the excluded ones.
+        reports: what was found in the file of each of them, and what became of it.
+        subjects: whose arm each of them is, by file name; a volume without a subject is its own.
+        splits: `train`, `validation` or `test` by file name, None where the manifest has no splits.
+        excluded: why a volume of the folder was left out, by file name.
+
+    Raises:
+        InvalidValueError: if one of them is something else, or `reports`, `subjects` or `splits` are of other volumes.
+    """
+
+    volumes: dict[str, LabelVolume]
+    reports: dict[str, VolumeReport]
+    subjects: dict[str, str]
+    splits: dict[str, str] | None = None
+    excluded: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, kind in (("volumes", LabelVolume), ("reports", VolumeReport), ("subjects", str), ("excluded", str)):
+            _check_mapping(name, getattr(self, name), kind, None if name == "excluded" else self.volumes)
+        if self.splits is not None:
+            _check_mapping("splits", self.splits, str, self.volumes)
+            for split in self.splits.values():
+                check_choice("a split", split, SPLITS)
+
+    def volumes_of(self, split: str) -> dict[str, LabelVolume]:
+        """Returns the volumes of `train`, `validation` or `test` by file name; none where there are no splits."""
+        check_choice("split", split, SPLITS)
+        return {name: volume for name, volume in self.volumes.items() if self.splits and self.splits[name] == split}
 
 
 def read_dataset(path: str | Path) -> dict[str, LabelVolume]:
-    """Reads every volume of a folder, each with its labelled optimal plane.
+    """Reads every volume of a folder: the `volumes` of `open_dataset`."""
+    return open_dataset(path).volumes
 
-    The manifest `optimal_actions.json` is an object with one entry for each volume file of the folder, named by the
-    file: `rotation`, (rz, rx) in degrees, `translation`, (tx, ty) in mm, and, where the file's axes are not across,
-    along and depth in this order, `axes` as in `read_volume`.
+
+def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
+    """Reads every volume of a folder as its manifest says.
 
     Args:
-        path: the folder.
+        path: the folder. Its manifest, `manifest.yaml`, `manifest.yml` or `manifest.json`, is described in
+            `docs/manifest.md`; `optimal_actions.json`, an object of nothing but the volumes' entries, is read too.
+        require_manifest: whether a folder without a manifest is refused, rather than read as if it had an empty one.
 
     Returns:
-        The volumes by file name, in the order of their names.
+        The volumes in the order of their names, and what is known of them.
 
     Raises:
         VolumeError: if the folder or a file cannot be used.
         ManifestError: if the manifest is missing or damaged, or does not name the folder's volumes.
     """
+    from armscan.volumes.schema import Manifest
+
     folder = check_path("the folder of volumes", path)
-    try:
-        if not folder.is_dir():
-            what = "is a file, not a folder" if folder.exists() else "does not exist"
-            raise VolumeError(f"{folder}: the folder of volumes {what}")
-        files = {file.name: file for file in sorted(folder.iterdir()) if file.is_file() and volume_suffix(file)}
-    except OSError as error:
-        raise VolumeError(f"{folder}: the folder of volumes cannot be read ({error.strerror})") from error
-    if not files:
-        raise VolumeError(f"{folder}: the folder holds no volume (files ending in {listed(CHECKS)})")
-    manifest = folder / MANIFEST_NAME
-    entries = _read_manifest(manifest)
-    if missing := [name for name in entries if name not in files]:
-        raise ManifestError(f"{manifest}: has an entry for {listed(missing)}, but the folder holds no such volume")
-    if unlisted := [name for name in files if name not in entries]:
-        raise ManifestError(f"{manifest}: has no entry for {listed(unlisted)}, which is in the folder")
-    planes = {name: _parse_plane(entries[name], f"{manifest}: entry {name!r}") for name in files}
-    return {
-        name: read_volume(file, optimal_action=planes[name], axes=entries[name].get("axes", "xyz"))
-        for name, file in files.items()
-    }
-
-
-def _read_manifest(manifest: Path) -> dict[str, Any]:
-    try:
-        entries = json.loads(manifest.read_text(encoding="utf-8"), object_pairs_hook=_without_duplicates)
-    except FileNotFoundError as error:
-        raise ManifestError(f"{manifest}: the manifest with the volumes' optimal planes does not exist") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise ManifestError(f"{manifest}: the manifest cannot be read as JSON ({error})") from error
-    if not isinstance(entries, dict):
-        raise ManifestError(
-            f"{manifest}: is a {type(entries).__name__}, but it must be an object with an entry a volume"
+    files = volume_files(folder)
+    found = find_manifest(folder)
+    if found is None and require_manifest:
+        raise ManifestError(f"{folder}: the folder has no manifest ({listed(MANIFEST_NAMES)})")
+    manifest = read_manifest(found) if found else Manifest()
+    entries = volume_entries(manifest, files, found)
+    used = {name: entry for name, entry in entries.items() if not entry.exclude}
+    if not used:
+        raise ManifestError(f"{found}: excludes every volume of the folder")
+    volumes, stored = {}, {}
+    for name, entry in used.items():
+        volumes[name], stored[name] = read_stored(
+            files[name],
+            ReadingOptions(crop_mm=entry.crop_mm, **{key: manifest.setting(entry, key) for key in SHARED_KEYS}),
+            optimal_action=entry.plane,
         )
-    return entries
+    if manifest.spacing == "finest":
+        spacing = finest_spacing(volumes.values())
+        volumes = {name: resampled(volume, spacing) for name, volume in volumes.items()}
+    subjects = {name: entry.subject or name for name, entry in entries.items()}
+    splits = None if manifest.splits is None else _split_of(manifest.splits, subjects, used, f"{found}: splits")
+    return Dataset(
+        volumes=volumes,
+        reports={name: VolumeReport.of(volume, stored[name]) for name, volume in volumes.items()},
+        subjects={name: subjects[name] for name in used},
+        splits=splits,
+        excluded={name: str(entry.exclude) for name, entry in entries.items() if entry.exclude},
+    )
 
 
-def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Refuses what JSON allows and everybody regrets: a key that is there twice, the first one forgotten."""
-    entries = dict(pairs)
-    if len(entries) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"the key {max(names, key=names.count)!r} is there twice")
-    return entries
+def _check_mapping(name: str, value: Any, kind: type, volumes: dict[str, LabelVolume] | None) -> None:
+    """Raises `InvalidValueError` unless `value` holds one of a kind for each of the volumes, where they are given."""
+    if not isinstance(value, dict) or not all(isinstance(each, kind) for each in value.values()):
+        raise InvalidValueError(f"{name} is {value!r}, but it must be a dict with a {kind.__name__} by file name")
+    if volumes is not None and value.keys() != volumes.keys():
+        raise InvalidValueError(f"{name} is of {list(value)}, but it must be of the volumes: {list(volumes)}")
 
 
-def _parse_plane(entry: Any, where: str) -> ManipulatorAction:
-    if not isinstance(entry, dict):
-        raise ManifestError(f"{where} is {entry!r}, but it must be an object with {listed(REQUIRED_KEYS)}")
-    if missing := [key for key in REQUIRED_KEYS if key not in entry]:
-        raise ManifestError(f"{where} has no {listed(missing)}")
-    if unknown := [key for key in entry if key not in REQUIRED_KEYS + OPTIONAL_KEYS]:
+def _split_of(splits: Splits, subjects: Mapping[str, str], used: Mapping[str, object], where: str) -> dict[str, str]:
+    """Returns the split of each volume; `subjects` also holds those whose volumes are all excluded."""
+    split_of = {subject: split for split in SPLITS for subject in getattr(splits, split)}
+    if unknown := [subject for subject in split_of if subject not in subjects.values()]:
         raise ManifestError(
-            f"{where} has the key {unknown[0]!r}, but only {listed(REQUIRED_KEYS + OPTIONAL_KEYS)} are known"
+            f"{where} names {listed(unknown)}, but the subjects are {listed(dict.fromkeys(subjects.values()))}"
         )
-    if not isinstance(entry.get("axes", ""), str):
-        raise ManifestError(f"{where}: axes is {entry['axes']!r}, but it must be a text such as 'xyz'")
-    try:
-        return ManipulatorAction(entry["rotation"], entry["translation"])
-    except InvalidValueError as error:
-        raise ManifestError(f"{where}: {error}") from error
+    if left_out := [name for name in used if subjects[name] not in split_of]:
+        raise ManifestError(
+            f"{where} does not name {subjects[left_out[0]]!r}, the subject of {left_out[0]}, but every subject must be "
+            "in one split (or its volumes excluded)"
+        )
+    return {name: split_of[subjects[name]] for name in used}

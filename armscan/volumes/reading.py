@@ -2,15 +2,56 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from armscan.checks import check_path
-from armscan.errors import VolumeError, listed
+from armscan.checks import check_choice, check_path
+from armscan.errors import InvalidValueError, VolumeError, listed
+from armscan.volumes.frames import AXES, Crop, check_axes, check_crop, check_orientation, orientation_of
 from armscan.volumes.headers import CHECKS
-from armscan.volumes.plane import ManipulatorAction
+from armscan.volumes.labelmap import Found, LabelMap, check_landmarks, map_values
+from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.volumes.report import StoredFile, missing_sources
+from armscan.volumes.segmentation import OVERLAPS, SEGMENTATION_SUFFIX, read_segmentation
 from armscan.volumes.volume import LabelVolume
+
+if TYPE_CHECKING:
+    import SimpleITK
+
+# A voxel's centre this close to the edge of a crop, in voxels, is inside.
+ON_EDGE = 1e-6
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """How a file is read; see `read_volume`."""
+
+    labels: LabelMap | None = None
+    orientation: str | None = None
+    axes: str = "xyz"
+    crop_mm: Crop | None = None
+    overlap: str = "refuse"
+
+    def __post_init__(self) -> None:
+        if self.labels is not None and not isinstance(self.labels, LabelMap):
+            raise InvalidValueError(f"labels is {self.labels!r}, but it must be a LabelMap or None")
+        check_orientation(self.orientation)
+        check_axes(self.axes)
+        object.__setattr__(self, "crop_mm", check_crop(self.crop_mm))
+        check_choice("overlap", self.overlap, OVERLAPS)
+
+
+def is_text(name: str) -> bool:
+    """Whether a name can be written; the names of files may hold any bytes."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def volume_suffix(path: Path) -> str | None:
@@ -23,58 +64,160 @@ def read_volume(
     *,
     name: str | None = None,
     optimal_action: ManipulatorAction | None = None,
+    labels: LabelMap | None = None,
+    orientation: str | None = None,
     axes: str = "xyz",
+    crop_mm: Crop | None = None,
+    overlap: str = "refuse",
 ) -> LabelVolume:
-    """Reads a labelmap from .nii, .nii.gz, .nrrd, .mha or .mhd.
+    """Reads a labelmap from .nii, .nii.gz, .nrrd, .mha or .mhd, or a segmentation of 3D Slicer from .seg.nrrd.
+
+    Where a voxel lies in the world stays as the file says, whichever way the array is turned and cropped.
 
     Args:
         path: the file.
         name: the volume's name; the file's where it is None.
         optimal_action: the labelled plane, in the frame of the volume as returned.
-        axes: which of the arm's axes the file's first, second and third axis are; 'xyz' where X runs across the palm,
+        labels: which values or segments are which tissue; None where the values are those of `LabelVolume`, and where
+            the segments are called bones, tendons, artery, nerve or background.
+        orientation: first, the file's axes are turned so that they run towards these, such as 'LPS'; None leaves them.
+        axes: then, which of the arm's axes the first, second and third axis are; 'xyz' where X runs across the palm,
             Y along the arm and Z through the depth.
+        crop_mm: then, what is kept: for some of the axes x, y and z a range in mm from the first voxel's centre. Voxels
+            whose centres lie in it stay, and the first of them is where the volume's frame begins.
+        overlap: of segments of different tissues: `refuse`, or whose tissue a shared voxel gets, that of the `first` or
+            the `last` segment, in the order of the file.
 
     Returns:
         The volume, its array in the order x, y, z.
 
     Raises:
         VolumeError: naming the file, if it is missing, damaged, truncated, no 3-D scalar image, no labelmap, or has a
-            spacing that is not finite and positive.
+            spacing that is not finite and positive, and if an argument is not as above.
     """
+    path = check_path("the volume's file", path)
+    try:
+        options = ReadingOptions(labels, orientation, axes, crop_mm, overlap)
+    except InvalidValueError as error:
+        raise VolumeError(f"{path}: {error}") from error
+    return read_stored(path, options, name=name, optimal_action=optimal_action)[0]
+
+
+def read_stored(
+    path: Path,
+    options: ReadingOptions,
+    *,
+    name: str | None = None,
+    optimal_action: ManipulatorAction | None = None,
+) -> tuple[LabelVolume, StoredFile]:
+    """Reads a volume as `read_volume` does, and tells what it was read from."""
+    image, found = _read_labels(path, options)
+    if options.labels is not None:
+        check_landmarks(found, options.labels, str(path))
+    labels, spacing, origin, direction = _in_order(image, options, path)
+    volume = LabelVolume(
+        labels,
+        (spacing[0], spacing[1], spacing[2]),
+        name=path.name if name is None else name,
+        optimal_action=optimal_action,
+        origin=(origin[0], origin[1], origin[2]),
+        direction=direction,
+    )
+    stored = StoredFile(
+        shape=image.GetSize(),
+        spacing=image.GetSpacing(),
+        orientation=orientation_of(np.array(image.GetDirection()).reshape(3, 3)),
+        found=found,
+        missing=missing_sources(options.labels, found),
+        crop_mm=options.crop_mm,
+    )
+    return volume, stored
+
+
+def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, tuple[Found, ...]]:
+    """Returns the file as a SimpleITK image of the labels 0 to 4, and what was found in it."""
     # Deferred: it takes long to load, and who steps through phantoms never needs it.
     import SimpleITK
 
-    path = check_path("the volume's file", path)
     suffix = volume_suffix(path)
     if suffix is None:
         raise VolumeError(f"{path}: a volume is read from {listed(CHECKS)}")
-    if not isinstance(axes, str) or sorted(axes) != ["x", "y", "z"]:
-        raise VolumeError(f"{path}: axes is {axes!r}, but it must be the letters x, y and z in some order")
     SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
     try:
         if not path.is_file():
             raise VolumeError(f"{path}: there is no such file")
+        if not is_text(str(path)):
+            # SimpleITK would end the process.
+            raise VolumeError(f"{str(path)!a}: the file's name must be a text in UTF-8")
         CHECKS[suffix](path)
-        image = SimpleITK.ReadImage(str(path))
+        if suffix == SEGMENTATION_SUFFIX:
+            labels, matrix, found = read_segmentation(path, options.labels, options.overlap)
+            return _image(labels, matrix, path), found
+        stored = SimpleITK.ReadImage(str(path))
     except OSError as error:
         raise VolumeError(f"{path}: the file cannot be read ({error.strerror or error})") from error
     except RuntimeError as error:
         reason = " ".join(str(error).split("ERROR:")[-1].split())[:200]
         raise VolumeError(f"{path}: the file is truncated or damaged, or no image ({reason})") from error
-    if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
+    if stored.GetDimension() == 4 and stored.GetSize()[3] == 1:
+        # A single point in time.
+        stored = stored[:, :, :, 0]
+    if 0 in stored.GetSize():
+        raise VolumeError(f"{path}: the image has the size {stored.GetSize()}, but a labelmap must not be empty")
+    if stored.GetDimension() != 3 or stored.GetNumberOfComponentsPerPixel() != 1:
         raise VolumeError(
-            f"{path}: the image is {image.GetDimension()}-D with {image.GetNumberOfComponentsPerPixel()} value(s) a "
+            f"{path}: the image is {stored.GetDimension()}-D with {stored.GetNumberOfComponentsPerPixel()} value(s) a "
             "voxel, but a labelmap is 3-D with one"
         )
-    # SimpleITK's arrays are indexed [z, y, x]; `order` then brings the file's axes into the arm's.
-    order = tuple(axes.index(axis) for axis in "xyz")
-    labels = SimpleITK.GetArrayViewFromImage(image).transpose(2, 1, 0).transpose(order)
-    spacing = image.GetSpacing()
-    return LabelVolume(
-        labels,
-        (spacing[order[0]], spacing[order[1]], spacing[order[2]]),
-        name=name or path.name,
-        optimal_action=optimal_action,
-        origin=image.GetOrigin(),
-        direction=np.array(image.GetDirection()).reshape(3, 3)[:, order],
-    )
+    # SimpleITK's arrays are indexed [z, y, x].
+    values, found = map_values(SimpleITK.GetArrayViewFromImage(stored), options.labels, str(path))
+    image = SimpleITK.GetImageFromArray(values)
+    image.CopyInformation(stored)
+    return image, found
+
+
+def _image(labels: NDArray[np.uint8], matrix: FloatArray, path: Path) -> SimpleITK.Image:
+    """Returns labels over (i, j, k) with their matrix to world coordinates as a SimpleITK image."""
+    import SimpleITK
+
+    spacing = np.linalg.norm(matrix[:3, :3], axis=0)
+    if not np.isfinite(matrix).all() or not (spacing > 0).all():
+        raise VolumeError(f"{path}: the place in the world is {matrix.tolist()}, but it must be finite, its axes not 0")
+    image = SimpleITK.GetImageFromArray(np.ascontiguousarray(labels.transpose(2, 1, 0)))
+    image.SetSpacing(spacing.tolist())
+    image.SetOrigin(matrix[:3, 3].tolist())
+    image.SetDirection((matrix[:3, :3] / spacing).ravel().tolist())
+    return image
+
+
+def _in_order(
+    image: SimpleITK.Image, options: ReadingOptions, path: Path
+) -> tuple[NDArray[np.uint8], FloatArray, FloatArray, FloatArray]:
+    """Orients an image, brings its axes into the arm's order and crops it: labels, spacing, origin and direction."""
+    import SimpleITK
+
+    if options.orientation is not None:
+        image = SimpleITK.DICOMOrient(image, options.orientation)
+    order = [options.axes.index(axis) for axis in AXES]
+    labels = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0).transpose(order)
+    spacing = np.array(image.GetSpacing())[order]
+    direction = np.array(image.GetDirection()).reshape(3, 3)[:, order]
+    ranges = [_kept(options.crop_mm, axis, labels.shape[i], spacing[i], path) for i, axis in enumerate(AXES)]
+    first = np.array([kept.start for kept in ranges])
+    origin = np.array(image.GetOrigin()) + direction @ (first * spacing)
+    return labels[tuple(ranges)], spacing, origin, direction
+
+
+def _kept(crop_mm: Crop | None, axis: str, n_voxels: int, step_mm: float, path: Path) -> slice:
+    """Returns which voxels along an axis stay."""
+    if crop_mm is None or axis not in crop_mm:
+        return slice(0, n_voxels)
+    low, high = crop_mm[axis]
+    centres = np.arange(n_voxels)
+    inside = np.flatnonzero((centres >= low / step_mm - ON_EDGE) & (centres <= high / step_mm + ON_EDGE))
+    if not inside.size:
+        raise VolumeError(
+            f"{path}: crop_mm of {axis} is [{low:g}, {high:g}], but the voxels' centres lie every {step_mm:g} mm from "
+            f"0 to {(n_voxels - 1) * step_mm:g} mm and none is inside"
+        )
+    return slice(int(inside[0]), int(inside[-1]) + 1)

@@ -16,11 +16,15 @@ from armscan.volumes.slicing import sample_plane
 LABEL_NAMES = {0: "background", 1: "bones", 2: "tendons", 3: "artery", 4: "nerve"}
 LANDMARK_LABELS = (1, 2, 3)
 LONGEST_SIDE_PX = 65536
+# Of scalar products of unit vectors; files keep them with six digits or more.
+RIGHT_ANGLE_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LabelVolume:
     """An integer labelmap of an arm with its spacing and, where one is known, the plane to find.
+
+    It may be one voxel thick along an axis; a plane beside it shows background, as beside any volume.
 
     Args:
         labels: integers over (x, y, z), shape (nx, ny, nz): X across the palm, Y along the arm, Z through the depth;
@@ -33,7 +37,7 @@ class LabelVolume:
 
     Raises:
         VolumeError: naming the volume, if the labels are not a 3-D array of the labels above, a landmark is missing,
-            or the geometry is not finite and positive.
+            the spacing is not finite and positive, or the way back is no position and axes at right angles.
     """
 
     labels: NDArray[np.uint8]
@@ -44,8 +48,12 @@ class LabelVolume:
     direction: FloatArray = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise VolumeError(f"the name of a volume is {self.name!r}, but it must be a text")
         object.__setattr__(self, "labels", _checked_labels(self.labels, self.name))
         object.__setattr__(self, "spacing", _checked_spacing(self.spacing, self.name))
+        object.__setattr__(self, "origin", _checked_origin(self.origin, self.name))
+        object.__setattr__(self, "direction", _checked_direction(self.direction, self.name))
         if self.optimal_action is not None and not isinstance(self.optimal_action, ManipulatorAction):
             raise VolumeError(
                 f"{self.name}: optimal_action is {self.optimal_action!r}, but it must be a ManipulatorAction or None"
@@ -123,7 +131,10 @@ class LabelVolume:
 
 
 def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]:
-    labels = np.asarray(labels)
+    try:
+        labels = np.asarray(labels)
+    except ValueError as error:
+        raise VolumeError(f"{name}: the labels are no array ({error})") from error
     if labels.ndim != 3 or 0 in labels.shape:
         raise VolumeError(f"{name}: the image has shape {labels.shape}, but a labelmap must be 3-D and not empty")
     if not np.issubdtype(labels.dtype, np.integer) and not np.issubdtype(labels.dtype, np.floating):
@@ -157,3 +168,24 @@ def _checked_spacing(spacing: tuple[float, float, float], name: str) -> tuple[fl
     if min(s_x, s_y, s_z) <= 0:
         raise VolumeError(f"{name}: spacing is {(s_x, s_y, s_z)}, but each must be above 0 mm")
     return s_x, s_y, s_z
+
+
+def _checked_origin(origin: tuple[float, float, float], name: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = check_numbers("origin", origin, 3, "(x, y, z) in mm")
+    except InvalidValueError as error:
+        raise VolumeError(f"{name}: {error}") from error
+    return x, y, z
+
+
+def _checked_direction(direction: FloatArray, name: str) -> FloatArray:
+    try:
+        checked: FloatArray = np.array(direction, dtype=np.float64)
+    except (TypeError, ValueError):
+        checked = np.empty(0)
+    # Written so that a NaN fails it, too.
+    if checked.shape != (3, 3) or not (np.abs(checked.T @ checked - np.eye(3)) < RIGHT_ANGLE_TOLERANCE).all():
+        received = np.array2string(checked, separator=", ").replace("\n", "") if checked.size else repr(direction)
+        raise VolumeError(f"{name}: direction is {received}, but its 3 columns must be unit vectors at right angles")
+    checked.flags.writeable = False
+    return checked

@@ -43,7 +43,7 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
         tracked.on_end()
         tracked.keep_results(
             TrainingResult(tuple(REPORTS), is_solved=False, wall_s=3.0),
-            {"held-out volumes": evaluation_of(2, 4)},
+            {"test volumes": evaluation_of(2, 4)},
             folder,
         )
     run = client.get_run(tracked.run_id)
@@ -51,9 +51,9 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
     assert run.data.params == {"agent.lr": "0.1", "agent.sizes": "[1, 2]", "seed": "3"}
     assert run.data.tags["overrides"] == "seed=3"
     assert run.data.tags["git.commit"] == source_tags()["git.commit"]
-    assert run.data.metrics["held_out_volumes/mean_steps"] == 3.0
+    assert run.data.metrics["test_volumes/mean_steps"] == 3.0
     assert run.data.metrics["best_env_step"] == 300
-    history = client.get_metric_history(tracked.run_id, "test/mean_steps")
+    history = client.get_metric_history(tracked.run_id, "validation/mean_steps")
     assert [(point.step, point.value) for point in history] == [(100, 9.0), (200, 4.0), (300, 3.0)]
     files = {file.path for file in client.list_artifacts(tracked.run_id)}
     assert files == {"best.pt", "config.yaml", "evaluation.json", "learning_curve.png"}

@@ -76,7 +76,7 @@ class Recorder:
 def run(tmp_path, evaluations, **budget):
     learner, recorder = ScriptedLearner(), Recorder()
     script = iter(evaluations)
-    arguments = {"env_steps": 100, "epoch_env_steps": 40, "test_episodes": 1} | budget
+    arguments = {"env_steps": 100, "epoch_env_steps": 40, "validation_episodes": 1} | budget
     result = train(learner, Budget(**arguments), lambda: next(script), tmp_path, [recorder])
     return learner, recorder, result
 
@@ -117,7 +117,7 @@ def test_train_tells_its_callbacks_when_it_fails(tmp_path):
     with pytest.raises(ZeroDivisionError):
         train(
             ScriptedLearner(),
-            Budget(env_steps=100, epoch_env_steps=40, test_episodes=1),
+            Budget(env_steps=100, epoch_env_steps=40, validation_episodes=1),
             lambda: 1 / 0,
             tmp_path,
             [recorder],
@@ -130,12 +130,12 @@ def test_train_tells_its_callbacks_when_it_fails(tmp_path):
     [
         ({"env_steps": 0}, r"training\.env_steps is 0"),
         ({"epoch_env_steps": "a"}, r"training\.epoch_env_steps is 'a'"),
-        ({"test_episodes": 0}, r"training\.test_episodes is 0"),
+        ({"validation_episodes": 0}, r"training\.validation_episodes is 0"),
     ],
 )
 def test_budget_refuses_impossible_figures(changes, message):
     with pytest.raises(InvalidValueError, match=message):
-        Budget(**({"env_steps": 100, "epoch_env_steps": 40, "test_episodes": 1} | changes))
+        Budget(**({"env_steps": 100, "epoch_env_steps": 40, "validation_episodes": 1} | changes))
 
 
 @pytest.mark.parametrize("changes", [{"success_rate": 2}, {"mean_steps": 0.5}, {"n_epochs": 0}])

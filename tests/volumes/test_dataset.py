@@ -3,7 +3,8 @@
 import pytest
 
 from armscan.errors import InvalidValueError, ManifestError, VolumeError
-from armscan.volumes import read_dataset
+from armscan.volumes import Dataset, read_dataset
+from armscan.volumes.report import StoredFile, VolumeReport
 
 PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
 
@@ -45,7 +46,7 @@ def test_read_dataset_refuses_an_empty_folder(tmp_path):
 
 def test_read_dataset_names_a_missing_manifest(write_labelmap, tmp_path):
     write_labelmap("a.nii.gz")
-    with pytest.raises(ManifestError, match=r"optimal_actions\.json: the manifest .* does not exist"):
+    with pytest.raises(ManifestError, match=r"has no manifest \(manifest\.yaml, .* or optimal_actions\.json\)"):
         read_dataset(tmp_path)
 
 
@@ -85,3 +86,19 @@ def test_read_dataset_says_what_is_wrong_in_the_manifest(write_labelmap, write_m
     write_labelmap("a.nii.gz")
     with pytest.raises(ManifestError, match=message):
         read_dataset(write_manifest(entries))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"volumes": []}, r"volumes is \[\], but it must be a dict with a LabelVolume by file name"),
+        ({"subjects": {"a": 3}}, r"subjects is {'a': 3}, but"),
+        ({"subjects": {}}, r"subjects is of \[\], but it must be of the volumes: \['a'\]"),
+        ({"splits": {"a": "trian"}}, "a split is 'trian', but it must be train, validation or test"),
+    ],
+)
+def test_dataset_refuses_what_does_not_fit(tiny_volume, changes, message):
+    stored = StoredFile(shape=(), spacing=(), orientation="LPS", found=(), missing=(), crop_mm=None)
+    reports = {"a": VolumeReport.of(tiny_volume, stored)}
+    with pytest.raises(InvalidValueError, match=message):
+        Dataset(**({"volumes": {"a": tiny_volume}, "reports": reports, "subjects": {"a": "S1"}} | changes))

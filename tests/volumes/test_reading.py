@@ -95,6 +95,42 @@ def test_read_volume_refuses_an_image_that_is_not_3d(write_labelmap, shape, dime
         read_volume(write_labelmap(labels=np.ones(shape, np.uint8)))
 
 
+@pytest.mark.parametrize("name", ["wrist.nii.gz", "wrist.mha"])
+def test_read_volume_takes_a_single_point_in_time(write_labelmap, tiny_volume, name):
+    volume = read_volume(write_labelmap(name, labels=tiny_volume.labels[..., np.newaxis]))
+    np.testing.assert_array_equal(volume.labels, tiny_volume.labels)
+    assert volume.spacing == pytest.approx((0.3, 0.4, 0.5))
+
+
+def test_read_volume_refuses_an_image_of_no_voxels(write_labelmap):
+    path = write_labelmap("wrist.mha")
+    path.write_bytes(path.read_bytes().replace(b"DimSize = 30 20 12", b"DimSize = 30 20 00"))
+    with pytest.raises(VolumeError, match=r"wrist\.mha: the image has the size \(30, 20, 0\), but"):
+        read_volume(path)
+
+
+def test_read_volume_refuses_a_header_without_its_data(write_labelmap):
+    path = write_labelmap("wrist.mhd")
+    path.with_suffix(".raw").unlink()
+    with pytest.raises(VolumeError, match=r"wrist\.mhd: "):
+        read_volume(path)
+
+
+def test_read_volume_refuses_a_file_that_gives_no_spacing(write_labelmap):
+    for name, key in (("wrist.mha", b"ElementSpacing"), ("wrist.nrrd", b"space directions")):
+        path = write_labelmap(name)
+        path.write_bytes(path.read_bytes().replace(key, b"#" + key))
+        with pytest.raises(VolumeError, match=f"{name}: the file gives no spacing"):
+            read_volume(path)
+
+
+def test_read_volume_refuses_a_name_that_is_no_text(write_labelmap):
+    path = write_labelmap("wrist.nrrd")
+    renamed = path.rename(path.with_name("wrist\udcff.nrrd"))
+    with pytest.raises(VolumeError, match=r"wrist\\udcff\.nrrd': the file's name must be a text in UTF-8"):
+        read_volume(renamed)
+
+
 def test_read_volume_refuses_grey_values(write_labelmap):
     grey = np.random.default_rng(0).normal(100, 30, (10, 10, 10)).astype(np.float32)
     with pytest.raises(VolumeError, match=r"wrist\.nii\.gz: .*grey values"):

@@ -1,0 +1,153 @@
+"""The command `python -m armscan.label`: optimal planes for volumes that have none, for a person to accept or reject.
+
+    python -m armscan.label data=FOLDER                             label the volumes of the folder that have no plane
+    python -m armscan.label data=FOLDER markup=FILE volume=NAME     take a plane that was moved or drawn in 3D Slicer
+
+data=FOLDER         the volumes, and the manifest that the planes are written into (made where there is none)
+clustering=metric   cluster what is seen by millimetres, for volumes of another spacing than about 0.27 x 0.55 mm
+volumes=[A,B]       only these, by their file names
+overwrite=true      volumes that have a plane as well
+pictures=FOLDER     where pictures go, FOLDER/labelling of the data where nothing is said
+markups=true        a markups file (.mrk.json) for 3D Slicer beside each picture
+markup=FILE         read the plane from this markups file ...
+volume=NAME         ... for this volume, whether it has a plane or not
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+from yaml import YAMLError
+
+from armscan.anatomy import checked_tissues
+from armscan.checks import check_bool
+from armscan.errors import ArmscanError, InvalidValueError, is_interruption, listed
+from armscan.labelling import DELTA, Labelled, Request, label
+from armscan.volumes.markups import MARKUP_SUFFIX
+
+# Within the folder of the data, where no other is asked for.
+PICTURES = "labelling"
+# Keys whose values are taken as they are written, whatever a path looks like; lists and truth values are parsed.
+TEXTS = ("data", "clustering", "pictures", "markup", "volume")
+
+
+def parse(words: Sequence[str]) -> Request:
+    """Returns what `key=value` words ask for.
+
+    Raises:
+        InvalidValueError: if a word is something else, a key unknown, or a value of another kind.
+    """
+    allowed = ["clustering" if field.name == "tissues" else field.name for field in fields(Request)]
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not equals:
+            raise InvalidValueError(f"{word!r} cannot be read: give key=value, with a key of {listed(allowed)}")
+        if key not in allowed:
+            raise InvalidValueError(f"there is no key {key!r}, but only {listed(allowed)}")
+        if not text:
+            raise InvalidValueError(f"{key} is empty, but it must have a value")
+    texts = {word.partition("=")[0]: word.partition("=")[2] for word in words}
+    values = _values([word for word in words if word.partition("=")[0] not in TEXTS])
+    if "data" not in texts:
+        raise InvalidValueError("data is not set, but it must be: give data=FOLDER (--help explains)")
+    if ("markup" in texts) != ("volume" in texts):
+        raise InvalidValueError("markup and volume must be given together: which file, and for which volume")
+    if idle := [key for key in ("volumes", "overwrite") if key in texts and "markup" in texts]:
+        raise InvalidValueError(f"{idle[0]} is for a search, but markup and volume say which plane and for what")
+    data = Path(texts["data"])
+    return Request(
+        data=data,
+        tissues=checked_tissues(texts.get("clustering", "pixels")),
+        volumes=_names(values["volumes"]) if "volumes" in values else None,
+        overwrite=check_bool("overwrite", values.get("overwrite", False)),
+        pictures=Path(texts["pictures"]) if "pictures" in texts else data / PICTURES,
+        markups=check_bool("markups", values.get("markups", False)),
+        markup=Path(texts["markup"]) if "markup" in texts else None,
+        volume=texts.get("volume"),
+    )
+
+
+def _values(words: list[str]) -> dict[str, Any]:
+    """What words whose values are no plain texts say."""
+    try:
+        values: Any = OmegaConf.to_container(OmegaConf.from_dotlist(words), resolve=True)
+    except (OmegaConfBaseException, YAMLError) as error:
+        raise InvalidValueError(f"{' '.join(words)!r} cannot be read ({' '.join(str(error).split())})") from error
+    return dict(values)
+
+
+def _names(value: Any) -> tuple[str, ...]:
+    names = value if isinstance(value, list) else [value]
+    if not names or not all(isinstance(name, str) for name in names):
+        raise InvalidValueError(f"volumes is {value!r}, but it must be the names of some volumes: [A,B]")
+    return tuple(names)
+
+
+def print_report(request: Request, labelled: Sequence[Labelled]) -> None:
+    """Prints a table of the planes, and what the person who looks at them can do next."""
+    table = Table(title="planes written into the manifest", title_justify="left")
+    table.add_column("volume", overflow="fold")
+    for heading in ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "as good over\n°, °, mm"):
+        table.add_column(heading, justify="right")
+    for plane in labelled:
+        rz, rx, tx, ty = plane.action.to_array()
+        table.add_row(
+            Text(plane.volume.name),
+            f"{plane.score:.3f}",
+            ", ".join(map(str, plane.counts)),
+            f"{rz:.1f}, {rx:.1f}",
+            f"{tx:.1f}, {ty:.1f}",
+            "-" if plane.spread is None else "{:.0f}, {:.0f}, {:.0f}".format(*plane.spread),
+        )
+    Console().print(table)
+    for plane in labelled:
+        if plane.score <= -DELTA:
+            print(f"note: {plane.volume.name} scores {plane.score:.3f}, and an environment wants more than {-DELTA:g}")
+    folder = request.pictures
+    print(f"look at   {folder}")
+    print("accept    nothing is left to do")
+    print(
+        "reject    take rotation, translation and score out of the volume's entry, or give the entry an exclude: REASON"
+    )
+    print("correct   move the plane in 3D Slicer, save it, and read it back:")
+    print(f"          python -m armscan.label data={request.data} volume=NAME markup=FILE{MARKUP_SUFFIX}")
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Runs what the command line asks for; returns the exit code."""
+    words = sys.argv[1:] if words is None else words
+    if {"-h", "--help"} & set(words):
+        print(__doc__)
+        return 0
+    try:
+        request = parse(words)
+        labelled, failures = label(request)
+    # Raised inside compiled code, an interrupt can come out as any other error.
+    except (KeyboardInterrupt, Exception) as error:
+        if is_interruption(error):
+            print("\ninterrupted; the planes found so far are in the manifest", file=sys.stderr)
+            return 130
+        if not isinstance(error, ArmscanError):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    if labelled:
+        print_report(request, labelled)
+    elif not failures:
+        print("every volume has a plane already; overwrite=true looks for new ones")
+    for failure in failures:
+        print(f"error: {failure}", file=sys.stderr)
+    return 2 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,159 @@
+"""Labelling a folder: volume by volume a plane that is found or was drawn, into the manifest and a picture of it."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from armscan.anatomy import Judge, LandmarkReward, Scanner, Tissues, find_optimal_plane
+from armscan.envs.actions import ActionBounds
+from armscan.envs.observations import View
+from armscan.envs.rendering import draw_frame
+from armscan.envs.scene import Scene, slice_geometry
+from armscan.errors import InvalidValueError, OptimalPlaneError, listed
+from armscan.files import write_whole
+from armscan.volumes import (
+    Dataset,
+    LabelVolume,
+    ManipulatorAction,
+    open_dataset,
+    read_markup,
+    record_planes,
+    write_markup,
+)
+from armscan.volumes.markups import MARKUP_SUFFIX
+
+# An environment wants planes that score above -delta, and this is its delta where nothing else is said.
+DELTA = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """What is to be labelled, and how.
+
+    Args:
+        data: the folder of volumes.
+        tissues: how what is seen is clustered.
+        volumes: only these, by file name; None for all.
+        overwrite: whether volumes that have a plane are labelled as well.
+        pictures: the folder for pictures, made where it is not there.
+        markups: whether a markups file for 3D Slicer is written beside each picture.
+        markup: a markups file with the plane of `volume`, to be taken instead of a search.
+        volume: the one volume to label, whether it has a plane or not.
+    """
+
+    data: Path
+    tissues: Tissues
+    volumes: tuple[str, ...] | None = None
+    overwrite: bool = False
+    pictures: Path
+    markups: bool = False
+    markup: Path | None = None
+    volume: str | None = None
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A plane that is now in the manifest.
+
+    Args:
+        volume: that it was found or drawn for, with the plane that it had before.
+        action: the plane.
+        score: its reward.
+        counts: clusters of bones, tendons and artery that it shows.
+        spread: as `FoundPlane`'s, None where a person drew the plane.
+    """
+
+    volume: LabelVolume
+    action: ManipulatorAction
+    score: float
+    counts: tuple[int, int, int]
+    spread: tuple[float, float, float] | None = None
+
+
+def label(request: Request) -> tuple[list[Labelled], list[OptimalPlaneError]]:
+    """Finds or reads a plane for each volume, draws it and writes it into the manifest; what is done stays done.
+
+    Returns:
+        The planes that were written into the manifest, and for which volumes none was found.
+
+    Raises:
+        ArmscanError: if the request or a file cannot be used.
+    """
+    dataset = open_dataset(request.data, require_manifest=False)
+    volumes = _wanted(request, dataset)
+    _make_folder(request.pictures)
+    labelled: list[Labelled] = []
+    failures: list[OptimalPlaneError] = []
+    for number, (name, volume) in enumerate(volumes.items(), 1):
+        print(f"{number}/{len(volumes)}  {name}", flush=True)
+        try:
+            plane = _found(request, volume) if request.markup is None else _drawn(request, volume, request.markup)
+        except OptimalPlaneError as error:
+            failures.append(error)
+            continue
+        # The manifest last: no plane stands there that nobody can look at.
+        _write_picture(request.pictures / f"{name}.png", plane, request.tissues)
+        if request.markups:
+            write_markup(request.pictures / f"{name}{MARKUP_SUFFIX}", volume, plane.action)
+        record_planes(request.data, {name: (plane.action, plane.score)})
+        labelled.append(plane)
+    return labelled, failures
+
+
+def _wanted(request: Request, dataset: Dataset) -> dict[str, LabelVolume]:
+    """The volumes to label, by file name."""
+    names = (request.volume,) if request.volume is not None else request.volumes
+    if names is None:
+        wanted = dataset.volumes
+    else:
+        if unknown := [name for name in names if name not in dataset.volumes]:
+            raise InvalidValueError(f"the volume is {unknown[0]!r}, but it must be {listed(dataset.volumes)}")
+        wanted = {name: dataset.volumes[name] for name in names}
+    if request.overwrite or request.markup is not None:
+        return wanted
+    return {name: volume for name, volume in wanted.items() if volume.optimal_action is None}
+
+
+def _found(request: Request, volume: LabelVolume) -> Labelled:
+    found = find_optimal_plane(volume, delta=DELTA, clustering=request.tissues)
+    return Labelled(volume, found.action, found.score, found.counts, found.spread)
+
+
+def _drawn(request: Request, volume: LabelVolume, markup: Path) -> Labelled:
+    action = read_markup(markup, volume)
+    score, counts = Judge(volume, LandmarkReward(), request.tissues).seen(action)
+    return Labelled(volume, action, score, counts)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidValueError(f"pictures is {folder}, but no folder can be made there ({error.strerror})") from error
+
+
+def _write_picture(path: Path, plane: Labelled, tissues: Tissues) -> None:
+    """Draws the slice, and the plane from two sides; beside it the plane that the volume had before, if any."""
+    volume = plane.volume
+    slice_xz, landmarks = Scanner([volume], tissues).look(0, plane.action.matrix, plane.action.offset_mm)
+    bounds = ActionBounds((180.0, 180.0), volume.size_mm[:2])
+    view = View(
+        slice_xz=slice_xz,
+        landmarks=landmarks,
+        tissues=tissues,
+        geometry=slice_geometry(volume),
+        smallest_shape=volume.slice_shape,
+        action=bounds.normalised(plane.action),
+        reward=plane.score,
+    )
+    scene = Scene(volume, None, volume.optimal_action or plane.action, bounds)
+    picture = io.BytesIO()
+    Image.fromarray(draw_frame(scene, plane.action, view, 0)).save(picture, "PNG")
+    try:
+        write_whole(path, lambda file: file.write(picture.getvalue()))
+    except OSError as error:
+        raise InvalidValueError(f"{path}: the picture cannot be written ({error.strerror or error})") from error

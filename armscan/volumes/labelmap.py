@@ -1,0 +1,224 @@
+"""Which values or segments of a file are which tissue."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from numbers import Integral
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.errors import InvalidValueError, VolumeError, listed
+from armscan.volumes.volume import LABEL_NAMES
+
+TISSUE_LABELS = {name: label for label, name in LABEL_NAMES.items()}
+BACKGROUND = TISSUE_LABELS["background"]
+# Values this close together are looked up in one table; others are searched for.
+LARGEST_TABLE = 65536
+LARGEST_INT64 = 2**63 - 1
+# The whole numbers up to here are exact as 64-bit floats.
+LARGEST_FLOAT_LABEL = 2**53
+MAX_SHOWN = 8
+
+# What a file calls a tissue: a voxel's value, or the name of a segment.
+Source = int | str
+
+
+@dataclass(frozen=True)
+class LabelMap:
+    """Which values (of plain labelmaps) or segments by name (of .seg.nrrd files) are which tissue.
+
+    Several sources may be one tissue: segmentations often number every bone by itself. The value 0 is background where
+    no tissue names it.
+
+    Args:
+        bones: whole numbers and names of segments, in a list or tuple.
+        tendons: likewise; the flexor tendons.
+        artery: likewise; the ulnar artery.
+        nerve: likewise; the median nerve.
+        background: likewise; what is in the file but of no interest.
+        others: `background` makes everything else background; None refuses a file that holds anything else.
+
+    Raises:
+        InvalidValueError: if a source is neither a whole number nor a text, stands twice, or a landmark (bones,
+            tendons, artery) has none.
+    """
+
+    bones: tuple[Source, ...]
+    tendons: tuple[Source, ...]
+    artery: tuple[Source, ...]
+    nerve: tuple[Source, ...] = ()
+    background: tuple[Source, ...] = ()
+    others: str | None = None
+
+    def __post_init__(self) -> None:
+        for tissue in TISSUE_LABELS:
+            object.__setattr__(self, tissue, _checked_sources(tissue, getattr(self, tissue)))
+        for tissue in ("bones", "tendons", "artery"):
+            if not getattr(self, tissue):
+                raise InvalidValueError(f"labels: {tissue} is empty, but every landmark must be there")
+        if self.others not in (None, "background"):
+            raise InvalidValueError(f"labels: others is {self.others!r}, but it must be 'background' or left out")
+        seen: dict[Source, str] = {}
+        for tissue in TISSUE_LABELS:
+            for source in getattr(self, tissue):
+                if source in seen:
+                    raise InvalidValueError(
+                        f"labels: {source!r} is {seen[source]} and {tissue}, but it must stand once"
+                    )
+                seen[source] = tissue
+
+    @classmethod
+    def from_mapping(cls, mapping: Any) -> Self:
+        """Builds a label map from what a manifest says, {'bones': [1, 2], ...}.
+
+        Raises:
+            InvalidValueError: if it is no mapping, or a key is unknown or missing, and as the class says.
+        """
+        allowed = [field.name for field in fields(cls)]
+        if not isinstance(mapping, Mapping):
+            raise InvalidValueError(f"labels is {mapping!r}, but it must be a mapping with {', '.join(allowed)}")
+        if unknown := [key for key in mapping if key not in allowed]:
+            raise InvalidValueError(f"labels has the key {unknown[0]!r}, but only {listed(allowed)} are known")
+        if missing := [tissue for tissue in ("bones", "tendons", "artery") if tissue not in mapping]:
+            raise InvalidValueError(f"labels has no {missing[0]}, but every landmark must be there")
+        return cls(**mapping)
+
+    @cached_property
+    def by_source(self) -> dict[Source, int]:
+        """The label, 0 to 4, of each source that is named."""
+        return {source: label for tissue, label in TISSUE_LABELS.items() for source in getattr(self, tissue)}
+
+    def label_of(self, source: Source) -> int | None:
+        """Returns the label, 0 to 4, of what a file holds; None where the map does not name it and refuses others."""
+        unnamed = BACKGROUND if self.others == "background" or source == 0 else None
+        return self.by_source.get(source, unnamed)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a file holds.
+
+    Args:
+        source: a value, or the name of a segment.
+        label: what it was mapped to, 0 to 4.
+        n_voxels: of the file; a segment may have none.
+    """
+
+    source: Source
+    label: int
+    n_voxels: int
+
+
+def map_values(
+    values: NDArray[np.generic], labels: LabelMap | None, where: str
+) -> tuple[NDArray[np.uint8], tuple[Found, ...]]:
+    """Maps a file's values to the labels 0 to 4.
+
+    Args:
+        values: of the voxels, any shape that is not empty, whole numbers of any type.
+        labels: which value is what; None where the file already holds the labels 0 to 4.
+        where: the file, for errors.
+
+    Returns:
+        The labels, of the same shape, and what was found, in the order of the values.
+
+    Raises:
+        VolumeError: if the values are not whole numbers, or the label map does not name one of them.
+    """
+    whole = _whole(values, where)
+    counts = count_values(whole)
+    table = {value: (labels or STANDARD_LABELS).label_of(value) for value in counts}
+    if unnamed := [value for value, label in table.items() if label is None]:
+        if labels is None:
+            raise VolumeError(
+                f"{where}: holds the values {shown(counts)}, but a labelmap holds "
+                f"{', '.join(f'{label} {tissue}' for label, tissue in LABEL_NAMES.items())} only; a label map says "
+                "what other values are"
+            )
+        raise VolumeError(
+            f"{where}: holds {shown(unnamed)}, which the label map does not name; every value must be named, or others "
+            "must be background"
+        )
+    named = {value: label for value, label in table.items() if label is not None}
+    return replaced(whole, named), tuple(Found(value, named[value], counts[value]) for value in counts)
+
+
+def count_values(values: NDArray[np.integer[Any]]) -> dict[int, int]:
+    """Returns how many voxels have each value that occurs, in ascending order."""
+    low, high = int(values.min()), int(values.max())
+    if high - low >= LARGEST_TABLE or high > LARGEST_INT64:
+        present, n_voxels = np.unique(values, return_counts=True)
+        return dict(zip(map(int, present), map(int, n_voxels), strict=True))
+    counts = np.zeros(high - low + 1, dtype=np.int64)
+    # Slab by slab: the copies stay small, and it is ten times as fast.
+    for slab in values:
+        counts += np.bincount((slab.astype(np.int64) - low).ravel(), minlength=counts.size)
+    return {low + int(position): int(counts[position]) for position in np.flatnonzero(counts)}
+
+
+def replaced(values: NDArray[np.integer[Any]], table: Mapping[int, int]) -> NDArray[np.uint8]:
+    """Returns the label that `table` gives for each value; every value that occurs must be in it."""
+    known = sorted(table)
+    low, high = known[0], known[-1]
+    labels = np.array([table[value] for value in known], dtype=np.uint8)
+    if high - low >= LARGEST_TABLE or high > LARGEST_INT64:
+        return np.asarray(labels[np.searchsorted(np.array(known, dtype=values.dtype), values)])
+    dense = np.zeros(high - low + 1, dtype=np.uint8)
+    dense[np.array(known) - low] = labels
+    mapped = np.empty(values.shape, dtype=np.uint8)
+    for position, slab in enumerate(values):
+        mapped[position] = dense[slab.astype(np.int64) - low]
+    return mapped
+
+
+def check_landmarks(found: tuple[Found, ...], labels: LabelMap, where: str) -> None:
+    """Raises `VolumeError` unless the file has voxels of every landmark."""
+    for tissue in ("bones", "tendons", "artery"):
+        if not any(each.n_voxels for each in found if each.label == TISSUE_LABELS[tissue]):
+            raise VolumeError(
+                f"{where}: no voxel is {tissue}, which is {shown(getattr(labels, tissue))} by the label map, but every "
+                f"landmark must be there; the file holds {shown([each.source for each in found])}"
+            )
+
+
+def shown(sources: Iterable[Source]) -> str:
+    """Returns values or names as they are written in a message, the first few of them."""
+    names = [repr(source) for source in sources]
+    return ", ".join(names[:MAX_SHOWN]) + (f", ... ({len(names)} in all)" if len(names) > MAX_SHOWN else "")
+
+
+def _whole(values: NDArray[np.generic], where: str) -> NDArray[np.integer[Any]]:
+    """Returns the values as whole numbers of whichever type."""
+    if np.issubdtype(values.dtype, np.integer):
+        return values  # type: ignore[return-value]
+    if not np.issubdtype(values.dtype, np.floating):
+        raise VolumeError(f"{where}: holds values of type {values.dtype}, but a labelmap holds whole numbers")
+    low, high = values.min(), values.max()
+    # Written so that a NaN fails it, too.
+    if not (
+        abs(low) <= LARGEST_FLOAT_LABEL and abs(high) <= LARGEST_FLOAT_LABEL and (values == np.floor(values)).all()
+    ):
+        raise VolumeError(
+            f"{where}: holds {values.dtype} values between {low:g} and {high:g} that are not whole numbers: grey "
+            "values? A labelmap holds whole numbers only"
+        )
+    return values.astype(np.int64)
+
+
+def _checked_sources(tissue: str, sources: Any) -> tuple[Source, ...]:
+    if not isinstance(sources, list | tuple) or not all(map(_is_source, sources)):
+        raise InvalidValueError(
+            f"labels: {tissue} is {sources!r}, but it must be a list of whole numbers and names of segments"
+        )
+    return tuple(source if isinstance(source, str) else int(source) for source in sources)
+
+
+def _is_source(value: Any) -> bool:
+    return isinstance(value, str) or (isinstance(value, Integral) and not isinstance(value, bool))
+
+
+STANDARD_LABELS = LabelMap(bones=(1,), tendons=(2,), artery=(3,), nerve=(4,))

@@ -1,0 +1,244 @@
+"""The file that says what a folder's volumes are: finding it, reading and checking it, writing planes into it."""
+
+from __future__ import annotations
+
+import json
+import reprlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from armscan.checks import check_float, check_path
+from armscan.errors import InvalidValueError, ManifestError, VolumeError, listed
+from armscan.files import write_whole
+from armscan.volumes.headers import CHECKS
+from armscan.volumes.plane import ManipulatorAction
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel, ValidationError
+
+    from armscan.volumes.schema import Manifest, VolumeEntry
+
+# The last one is of an older form: nothing but the entries of the volumes.
+MANIFEST_NAMES = ("manifest.yaml", "manifest.yml", "manifest.json", "optimal_actions.json")
+ENTRIES_ONLY = MANIFEST_NAMES[-1]
+NEW_MANIFEST = MANIFEST_NAMES[0]
+
+Document = dict[str, Any]
+
+
+def volume_files(folder: Path) -> dict[str, Path]:
+    """Returns the volumes of a folder by file name, in the order of their names.
+
+    Raises:
+        VolumeError: if the folder does not exist, cannot be read, or holds no volume.
+    """
+    try:
+        if not folder.is_dir():
+            what = "is a file, not a folder" if folder.exists() else "does not exist"
+            raise VolumeError(f"{folder}: the folder of volumes {what}")
+        files = {file.name: file for file in sorted(folder.iterdir()) if file.name.endswith(tuple(CHECKS))}
+        files = {name: file for name, file in files.items() if file.is_file()}
+    except (OSError, ValueError) as error:
+        if isinstance(error, VolumeError):
+            raise
+        raise VolumeError(f"{folder}: the folder of volumes cannot be read ({error})") from error
+    if not files:
+        raise VolumeError(f"{folder}: the folder holds no volume (files ending in {listed(CHECKS)})")
+    return files
+
+
+def find_manifest(folder: Path) -> Path | None:
+    """Returns the manifest of a folder, None where there is none.
+
+    Raises:
+        ManifestError: if there are several.
+    """
+    found = [folder / name for name in MANIFEST_NAMES if (folder / name).exists()]
+    if len(found) > 1:
+        raise ManifestError(f"{folder}: holds {' and '.join(path.name for path in found)}, but one manifest is allowed")
+    return found[0] if found else None
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Reads and checks a manifest.
+
+    Raises:
+        ManifestError: naming the file, the entry, the key, the value received and what is allowed.
+    """
+    return _checked(_load(path), path)
+
+
+def volume_entries(manifest: Manifest, files: Mapping[str, Path], path: Path | None) -> dict[str, VolumeEntry]:
+    """Returns the entry of each volume file; empty ones where the manifest has no `volumes`.
+
+    Raises:
+        ManifestError: if an entry has no file, or a file no entry.
+    """
+    from armscan.volumes.schema import VolumeEntry
+
+    if manifest.volumes is None:
+        return {name: VolumeEntry() for name in files}
+    if missing := [name for name in manifest.volumes if name not in files]:
+        raise ManifestError(f"{path}: has an entry for {listed(missing)}, but the folder holds no such volume")
+    if unlisted := [name for name in files if name not in manifest.volumes]:
+        raise ManifestError(f"{path}: has no entry for {listed(unlisted)}, which is in the folder")
+    return {name: manifest.volumes[name] for name in files}
+
+
+def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorAction, float]]) -> Path:
+    """Writes optimal planes into the manifest of a folder, and leaves everything else that it says as it is.
+
+    Where the folder has no manifest, `manifest.yaml` is made. The file is there whole or not at all. A manifest in YAML
+    is written anew: what it says stays, its comments do not.
+
+    Args:
+        folder: the folder of volumes.
+        planes: by file name, the plane in the frame of the volume as `open_dataset` returns it, and its reward.
+
+    Returns:
+        The manifest.
+
+    Raises:
+        InvalidValueError: if `planes` is something else, or a score is not in [-1, 0].
+        ManifestError: if the manifest is damaged, or the folder holds no such volume.
+        VolumeError: if the folder cannot be used.
+    """
+    folder = check_path("the folder of volumes", folder)
+    recorded = _checked_planes(planes)
+    files = volume_files(folder)
+    if unknown := [name for name in recorded if name not in files]:
+        raise ManifestError(f"{folder}: a plane is given for {listed(unknown)}, but the folder holds {listed(files)}")
+    found = find_manifest(folder)
+    path = found or folder / NEW_MANIFEST
+    document = _load(path) if found else {}
+    _checked(document, path)
+    if document.get("volumes") is None:
+        document["volumes"] = {name: {} for name in files}
+    for name, keys in recorded.items():
+        # A new object: in YAML, two entries can be one and the same.
+        document["volumes"][name] = document["volumes"].get(name, {}) | keys
+    contents = document["volumes"] if path.name == ENTRIES_ONLY else document
+    try:
+        text = _dumped(contents, path).encode()
+        write_whole(path, lambda file: file.write(text))
+    except (OSError, UnicodeError) as error:
+        raise ManifestError(f"{path}: the manifest cannot be written ({error})") from error
+    return path
+
+
+def _checked_planes(planes: Any) -> dict[str, Document]:
+    if not isinstance(planes, Mapping):
+        raise InvalidValueError(f"planes is {planes!r}, but it must be planes with their scores by file name")
+    recorded = {}
+    for name, pair in planes.items():
+        if not isinstance(pair, tuple) or len(pair) != 2 or not isinstance(pair[0], ManipulatorAction):
+            raise InvalidValueError(
+                f"the plane of {name!r} is {pair!r}, but it must be a ManipulatorAction and its score"
+            )
+        recorded[name] = {
+            "rotation": list(pair[0].rotation),
+            "translation": list(pair[0].translation),
+            "score": check_float(f"the score of {name!r}", pair[1], at_least=-1.0, at_most=0.0),
+        }
+    return recorded
+
+
+def _load(path: Path) -> Document:
+    """Reads the file as it is, whichever of the two languages it is in."""
+    language, load = ("JSON", _load_json) if path.suffix == ".json" else ("YAML", _load_yaml)
+    try:
+        document = load(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise ManifestError(f"{path}: the manifest cannot be read ({error.strerror or error})") from error
+    # PyYAML reports some damaged texts by whatever exception its constructors meet first: KeyError, AttributeError, ...
+    except Exception as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ManifestError(f"{path}: the manifest cannot be read as {language} ({reason})") from error
+    if document is None and language == "YAML":
+        # An empty file, or nothing but comments.
+        document = {}
+    if not isinstance(document, dict):
+        raise ManifestError(f"{path}: is a {type(document).__name__}, but it must be an object with keys and values")
+    return {"volumes": document} if path.name == ENTRIES_ONLY else document
+
+
+def _load_json(text: str) -> Any:
+    def without_duplicates(pairs: list[tuple[str, Any]]) -> Document:
+        """Refuses what JSON allows and everybody regrets: a key that is there twice, the first one forgotten."""
+        _check_no_duplicates([key for key, _ in pairs])
+        return dict(pairs)
+
+    return json.loads(text, object_pairs_hook=without_duplicates)
+
+
+def _load_yaml(text: str) -> Any:
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """Refuses a key that is there twice."""
+
+        def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+            node = super().compose_mapping_node(anchor)
+            keys = (key for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+            _check_no_duplicates([key.value for key in keys if key.tag != "tag:yaml.org,2002:merge"])
+            return node
+
+    return yaml.load(text, Loader)
+
+
+def _check_no_duplicates(keys: list[str]) -> None:
+    seen: set[str] = set()
+    for key in keys:
+        if key in seen:
+            raise ValueError(f"the key {key!r} is there twice")
+        seen.add(key)
+
+
+def _dumped(contents: Document, path: Path) -> str:
+    if path.suffix == ".json":
+        return json.dumps(contents, indent=1) + "\n"
+    import yaml
+
+    return yaml.safe_dump(contents, sort_keys=False, allow_unicode=True)
+
+
+def _checked(document: Document, path: Path) -> Manifest:
+    # Deferred: who steps through phantoms reads no manifest.
+    from pydantic import ValidationError
+
+    from armscan.volumes.schema import Manifest
+
+    try:
+        return Manifest.model_validate(document)
+    except ValidationError as error:
+        raise ManifestError(_in_one_line(error, path)) from error
+    # What is nested in itself, or too deeply to be looked at.
+    except RecursionError as error:
+        raise ManifestError(f"{path}: the manifest is nested too deeply") from error
+
+
+def _in_one_line(error: ValidationError, path: Path) -> str:
+    """Names the file, the entry, the key, the value received and what is allowed, of the first mistake."""
+    from armscan.volumes.schema import Manifest, Splits, VolumeEntry
+
+    mistake = error.errors(include_url=False)[0]
+    kind, received, place = mistake["type"], reprlib.repr(mistake["input"]), list(mistake["loc"])
+    model: type[BaseModel] = Manifest
+    part = ""
+    if place[:1] == ["volumes"] and len(place) > 1:
+        part, model, place = f"entry {place[1]!r}", VolumeEntry, place[2:]
+    elif place[:1] == ["splits"] and (len(place) > 1 or kind == "value_error"):
+        part, model, place = "splits", Splits, place[1:]
+    key = f"{path}: {part}: " if part else f"{path}: "
+    whole = f"{path}: {part} " if part else f"{path}: "
+    known = listed(model.model_fields)
+    if kind == "extra_forbidden":
+        return f"{whole}has the key {place[-1]!r}, but only {known} are known"
+    if kind == "value_error":
+        return f"{key if place else whole}{mistake['ctx']['error']}"
+    if not place:
+        return f"{whole}is {received}, but it must be an object with some of {known}"
+    field = model.model_fields.get(str(place[0]))
+    allowed = (field.description if field else None) or "a text"
+    return f"{key}{place[0]} is {received}, but it must be {allowed}"

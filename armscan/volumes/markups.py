@@ -1,0 +1,152 @@
+"""Planes to and from 3D Slicer: markups files (`.mrk.json`) in world coordinates, written and read back.
+
+World coordinates are millimetres in LPS (X to the left, Y to the back, Z to the head), the frame of a volume's `origin`
+and `direction`.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armscan.checks import check_path
+from armscan.errors import InvalidValueError, MarkupError
+from armscan.files import write_whole
+from armscan.volumes.plane import FloatArray, ManipulatorAction, slid_into
+from armscan.volumes.slicer_plane import SlicerPlane, read_slicer_plane
+from armscan.volumes.volume import LabelVolume
+
+MARKUP_SUFFIX = ".mrk.json"
+# As Slicer itself writes it.
+SCHEMA = (
+    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
+    "markups-schema-v1.0.3.json#"
+)
+# Nearer to the volume's floor than this, in depth per mm, a plane meets it too far away to begin there.
+LEAST_SLOPE = 1e-3
+# A rectangle is a slice of the volume where their sizes agree to this.
+SAME_SIZE_MM = 0.01
+ROUNDING_MM = 1e-3
+
+
+def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorAction, name: str = "optimal plane") -> None:
+    """Writes a plane as the rectangle that its slice fills in the volume as Slicer shows it.
+
+    The rectangle's x axis runs across and its y axis in depth; the normal makes them right-handed.
+
+    Args:
+        path: the file, ending in `.mrk.json`; its folder exists.
+        volume: the volume that the plane is for.
+        action: the plane, in the volume's frame.
+        name: what Slicer calls the plane.
+
+    Raises:
+        InvalidValueError: if an argument is of another type.
+        MarkupError: if the file cannot be written.
+    """
+    path = check_path("the markups file", path)
+    if not isinstance(volume, LabelVolume) or not isinstance(action, ManipulatorAction) or not isinstance(name, str):
+        raise InvalidValueError(
+            f"volume, action and name are {volume!r}, {action!r} and {name!r}, but they must be a LabelVolume, a "
+            "ManipulatorAction and a text"
+        )
+    if not path.name.endswith(MARKUP_SUFFIX):
+        raise MarkupError(f"{path}: a markups file must end in {MARKUP_SUFFIX}, or Slicer does not know it as one")
+    document = {"@schema": SCHEMA, "markups": [_markup(volume, action, name)]}
+    try:
+        write_whole(path, lambda file: file.write((json.dumps(document, indent=2) + "\n").encode()))
+    except OSError as error:
+        raise MarkupError(f"{path}: the markups file cannot be written ({error.strerror or error})") from error
+
+
+def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
+    """Reads the plane of a markups file, written by `write_markup` or drawn in Slicer, in LPS or RAS.
+
+    It is the same plane as a set of points. Where the file shows a rectangle of a slice's size, its middle stays the
+    middle of the slice; otherwise the slice is placed about the volume's middle. How the rectangle is turned within its
+    plane, and where it lies in depth, is left out: an action has no such components.
+
+    Args:
+        path: the file; it holds one plane and any other markups.
+        volume: the volume that the plane is for.
+
+    Returns:
+        The plane in the volume's frame, rz and rx within +-90 degrees, its origin (tx, ty) within the volume.
+
+    Raises:
+        InvalidValueError: if an argument is of another type.
+        MarkupError: naming the file and the key, if the file does not say which plane, or no action is this plane.
+    """
+    path = check_path("the markups file", path)
+    if not isinstance(volume, LabelVolume):
+        raise InvalidValueError(f"volume is {volume!r}, but it must be a LabelVolume")
+    plane = read_slicer_plane(path)
+    origin_mm, axes = np.asarray(volume.origin), volume.direction
+    point_mm, normal = np.linalg.solve(axes, plane.point_mm - origin_mm), axes.T @ plane.normal
+    # Of a plane's two descriptions the one that looks along the arm, so that the picture is not mirrored.
+    normal *= -1.0 if normal[1] < 0 else 1.0
+    rx = np.arctan2(normal[2], np.hypot(normal[0], normal[1]))
+    rz = np.arctan2(-normal[0], normal[1])
+    turned = ManipulatorAction((float(np.rad2deg(rz)), float(np.rad2deg(rx))), (0.0, 0.0))
+    across, in_depth = turned.matrix[:, 0], turned.matrix[:, 2]
+    where = f"{path}: the plane by center and normal, or controlPoints and baseToNode, lies"
+    if in_depth[2] < LEAST_SLOPE:
+        raise MarkupError(f"{where} along the palm of {volume.name}, but it must cross the arm")
+    slice_origin_mm = point_mm - turned.matrix @ _slice_centre(volume)
+    if not _is_slice(plane, volume):
+        slice_origin_mm += across @ (np.array(volume.centre_mm) - point_mm) * across
+    slice_origin_mm -= slice_origin_mm[2] / in_depth[2] * in_depth
+    # What the file's rounding has moved out of the volume is moved back.
+    within_mm = np.clip(slice_origin_mm[:2], 0.0, volume.size_mm[:2])
+    tx, ty = np.where(np.abs(within_mm - slice_origin_mm[:2]) < ROUNDING_MM, within_mm, slice_origin_mm[:2])
+    action = ManipulatorAction(turned.rotation, (float(tx), float(ty)))
+    slid = slid_into(action, volume.size_mm[:2])
+    if slid is None:
+        raise MarkupError(
+            f"{where} in {volume.name} at {action}, but its origin (tx, ty) must lie within (0, 0) and "
+            f"{volume.size_mm[:2]} mm"
+        )
+    return slid
+
+
+def _is_slice(plane: SlicerPlane, volume: LabelVolume) -> bool:
+    """Whether Slicer's rectangle is as large as the volume's slices are."""
+    size_mm = (volume.size_mm[0], volume.size_mm[2])
+    return plane.size_mm is not None and np.allclose(plane.size_mm, size_mm, rtol=0.0, atol=SAME_SIZE_MM)
+
+
+def _markup(volume: LabelVolume, action: ManipulatorAction, name: str) -> dict[str, Any]:
+    origin_mm, axes = np.asarray(volume.origin), volume.direction
+    across_mm, _, depth_mm = volume.size_mm
+    centre = origin_mm + axes @ (action.matrix @ _slice_centre(volume) + action.offset_mm)
+    x_axis, y_axis = axes @ action.matrix[:, 0], axes @ action.matrix[:, 2]
+    orientation = np.column_stack([x_axis, y_axis, np.cross(x_axis, y_axis)])
+    base_to_node = np.eye(4)
+    base_to_node[:3, :3], base_to_node[:3, 3] = orientation, centre
+    # No objectToBase: without one Slicer takes the identity (which it writes as diag(-1, -1, 1, 1) where it uses LPS).
+    return {
+        "type": "Plane",
+        "name": name,
+        "coordinateSystem": "LPS",
+        "coordinateUnits": "mm",
+        "locked": False,
+        "planeType": "pointNormal",
+        "sizeMode": "absolute",
+        "center": centre.tolist(),
+        "normal": orientation[:, 2].tolist(),
+        "baseToNode": base_to_node.ravel().tolist(),
+        "orientation": orientation.ravel().tolist(),
+        "size": [across_mm, depth_mm, 0.0],
+        "planeBounds": [-across_mm / 2, across_mm / 2, -depth_mm / 2, depth_mm / 2],
+        "controlPoints": [{"id": "1", "label": name, "position": centre.tolist(), "positionStatus": "defined"}],
+        # With handles, so that who disagrees can move it at once.
+        "display": {"visibility": True, "opacity": 1.0, "handlesInteractive": True},
+    }
+
+
+def _slice_centre(volume: LabelVolume) -> FloatArray:
+    """The middle of a slice in the plane's frame, which is also the middle of the rectangle that its pixels fill."""
+    return np.array([volume.centre_mm[0], 0.0, volume.centre_mm[2]])

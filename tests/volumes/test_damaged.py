@@ -1,0 +1,202 @@
+"""Whatever a file holds and whoever calls: a volume, or one of the project's own exceptions."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from armscan.errors import ArmscanError
+from armscan.volumes import LabelMap, LabelVolume, ManipulatorAction, open_dataset, read_volume, record_planes
+from armscan.volumes.dataset import Dataset
+from armscan.volumes.resampling import resampled
+
+from ..conftest import make_tiny_volume
+from .test_segmentation import NAMES, write_segmentation
+
+PLAIN = ["wrist.nii", "wrist.nii.gz", "wrist.nrrd", "wrist.mha", "wrist.mhd"]
+FILES = [*PLAIN, "wrist.seg.nrrd", "layers.seg.nrrd"]
+SETTINGS = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+# Anything that somebody might pass.
+numbers = st.integers(-5, 5) | st.floats() | st.booleans() | st.integers()
+anything = st.recursive(
+    st.none() | numbers | st.text(max_size=5) | st.binary(max_size=3) | st.just(np.zeros((2, 2, 2))),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.tuples(inner, inner) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+# What JSON and YAML can hold.
+values = st.recursive(
+    st.none() | numbers | st.text(max_size=5) | st.sampled_from(["xyz", "LPS", "a.nii.gz", "S1"]),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+def refuses(action):
+    """Runs an action; anything but success and the project's own exceptions, in one line, fails the test."""
+    try:
+        return action()
+    except ArmscanError as error:
+        message = str(error)
+    assert len(message.splitlines()) == 1
+    return None
+
+
+@pytest.fixture(scope="module")
+def whole_files(tmp_path_factory):
+    """One file of each kind, by name, with its bytes."""
+    import SimpleITK
+
+    folder, volume = tmp_path_factory.mktemp("whole"), make_tiny_volume()
+    image = SimpleITK.GetImageFromArray(np.ascontiguousarray(volume.labels.T).astype(np.int16))
+    for name in PLAIN:
+        SimpleITK.WriteImage(image, str(folder / name))
+    layers = np.stack([volume.labels == label for label in (1, 2, 3)]).astype(np.uint8)
+    write_segmentation(folder / FILES[5], volume.labels, [(name, 0, i) for i, name in enumerate(NAMES, 1)])
+    write_segmentation(folder / FILES[6], layers, [(name, i, 1) for i, name in enumerate(NAMES)])
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def laid_out(folder, contents, name, damaged):
+    """Writes a file, damaged, with the data file of a .mhd header beside it."""
+    (folder / "wrist.raw").write_bytes(contents["wrist.raw"])
+    (folder / name).write_bytes(damaged)
+    return folder / name
+
+
+@pytest.mark.parametrize("name", [*FILES, "wrist.raw"])
+@SETTINGS
+@given(kept=st.floats(0, 1, exclude_max=True))
+def test_truncated_files_are_refused(tmp_path, whole_files, name, kept):
+    contents = whole_files[name]
+    path = laid_out(tmp_path, whole_files, name, contents[: int(kept * len(contents))])
+    if name == "wrist.raw":
+        path = laid_out(tmp_path, whole_files | {name: path.read_bytes()}, "wrist.mhd", whole_files["wrist.mhd"])
+    volume = refuses(lambda: read_volume(path))
+    # All voxels may be there where only the end of a compressed stream, or of a header, is gone.
+    if volume is not None:
+        np.testing.assert_array_equal(volume.labels, make_tiny_volume().labels)
+
+
+@pytest.mark.parametrize("name", FILES)
+@SETTINGS
+@given(data=st.data())
+def test_files_with_flipped_bits_are_read_or_refused(tmp_path, whole_files, name, data):
+    damaged = bytearray(whole_files[name])
+    # Mostly in the header, where it does most.
+    for _ in range(data.draw(st.integers(1, 3))):
+        position = data.draw(st.integers(0, min(len(damaged), 700) - 1) | st.integers(0, len(damaged) - 1))
+        damaged[position] ^= 1 << data.draw(st.integers(0, 7))
+    refuses(lambda: read_volume(laid_out(tmp_path, whole_files, name, bytes(damaged))))
+
+
+@pytest.mark.parametrize("name", FILES)
+@SETTINGS
+@given(contents=st.binary(max_size=400))
+def test_files_of_anything_are_refused(tmp_path, whole_files, name, contents):
+    assert refuses(lambda: read_volume(laid_out(tmp_path, whole_files, name, contents))) is None
+    start = whole_files[name][:100] + contents
+    refuses(lambda: read_volume(laid_out(tmp_path, whole_files, name, start)))
+
+
+ENTRY_KEYS = ["rotation", "translation", "score", "subject", "exclude", "labels", "orientation", "axes", "crop_mm"]
+TOP_KEYS = ["labels", "orientation", "axes", "overlap", "spacing", "splits", "volumes"]
+manifests = st.dictionaries(
+    st.sampled_from(TOP_KEYS) | st.text(max_size=4), values, max_size=3
+) | st.fixed_dictionaries(
+    {
+        "volumes": st.fixed_dictionaries(
+            {"a.nii.gz": st.dictionaries(st.sampled_from(ENTRY_KEYS) | st.text(max_size=3), values, max_size=3)}
+        )
+    }
+)
+
+
+@pytest.mark.parametrize("name", ["manifest.yaml", "manifest.json", "optimal_actions.json"])
+@SETTINGS
+@given(manifest=manifests | values)
+def test_manifests_of_anything_are_read_or_refused(write_labelmap, tmp_path, name, manifest):
+    write_labelmap("a.nii.gz")
+    text = yaml.safe_dump(manifest) if name.endswith("yaml") else json.dumps(manifest)
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    refuses(lambda: open_dataset(tmp_path))
+    refuses(lambda: record_planes(tmp_path, {"a.nii.gz": (ManipulatorAction((0, 0), (0, 0)), -0.5)}))
+
+
+@pytest.mark.parametrize("name", ["manifest.yaml", "manifest.json", "optimal_actions.json"])
+@SETTINGS
+@given(
+    contents=st.binary(max_size=60)
+    | st.text(alphabet="{}[]:,-!&*<|>'\"#=% \n\tabc019.", max_size=60).map(str.encode)
+    | st.sampled_from(["!!int ''", "!!float x", "!!bool x", "!!timestamp x", "=", "&a [*a]", "2020-13-45"]).map(
+        lambda text: b"axes: " + text.encode()
+    )
+)
+def test_manifests_of_any_bytes_are_read_or_refused(write_labelmap, tmp_path, name, contents):
+    write_labelmap("a.nii.gz")
+    (tmp_path / name).write_bytes(contents)
+    refuses(lambda: open_dataset(tmp_path))
+
+
+@SETTINGS
+@given(
+    changes=st.dictionaries(
+        st.sampled_from(["name", "optimal_action", "labels", "orientation", "axes", "crop_mm", "overlap"]),
+        anything,
+        max_size=2,
+    )
+)
+def test_read_volume_answers_any_argument(write_labelmap, changes):
+    refuses(lambda: read_volume(write_labelmap("a.nrrd"), **changes))
+
+
+@SETTINGS
+@given(anything)
+def test_readers_answer_any_path(path):
+    for reader in (read_volume, open_dataset, lambda folder: record_planes(folder, {})):
+        assert refuses(lambda reader=reader: reader(path)) is None
+
+
+@SETTINGS
+@given(
+    st.dictionaries(
+        st.sampled_from(["labels", "spacing", "name", "optimal_action", "origin", "direction"]), anything, min_size=1
+    )
+)
+def test_label_volume_answers_any_argument(changes):
+    volume = make_tiny_volume()
+    arguments = {"labels": volume.labels, "spacing": (1.0, 1.0, 1.0), "name": "wrist"}
+    refuses(lambda: LabelVolume(**(arguments | changes)))
+
+
+@SETTINGS
+@given(st.dictionaries(st.sampled_from(["bones", "tendons", "artery", "nerve", "background", "others"]), anything))
+def test_label_map_answers_any_argument(arguments):
+    refuses(lambda: LabelMap(**({"bones": [1], "tendons": [2], "artery": [3]} | arguments)))
+    refuses(lambda: LabelMap.from_mapping(arguments))
+
+
+@SETTINGS
+@given(anything)
+def test_record_planes_and_label_map_answer_anything(write_labelmap, received):
+    folder = write_labelmap("a.nrrd").parent
+    refuses(lambda: record_planes(folder, received))
+    refuses(lambda: record_planes(folder, {"a.nrrd": received}))
+    refuses(lambda: LabelMap.from_mapping(received))
+
+
+@SETTINGS
+@given(st.dictionaries(st.sampled_from(["volumes", "reports", "subjects", "splits", "excluded"]), anything, min_size=1))
+def test_dataset_answers_any_argument(changes):
+    refuses(lambda: Dataset(**({"volumes": {}, "reports": {}, "subjects": {}} | changes)))
+
+
+@SETTINGS
+@given(anything)
+def test_resampled_answers_any_spacing(spacing):
+    refuses(lambda: resampled(make_tiny_volume(), spacing))

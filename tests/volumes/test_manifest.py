@@ -1,0 +1,230 @@
+"""Manifests: what may stand in them, what is refused, and how planes are written into them."""
+
+import json
+import math
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import yaml
+
+from armscan.errors import InvalidValueError, ManifestError
+from armscan.volumes import LabelMap, ManipulatorAction, open_dataset, record_planes
+
+PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
+NAMES = ["manifest.yaml", "manifest.yml", "manifest.json"]
+
+
+@pytest.fixture
+def folder(write_labelmap, tmp_path):
+    """Two volumes without a manifest."""
+    write_labelmap("a.nii.gz")
+    write_labelmap("b.nrrd")
+    return tmp_path
+
+
+def written(folder, contents, name="manifest.yaml"):
+    text = contents if isinstance(contents, str) else json.dumps(contents)
+    (folder / name).write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_manifest_is_read_in_either_language(folder, name):
+    written(folder, {"volumes": {"a.nii.gz": {**PLANE, "subject": "S1"}, "b.nrrd": {}}}, name)
+    dataset = open_dataset(folder)
+    assert dataset.volumes["a.nii.gz"].optimal_action.translation == (0.0, 7.0)
+    assert dataset.volumes["b.nrrd"].optimal_action is None
+    assert dataset.subjects == {"a.nii.gz": "S1", "b.nrrd": "b.nrrd"}
+    assert dataset.splits is None
+
+
+def test_manifest_without_entries_takes_every_volume(folder):
+    assert list(open_dataset(written(folder, "axes: xyz")).volumes) == ["a.nii.gz", "b.nrrd"]
+
+
+def test_manifest_may_be_missing_where_that_is_said(folder):
+    with pytest.raises(ManifestError, match="the folder has no manifest"):
+        open_dataset(folder)
+    assert list(open_dataset(folder, require_manifest=False).volumes) == ["a.nii.gz", "b.nrrd"]
+
+
+def test_manifest_stands_alone(folder):
+    written(folder, "", "manifest.yaml")
+    written(folder, "{}", "optimal_actions.json")
+    with pytest.raises(ManifestError, match=r"holds manifest\.yaml and optimal_actions\.json, but one"):
+        open_dataset(folder)
+
+
+def test_manifest_gives_an_entry_precedence(folder):
+    written(folder, {"axes": "zyx", "volumes": {"a.nii.gz": {"axes": "xyz"}, "b.nrrd": {}}})
+    volumes = open_dataset(folder).volumes
+    assert volumes["a.nii.gz"].shape == volumes["b.nrrd"].shape[::-1]
+
+
+@pytest.mark.parametrize(("value", "reason"), [(True, "True"), ("too short", "too short")])
+def test_manifest_excludes_a_volume(folder, value, reason):
+    (folder / "b.nrrd").write_text("not even an image")
+    written(folder, {"volumes": {"a.nii.gz": {"exclude": False}, "b.nrrd": {"exclude": value}}})
+    dataset = open_dataset(folder)
+    assert list(dataset.volumes) == ["a.nii.gz"]
+    assert dataset.excluded == {"b.nrrd": reason}
+
+
+def test_manifest_splits_by_subject(folder, write_labelmap):
+    write_labelmap("c.nii.gz")
+    volumes = {"a.nii.gz": {"subject": "S1"}, "b.nrrd": {"subject": "S2"}, "c.nii.gz": {"subject": "S1"}}
+    written(folder, {"splits": {"train": ["S1"], "test": ["S2"]}, "volumes": volumes})
+    dataset = open_dataset(folder)
+    assert dataset.splits == {"a.nii.gz": "train", "b.nrrd": "test", "c.nii.gz": "train"}
+    assert list(dataset.volumes_of("train")) == ["a.nii.gz", "c.nii.gz"]
+
+
+@pytest.mark.parametrize(
+    ("splits", "message"),
+    [
+        ({"train": ["S1"], "test": ["S2", "S1"]}, r"splits has the subject 'S1' in train and in test"),
+        ({"train": ["S1"], "test": ["S2", "S2"]}, r"splits has the subject 'S2' in test and in test"),
+        ({"train": ["S1"], "test": ["S3"]}, r"splits names S3, but the subjects are S1 or S2"),
+        ({"train": ["S1"]}, r"splits does not name 'S2', the subject of b\.nrrd"),
+        ({"train": []}, r"splits: a split is \[\], but it must be a list of subjects"),
+        ({"train": [1]}, r"splits: a split is \[1\], but it must be a list of subjects"),
+        ({"trian": ["S1"]}, r"splits has the key 'trian', but only train, validation or test"),
+        (["S1"], r"splits is \['S1'\], but it must be lists of subjects under train"),
+    ],
+)
+def test_manifest_refuses_impossible_splits(folder, splits, message):
+    written(folder, {"splits": splits, "volumes": {"a.nii.gz": {"subject": "S1"}, "b.nrrd": {"subject": "S2"}}})
+    with pytest.raises(ManifestError, match=rf"manifest\.yaml: {message}"):
+        open_dataset(folder)
+
+
+@pytest.mark.parametrize(
+    ("contents", "message"),
+    [
+        ("volumes: {a.nii.gz: {}, a.nii.gz: {}}", r"cannot be read as YAML \(the key 'a\.nii\.gz' is there twice"),
+        ("axes: xyz\naxes: zyx", "the key 'axes' is there twice"),
+        ("{unclosed", "cannot be read as YAML"),
+        ("!!python/object:os.system {}", "cannot be read as YAML"),
+        ("- a", "is a list, but"),
+        ("[" * 10_000, "cannot be read as YAML"),
+        ("axis: xyz", "has the key 'axis', but only labels, orientation, axes, overlap, spacing, splits or volumes"),
+        ("axes: [x, y, z]", r"axes is \['x', 'y', 'z'\], but it must be the letters"),
+        ("orientation: LLS", "orientation is 'LLS', but it must be None"),
+        ("spacing: coarsest", "spacing is 'coarsest', but it must be own or finest"),
+        ("overlap: none", "overlap is 'none', but it must be refuse, first or last"),
+        ("labels: {bones: [1], tendons: [1], artery: [2]}", "labels: 1 is bones and tendons, but"),
+        ("labels: {bones: [1], tendons: [2]}", "labels has no artery"),
+        ("labels: {bones: [1], tendons: [2], artery: []}", "labels: artery is empty"),
+        ("labels: {bones: 1, tendons: [2], artery: [3]}", "labels: bones is 1, but it must be a list"),
+        ("labels: {bones: [1.5], tendons: [2], artery: [3]}", r"labels: bones is \[1\.5\], but it must be a list"),
+        ("labels: {bones: [1], tendons: [2], artery: [3], veins: [4]}", "labels has the key 'veins', but only"),
+        ("labels: {bones: [1], tendons: [2], artery: [3], others: x}", "labels: others is 'x', but"),
+        ("volumes: [a.nii.gz]", r"volumes is \['a.nii.gz'\], but it must be entries by the names of the files"),
+        ("volumes: {a.nii.gz: {subject: 3}}", "entry 'a.nii.gz': subject is 3, but it must be a text"),
+        ("volumes: {a.nii.gz: {subject: ''}}", "entry 'a.nii.gz': subject is '', but it must be a text"),
+        ("volumes: {a.nii.gz: {exclude: 1}}", "entry 'a.nii.gz': exclude is 1, but it must be true, false or the"),
+        ("volumes: {a.nii.gz: {exclude: ''}}", "entry 'a.nii.gz': exclude is '', but it must be true, false or the"),
+        ("? ''\n: 1\n? ''\n: 2", "the key '' is there twice"),
+        ("volumes: {a.nii.gz: {score: 0.1}}", "entry 'a.nii.gz': score is 0.1, but it must be"),
+        ("volumes: {a.nii.gz: {score: .nan}}", "entry 'a.nii.gz': score is nan, but it must be"),
+        ("volumes: {a.nii.gz: {rotation: [.inf, 0]}}", r"entry 'a.nii.gz': rotation is \[inf, 0\], but it must be"),
+        ("volumes: {a.nii.gz: {translation: [0, 0]}}", "entry 'a.nii.gz' has no rotation, but"),
+        ("volumes: {a.nii.gz: {crop_mm: [1, 2]}}", r"entry 'a.nii.gz': crop_mm is \[1, 2\], but it must give"),
+        ("volumes: {a.nii.gz: {crop_mm: {y: [3, 2]}}}", r"entry 'a.nii.gz': crop_mm of y is \[3, 2\], but it must"),
+        ("volumes: {a.nii.gz: {crop_mm: {w: [3, 2]}}}", r"entry 'a.nii.gz': crop_mm is {'w': \[3, 2\]}, but it must"),
+        ("volumes: {a.nii.gz: }", "entry 'a.nii.gz' is None, but it must be an object"),
+        ("volumes: {a.nii.gz: {exclude: true}, b.nrrd: {exclude: true}}", "excludes every volume"),
+    ],
+)
+def test_manifest_says_what_is_wrong(folder, contents, message):
+    with pytest.raises(ManifestError, match=rf"manifest\.yaml: .*{message}") as caught:
+        open_dataset(written(folder, contents))
+    assert "\n" not in str(caught.value)
+
+
+ACTION = ManipulatorAction((3.5, -1.0), (0.0, 12.25))
+
+
+@pytest.mark.parametrize("name", [*NAMES, "optimal_actions.json"])
+def test_record_planes_keeps_what_else_the_manifest_says(folder, name):
+    entries = {"a.nii.gz": {"axes": "zyx", **PLANE}, "b.nrrd": PLANE}
+    whole = entries if name == "optimal_actions.json" else {"spacing": "own", "volumes": entries}
+    path = record_planes(written(folder, whole, name), {"b.nrrd": (ACTION, -0.01)})
+    assert path == folder / name
+    document = yaml.safe_load(path.read_text()) if "y" in path.suffix else json.loads(path.read_text())
+    recorded = {"rotation": [3.5, -1.0], "translation": [0.0, 12.25], "score": -0.01}
+    entries["b.nrrd"] = recorded
+    assert document == whole
+    volumes = open_dataset(folder).volumes
+    assert volumes["b.nrrd"].optimal_action == ACTION
+    assert volumes["a.nii.gz"].optimal_action.rotation == (1.5, -0.5)
+    assert {file.name for file in folder.iterdir()} == {"a.nii.gz", "b.nrrd", name}
+
+
+def test_manifest_may_repeat_itself_as_yaml_allows(folder):
+    written(folder, "\ufeffvolumes: {a.nii.gz: &one {subject: S1, axes: xyz}, b.nrrd: {<<: *one, axes: zyx}}")
+    dataset = open_dataset(folder)
+    assert dataset.subjects == {"a.nii.gz": "S1", "b.nrrd": "S1"}
+    assert dataset.volumes["b.nrrd"].shape == dataset.volumes["a.nii.gz"].shape[::-1]
+
+
+def test_record_planes_tells_entries_apart_that_yaml_has_as_one(folder):
+    written(folder, "volumes: {a.nii.gz: &same {subject: S1}, b.nrrd: *same}")
+    record_planes(folder, {"a.nii.gz": (ACTION, -0.01)})
+    dataset = open_dataset(folder)
+    assert dataset.volumes["a.nii.gz"].optimal_action == ACTION
+    assert dataset.volumes["b.nrrd"].optimal_action is None
+    assert dataset.subjects == {"a.nii.gz": "S1", "b.nrrd": "S1"}
+
+
+@pytest.mark.parametrize("contents", [None, "axes: xyz", ""])
+def test_record_planes_makes_what_is_missing(folder, contents):
+    if contents is not None:
+        written(folder, contents)
+    assert record_planes(folder, {"a.nii.gz": (ACTION, -0.0)}).name == "manifest.yaml"
+    volumes = open_dataset(folder).volumes
+    assert volumes["a.nii.gz"].optimal_action == ACTION
+    assert volumes["b.nrrd"].optimal_action is None
+
+
+@pytest.mark.parametrize(
+    ("planes", "error", "message"),
+    [
+        ({"c.nii": (ACTION, 0.0)}, ManifestError, r"a plane is given for c\.nii, but the folder holds a\.nii\.gz or b"),
+        ({"a.nii.gz": ACTION}, InvalidValueError, r"the plane of 'a\.nii\.gz' is ManipulatorAction.*, but"),
+        ({"a.nii.gz": (ACTION, math.nan)}, InvalidValueError, r"the score of 'a\.nii\.gz' is nan, but"),
+        ({"a.nii.gz": (ACTION, 0.5)}, InvalidValueError, r"the score of 'a\.nii\.gz' is 0\.5, but"),
+        ([ACTION], InvalidValueError, "planes is"),
+    ],
+)
+def test_record_planes_refuses_what_is_no_plane(folder, planes, error, message):
+    with pytest.raises(error, match=message):
+        record_planes(folder, planes)
+    assert not (folder / "manifest.yaml").exists()
+
+
+def test_record_planes_leaves_a_damaged_manifest_alone(folder):
+    written(folder, "axis: 3")
+    with pytest.raises(ManifestError, match="has the key 'axis'"):
+        record_planes(folder, {"a.nii.gz": (ACTION, 0.0)})
+    assert (folder / "manifest.yaml").read_text() == "axis: 3"
+
+
+def test_manifest_page_names_every_key_and_its_example_is_one(tmp_path):
+    from armscan.volumes.manifest import read_manifest
+    from armscan.volumes.schema import Manifest, Splits, VolumeEntry
+
+    page = (Path(__file__).parents[2] / "docs" / "manifest.md").read_text()
+    keys = [
+        *Manifest.model_fields,
+        *VolumeEntry.model_fields,
+        *Splits.model_fields,
+        *(f.name for f in fields(LabelMap)),
+    ]
+    assert [key for key in keys if f"`{key}`" not in page and f"`{key}:" not in page] == []
+    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    manifest = read_manifest(written(tmp_path, example) / "manifest.yaml")
+    used = {key for entry in manifest.volumes.values() for key in entry.model_fields_set}
+    assert used == set(VolumeEntry.model_fields)
