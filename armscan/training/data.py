@@ -37,16 +37,17 @@ class Split:
     test: dict[str, LabelVolume]
 
     def __post_init__(self) -> None:
-        seen: dict[str, str] = {}
-        for part in ("training", "validation", "test"):
-            volumes = getattr(self, part)
+        parts = {part: getattr(self, part) for part in ("training", "validation", "test")}
+        for part, volumes in parts.items():
             if not isinstance(volumes, dict) or not all(isinstance(each, LabelVolume) for each in volumes.values()):
                 raise InvalidValueError(f"the {part} volumes are {volumes!r}, but they must be volumes by name")
-            if not volumes:
-                raise InvalidValueError(
-                    f"of {len(self.training)} volumes for training, {len(self.validation)} for validation and "
-                    f"{len(self.test)} for the test, each must be at least 1"
-                )
+        if not all(parts.values()):
+            raise InvalidValueError(
+                f"of {len(self.training)} volumes for training, {len(self.validation)} for validation and "
+                f"{len(self.test)} for the test, each must be at least 1"
+            )
+        seen: dict[str, str] = {}
+        for part, volumes in parts.items():
             for name in volumes:
                 if name in seen:
                     raise InvalidValueError(f"{name} is in {seen[name]} and in {part}, but it must be in one split")

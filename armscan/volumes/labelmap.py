@@ -11,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from armscan.checks import check_choice
 from armscan.errors import InvalidValueError, VolumeError, listed
 from armscan.volumes.volume import LABEL_NAMES
 
@@ -60,8 +61,7 @@ class LabelMap:
         for tissue in ("bones", "tendons", "artery"):
             if not getattr(self, tissue):
                 raise InvalidValueError(f"labels: {tissue} is empty, but every landmark must be there")
-        if self.others not in (None, "background"):
-            raise InvalidValueError(f"labels: others is {self.others!r}, but it must be 'background' or left out")
+        check_choice("labels: others", self.others, (None, "background"))
         seen: dict[Source, str] = {}
         for tissue in TISSUE_LABELS:
             for source in getattr(self, tissue):
