@@ -115,7 +115,7 @@ def test_label_goes_on_after_a_volume_without_an_optimal_plane(bare, names, quic
     [
         ([], "data is not set"),
         (["data"], "'data' cannot be read: give key=value"),
-        (["data=x", "planes=3"], "there is no key 'planes', but only data, volumes, overwrite"),
+        (["data=x", "planes=3"], "there is no key 'planes', but only data, clustering, volumes, overwrite"),
         (["data="], "data is empty, but it must have a value"),
         (["data.x=y"], "there is no key 'data.x'"),
         (["data=x", "volumes=[a"], "'volumes=[a' cannot be read"),
