@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from armscan.training import Split
 
 MAX_TAG_CHARS = 5000
-SECTIONS = ("data", "obs", "agent", "network", "tracking", "env", "training", "evaluation")
-CHOICES_IN_TAGS = ("data", "obs", "agent", "network")
+SECTIONS = ("data", "obs", "reward", "agent", "network", "tracking", "env", "training", "evaluation")
+CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
 # What a job's process runs; it may be interrupted while it is still importing.
 JOB_PROGRAM = """
@@ -109,11 +109,12 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
 
     # Everything is built, and so checked, before anything is tracked.
     split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
-    maker = instantiate(config.env, _convert_="object")
+    maker = instantiate(config.env, _convert_="object").fitted_to(split.training)
     training_env, validation_env, test_env = map(maker.one, (split.training, split.validation, split.test))
     film_env = maker.one(split.test, render_mode="rgb_array")
     setup = LearningSetup(
         make_envs=partial(maker.many, volumes=split.training, autoreset_mode="Disabled"),
+        observation_space=training_env.observation_space,
         total_env_steps=budget.env_steps,
         seed=seed,
         device=checked_device(config.device),

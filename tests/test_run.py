@@ -155,7 +155,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["training.env_steps=abc"], "training.env_steps is 'abc', but it must be a whole number of at least 1"),
         (["training=null"], "training is None, but it must be a section"),
         (["training.solved=3"], "training.solved is 3, but it must be a SolvedCriterion or null"),
-        (["env.targets=3"], "targets is 3, but it must be 3 whole numbers"),
+        (["reward.targets=3"], "targets is 3, but it must be 3 whole numbers"),
         (["env.observation=3"], "observation is 3, but it must be action_reward or cluster"),
         (["projection=null"], "projection is ['None'], but it must be x, y, xy, zy or full"),
         (

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
+from gymnasium import spaces
 from tianshou.highlevel.module.actor import ActorFactory, ActorFactoryDefault, ContinuousActorType
 from tianshou.highlevel.module.critic import CriticFactory, CriticFactoryDefault
 from torch import nn
@@ -17,6 +18,9 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "el
 
 class Network(Protocol):
     """A kind of network that can be an actor's and a critic's."""
+
+    def check(self, observation_space: spaces.Space[Any]) -> None:
+        """Raises `InvalidValueError` if the network cannot take such observations."""
 
     def actor_factory(self) -> ActorFactory:
         """Returns the factory of a Gaussian actor whose spread depends on the observation."""
@@ -43,6 +47,15 @@ class MLP:
             check_int("each of hidden_sizes", size, at_least=1, at_most=65536) for size in hidden_sizes
         ]
         self.activation = ACTIVATIONS[check_choice("activation", activation, list(ACTIVATIONS))]
+
+    def check(self, observation_space: spaces.Space[Any]) -> None:
+        """See `Network.check`."""
+        if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
+            raise InvalidValueError(
+                "network is mlp, which takes one vector, but the observation has the parts "
+                f"{', '.join(observation_space) if isinstance(observation_space, spaces.Dict) else observation_space}; "
+                "take obs=cluster, or env.flat=true to put images and all into one vector"
+            )
 
     def actor_factory(self) -> ActorFactory:
         """See `Network.actor_factory`."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from armscan.envs.task import Observed
@@ -47,12 +48,14 @@ class LearningSetup:
 
     Args:
         make_envs: makes as many training environments as are asked for, without autoreset.
+        observation_space: of one of them.
         total_env_steps: environment steps that training may take.
         seed: of everything drawn.
         device: torch device.
     """
 
     make_envs: VectorEnvMaker
+    observation_space: spaces.Space[Any]
     total_env_steps: int
     seed: int
     device: str

@@ -81,8 +81,10 @@ class SAC:
         """Makes an agent that has learned nothing yet.
 
         Raises:
-            InvalidValueError: if the training takes no more steps than the random ones.
+            InvalidValueError: if the training takes no more steps than the random ones, or the network cannot take the
+                observations.
         """
+        self.network.check(setup.observation_space)
         n_random = self._rounded_up(self.random_env_steps)
         if n_random >= setup.total_env_steps:
             raise InvalidValueError(

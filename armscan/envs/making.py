@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gymnasium.vector import VectorEnv
 
+from armscan.anatomy import PUBLISHED_TARGETS
 from armscan.checks import check_bool, check_int
 from armscan.envs.env import ArmscanEnv
-from armscan.envs.task import Volumes
+from armscan.envs.task import Volumes, checked_reward
 from armscan.envs.vector_env import ArmscanVectorEnv
 from armscan.envs.vector_wrappers import VectorBestActionMemory, VectorFrameStack
 from armscan.envs.wrappers import BestActionMemory, Env, FrameStack
+from armscan.volumes import LabelVolume
 
 
 class EnvMaker:
@@ -24,6 +26,11 @@ class EnvMaker:
 
     def __init__(self, **rules: Any) -> None:
         self.rules = rules
+
+    def fitted_to(self, volumes: Mapping[str, LabelVolume]) -> EnvMaker:
+        """Returns the maker with its reward fitted to these volumes, whichever volumes the environments then have."""
+        reward = checked_reward(self.rules.get("reward"), self.rules.get("targets", PUBLISHED_TARGETS))
+        return EnvMaker(**self.rules | {"reward": reward.fitted_to(volumes.values()), "targets": PUBLISHED_TARGETS})
 
     def one(self, volumes: Volumes, *, render_mode: str | None = None) -> Env:
         """Makes one environment."""

@@ -64,7 +64,7 @@ class Task:
         self.max_steps = check_int("max_steps", max_steps, at_least=1)
         self.start = check_choice("start", start, STARTS)
         self.tissues = checked_tissues(clustering)
-        self.reward = _checked_reward(reward, targets).fitted_to(self.volumes.values())
+        self.reward = checked_reward(reward, targets).fitted_to(self.volumes.values())
         rotation = check_numbers("rotation_bounds_deg", rotation_bounds_deg, 2, "for rz and rx")
         if translation_bounds_mm is not None:
             translation = check_numbers("translation_bounds_mm", translation_bounds_mm, 2, "for tx and ty")
@@ -188,7 +188,12 @@ def named_volumes(volumes: Volumes) -> dict[str, LabelVolume]:
     return named
 
 
-def _checked_reward(reward: Reward | None, targets: Sequence[int]) -> Reward:
+def checked_reward(reward: Reward | None, targets: Sequence[int]) -> Reward:
+    """Returns a reward given as such, or by the targets of the published one.
+
+    Raises:
+        InvalidValueError: if it is no reward, or comes with targets of its own beside it.
+    """
     targets = checked_targets(targets)
     if reward is None:
         return LandmarkReward(targets)

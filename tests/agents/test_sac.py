@@ -1,5 +1,6 @@
 """SAC through Tianshou's builder."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -18,6 +19,7 @@ SMALL = {"num_envs": 2, "random_env_steps": 20, "batch_size": 16, "env_steps_per
 def setup(phantom):
     return LearningSetup(
         make_envs=partial(MAKER.many, volumes=[phantom], autoreset_mode="Disabled"),
+        observation_space=MAKER.one([phantom]).observation_space,
         total_env_steps=100,
         seed=3,
         device="cpu",
@@ -130,3 +132,9 @@ def test_checked_device_names_what_there_is():
     assert checked_device("cpu") == "cpu"
     with pytest.raises(InvalidValueError, match="device is 'tpu', but it must be cpu or cuda"):
         checked_device("tpu")
+
+
+def test_learner_refuses_observations_that_its_network_cannot_take(setup, phantom):
+    images = EnvMaker(observation="slice", projection="zy").one([phantom]).observation_space
+    with pytest.raises(InvalidValueError, match=r"mlp, which takes one vector, but .* action, reward, slice; take obs"):
+        SAC(network=MLP((8,)), **SMALL).learner(replace(setup, observation_space=images))

@@ -1,0 +1,59 @@
+"""Every choice of every configuration group can be composed, and makes an environment."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from hydra.utils import instantiate
+
+import armscan.conf
+
+FOLDER = Path(armscan.conf.__file__).parent
+
+
+def choices(group):
+    return sorted(path.stem for path in (FOLDER / group).glob("*.yaml"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def hydra_config():
+    with initialize_config_module("armscan.conf", version_base="1.3"):
+        yield
+
+
+def one_env(volume, *overrides):
+    config = compose("config", overrides=list(overrides))
+    return instantiate(config.env, _convert_="object").fitted_to({volume.name: volume}).one([volume])
+
+
+@pytest.mark.parametrize("reward", choices("reward"))
+@pytest.mark.parametrize("obs", choices("obs"))
+def test_conf_composes_every_observation_and_reward(phantom, obs, reward):
+    # A phantom's labelled plane shows four bones and three tendons.
+    env = one_env(phantom, f"obs={obs}", f"reward={reward}", "env.delta=0.5")
+    observed, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observed)
+
+
+@pytest.mark.parametrize("clustering", ["pixels", "metric"])
+@pytest.mark.parametrize("wrappers", [["stack=3"], ["memory=2"], ["stack=2", "memory=3", "stack_memory=true"]], ids=str)
+def test_conf_composes_wrappers_and_clusterings(phantom, wrappers, clustering):
+    env = one_env(phantom, *wrappers, f"env.clustering={clustering}", "projection=[rz,ty]")
+    assert env.observation_space.contains(env.reset(seed=0)[0])
+
+
+def test_conf_takes_any_combination_of_observations(phantom):
+    env = one_env(phantom, "env.observation=[slice,cluster,slice_channels]", "stack=2", "stack_exclude=[slice]")
+    assert list(env.observation_space) == ["action", "channels", "clusters", "reward", "slice"]
+    assert env.observation_space["slice"].shape == (360, 80)
+    assert env.observation_space["channels"].shape == (2, 3, 360, 80)
+
+
+def test_conf_fits_the_reward_to_the_volumes_that_are_trained_on(dataset):
+    first, second = list(dataset.values())[:2]
+    maker = instantiate(compose("config", overrides=["reward=agreement", "env.delta=0.5"]).env, _convert_="object")
+    rewards = [maker.fitted_to({volume.name: volume}).one([first]).unwrapped.task.reward for volume in (first, second)]
+    landmarks = np.array([[4, 3000, 180, 40], [3, 1000, 180, 45], [1, 100, 190, 50]], dtype=float)
+    scores = [reward.score(landmarks, first.pixel_mm) for reward in rewards]
+    assert scores[0] != scores[1]
