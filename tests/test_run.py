@@ -135,10 +135,10 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["obs=foo"], "obs is 'foo', but it must be action_reward or cluster"),
+        (["obs=foo"], "obs is 'foo', but it must be action_reward, cluster"),
         (["agent=foo"], "agent is 'foo', but it must be sac"),
         (["agent.lrr=1"], "there is no key 'lrr' in agent, but only network, lr, "),
-        (["agnet=sac"], "there is no key 'agnet' at the top, but only data, obs, agent, "),
+        (["agnet=sac"], "there is no key 'agnet' at the top, but only data, obs, reward, agent, "),
         (["+agent.foo=1"], "there is no key 'foo' in agent, but only "),
         (["data=nifti", "data.pth=x"], "there is no key 'pth' in data, but only path, validation, test or split_seed"),
         (["data=nifti"], "data.path is not set"),
@@ -156,7 +156,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["training=null"], "training is None, but it must be a section"),
         (["training.solved=3"], "training.solved is 3, but it must be a SolvedCriterion or null"),
         (["reward.targets=3"], "targets is 3, but it must be 3 whole numbers"),
-        (["env.observation=3"], "observation is 3, but it must be action_reward or cluster"),
+        (["env.observation=3"], "observation is 3, but it must be action_reward, cluster"),
         (["projection=null"], "projection is ['None'], but it must be x, y, xy, zy or full"),
         (
             ["seed=99999999999999999999"],
@@ -167,7 +167,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["data=nifti", "data.path=null"], "data.path is None, but it must be the path of a file or folder"),
         (["device=tpu"], "device is 'tpu', but it must be cpu or cuda"),
         (["tracking.uri=./mlruns"], "tracking.uri is './mlruns', but this store cannot be used"),
-        (["-m", "obs=cluster,foo"], "obs is 'foo', but it must be action_reward or cluster"),
+        (["-m", "obs=cluster,foo"], "obs is 'foo', but it must be action_reward, cluster"),
         (["obs=cluster", "-m", "agent=foo"], "agent is 'foo', but it must be sac"),
         (["-m", "seed=1,2", "tracking=null"], "Config group override must be a string or a list"),
         (["-m", "seed=1,2", "tracking.uri=./mlruns"], "tracking.uri is './mlruns', but this store cannot be used"),

@@ -182,34 +182,48 @@ def _reached(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _bounding_box(slice_xz: Pixels, label: int) -> tuple[int, int, int, int]:
+    """Returns first row, row after the last, first column and column after the last of a label; all 0 without it."""
+    n_rows, n_cols = slice_xz.shape
+    row_first, row_stop = n_rows, 0
+    in_column = np.zeros(n_cols, dtype=np.uint8)
+    for row in range(n_rows):
+        line = slice_xz[row]
+        n_in_row = 0
+        for col in range(n_cols):
+            is_label = np.uint8(line[col] == label)
+            in_column[col] |= is_label
+            n_in_row += int(is_label)
+        if n_in_row > 0:
+            row_first = min(row_first, row)
+            row_stop = row + 1
+    if row_stop == 0:
+        return 0, 0, 0, 0
+    columns = np.flatnonzero(in_column)
+    return row_first, row_stop, columns[0], columns[-1] + 1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _cluster(
     slice_xz: Pixels, label: int, half_widths: IntArray, min_samples: int
-) -> tuple[int, Pixels, RunArray, IntArray]:
+) -> tuple[int, int, Pixels, RunArray, IntArray]:
     """Clusters a label's pixels.
 
     Returns:
-        The first row that holds any; the mask and the cluster of each pixel (see `_reached`) from that row to the last
-        one that holds any; and for each cluster, noise last, the number of its pixels and the sums of their rows and
-        columns.
+        The first row and column of the box about them; the mask and the cluster of each pixel in the box (see
+        `_reached`); and for each cluster, noise last, the number of its pixels and the sums of their rows and columns.
     """
-    n_cols = slice_xz.shape[1]
-    row_first, row_stop = slice_xz.shape[0], 0
-    for row in range(slice_xz.shape[0]):
-        n_in_row = 0
-        for col in range(n_cols):
-            n_in_row += slice_xz[row, col] == label
-        if n_in_row:
-            row_first = min(row_first, row)
-            row_stop = row + 1
-    n_rows = max(0, row_stop - row_first)
+    row_first, row_stop, col_first, col_stop = _bounding_box(slice_xz, label)
+    n_rows, n_cols = row_stop - row_first, col_stop - col_first
     pad, reach = half_widths[0], half_widths.size - 1
     # One margin between two rows serves both.
     stride = n_cols + pad
     flat = np.zeros((n_rows + 2 * reach) * stride + 2 * pad, dtype=np.uint8)
     mask = flat[reach * stride + pad :][: n_rows * stride].reshape((n_rows, stride))
     for row in range(n_rows):
+        line = slice_xz[row_first + row, col_first:col_stop]
         for col in range(n_cols):
-            mask[row, col] = slice_xz[row_first + row, col] == label
+            mask[row, col] = line[col] == label
     core = _core_pixels(flat, stride, half_widths, min_samples).reshape((n_rows, stride))
     # Below an eps of one column not even the next pixel is a neighbour, and every run is a single pixel.
     starts, stops, first_run = _find_runs(core, n_cols, n_cols if pad >= 1 else 1)
@@ -222,8 +236,8 @@ def _cluster(
                 number = clusters[row, col]
                 sums[number, 0] += 1
                 sums[number, 1] += row_first + row
-                sums[number, 2] += col
-    return row_first, mask[:, :n_cols], clusters, sums
+                sums[number, 2] += col_first + col
+    return row_first, col_first, mask[:, :n_cols], clusters, sums
 
 
 @numba.njit(cache=True, nogil=True)
@@ -243,13 +257,13 @@ def cluster_label(
         the lowest-numbered cluster within eps; 0 for noise and background), the mean pixel coordinate of each
         cluster, shape (n_clusters, 2), and its number of pixels, shape (n_clusters,).
     """
-    row_first, mask, clusters, sums = _cluster(slice_xz, label, half_widths, min_samples)
+    row_first, col_first, mask, clusters, sums = _cluster(slice_xz, label, half_widths, min_samples)
     n_clusters = sums.shape[0] - 1
     image = np.zeros(slice_xz.shape, dtype=np.int32)
     for row in range(mask.shape[0]):
         for col in range(mask.shape[1]):
             if mask[row, col] and clusters[row, col] < n_clusters:
-                image[row_first + row, col] = clusters[row, col] + 1
+                image[row_first + row, col_first + col] = clusters[row, col] + 1
     return image, sums[:n_clusters, 1:] / sums[:n_clusters, :1], sums[:n_clusters, 0].copy()
 
 
@@ -267,7 +281,7 @@ def summarise_label(
         summary: filled with the number of clusters, the number of pixels in them, and the mean of their centres,
             (across, depth) in pixels, 0 where there is none; shape (4,).
     """
-    sums = _cluster(slice_xz, label, half_widths, min_samples)[3]
+    sums = _cluster(slice_xz, label, half_widths, min_samples)[4]
     n_clusters = sums.shape[0] - 1
     summary[:] = 0.0
     summary[0] = n_clusters

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from armscan.checks import check_choice
-from armscan.envs.episode import Episode, begin, checked_actions, look, wanted_volume
+from armscan.envs.episode import Episode, begin, checked_actions, info_of, look, wanted_volume
 from armscan.envs.scene import Scene
 from armscan.envs.task import Observed, Task, Volumes
 from armscan.errors import ResetNeededError
@@ -155,4 +155,4 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
 
     def _seen(self) -> tuple[Observed, dict[str, Any]]:
         look(self.task, [self.episode])
-        return self.task.observe(self.episode.view), self.episode.info()
+        return self.task.observe(self.episode.view), info_of(self.episode)

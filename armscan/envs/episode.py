@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,7 @@ class Episode:
         for component, value in zip(self.task.free, action.tolist(), strict=True):
             normalised[component] = value
         self.action = action
+        self._distance: tuple[float, float] | None = None
         self.plane: ManipulatorAction = self.scene.bounds.denormalised(normalised)
 
     def see(self, view: View) -> None:
@@ -57,25 +58,36 @@ class Episode:
         self.is_truncated = not self.is_solved and self.n_steps >= self.task.max_steps
 
     @property
+    def distance(self) -> tuple[float, float]:
+        """How far the plane is from the optimal one, in mm and degrees."""
+        if self._distance is None:
+            self._distance = self.scene.distance(self.plane)
+        return self._distance
+
+    @property
     def is_running(self) -> bool:
         """Whether a step can be taken; an episode that starts solved still takes its first."""
         return self.n_steps == 0 or not (self.is_solved or self.is_truncated)
 
-    def info(self) -> dict[str, Any]:
-        """Returns `info`, as `ArmscanEnv` describes it."""
-        distance_mm, distance_deg = self.scene.distance(self.plane)
-        return {
-            "volume": self.scene.volume.name,
-            "rotation_deg": np.array(self.plane.rotation),
-            "translation_mm": np.array(self.plane.translation),
-            "counts": self.view.landmarks[:, 0].astype(np.int64),
-            "is_success": self.is_solved,
-            "starts_solved": self.starts_solved,
-            "action": self.action.astype(np.float32),
-            "reward": self.view.reward,
-            "distance_mm": distance_mm,
-            "distance_deg": distance_deg,
-        }
+
+def info_of(episode: Episode) -> dict[str, Any]:
+    """Returns `info`, as `ArmscanEnv` describes it."""
+    return {name: gather([episode])[0] for name, gather in INFO.items()}
+
+
+INFO: dict[str, Callable[[Sequence[Episode]], Any]] = {
+    "volume": lambda episodes: [e.scene.volume.name for e in episodes],
+    "rotation_deg": lambda episodes: np.array([e.plane.rotation for e in episodes]),
+    "translation_mm": lambda episodes: np.array([e.plane.translation for e in episodes]),
+    "counts": lambda episodes: np.array([e.view.landmarks[:, 0] for e in episodes], dtype=np.int64),
+    "is_success": lambda episodes: [e.is_solved for e in episodes],
+    "starts_solved": lambda episodes: [e.starts_solved for e in episodes],
+    "action": lambda episodes: np.array([e.action for e in episodes], dtype=np.float32),
+    "reward": lambda episodes: [e.view.reward for e in episodes],
+    "distance_mm": lambda episodes: [e.distance[0] for e in episodes],
+    "distance_deg": lambda episodes: [e.distance[1] for e in episodes],
+}
+"""What `info` holds, for a batch of episodes."""
 
 
 def begin(task: Task, rngs: Sequence[np.random.Generator], volume_name: str | None = None) -> list[Episode]:

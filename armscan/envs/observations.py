@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium import spaces
@@ -80,6 +80,22 @@ class Observation(Protocol):
         """Returns the value of each part, within its space."""
 
 
+def observe_all(observation: Observation, views: Sequence[View]) -> Parts:
+    """Returns the parts of an observation for many views at once, shape (n_views, ...).
+
+    An observation of one's own is asked view by view, unless it has a method `observe_all(views)` too.
+    """
+    if isinstance(observation, _ObservingAll):
+        return observation.observe_all(views)
+    observed = [observation.observe(view) for view in views]
+    return {name: np.stack([parts[name] for parts in observed]) for name in observed[0]}
+
+
+@runtime_checkable
+class _ObservingAll(Protocol):
+    def observe_all(self, views: Sequence[View]) -> Parts: ...
+
+
 class ActionRewardObservation:
     """The last normalised action, shape (n_free,), and the reward of the current slice, shape (1,)."""
 
@@ -93,6 +109,13 @@ class ActionRewardObservation:
     def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
         return {"action": view.action.astype(np.float32), "reward": np.array([view.reward], dtype=np.float32)}
+
+    def observe_all(self, views: Sequence[View]) -> Parts:
+        """See `observe_all`."""
+        return {
+            "action": np.array([view.action for view in views], dtype=np.float32),
+            "reward": np.array([[view.reward] for view in views], dtype=np.float32),
+        }
 
 
 class ClusterObservation:
@@ -124,15 +147,24 @@ class ClusterObservation:
         """See `Observation.observe`."""
         return {"clusters": self._features(view.landmarks, view.geometry).ravel()}
 
+    def observe_all(self, views: Sequence[View]) -> Parts:
+        """See `observe_all`."""
+        landmarks = np.array([view.landmarks for view in views])
+        geometries = [view.geometry for view in views]
+        if geometries.count(geometries[0]) == len(geometries):
+            return {"clusters": self._features(landmarks, geometries[0]).reshape(len(views), -1)}
+        features = [self._features(*each) for each in zip(landmarks, geometries, strict=True)]
+        return {"clusters": np.array(features).reshape(len(views), -1)}
+
     def _features(self, landmarks: Landmarks, geometry: SliceGeometry) -> NDArray[np.float32]:
-        """Turns a summary of clusters, shape (3, 4), into the wanted form."""
+        """Turns summaries of clusters, shape (..., 3, 4), into the wanted form."""
         if not self.normalised:
             return landmarks.astype(np.float32)
         if geometry not in self._scales:
             self._scales[geometry] = self._scale(geometry)
         zero, scale = self._scales[geometry]
         features = (landmarks - zero) * scale
-        features[landmarks[:, 0] == 0] = 0.0
+        features[landmarks[..., 0] == 0] = 0.0
         return features.astype(np.float32)
 
     def _scale(self, geometry: SliceGeometry) -> tuple[FloatArray, FloatArray]:
@@ -185,6 +217,10 @@ class MergedObservation:
     def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
         return {key: part for observation in self.observations for key, part in observation.observe(view).items()}
+
+    def observe_all(self, views: Sequence[View]) -> Parts:
+        """See `observe_all`."""
+        return {key: part for each in self.observations for key, part in observe_all(each, views).items()}
 
 
 def named_observations() -> Mapping[str, type[Observation]]:

@@ -57,6 +57,6 @@ def flat_space(boxes: Mapping[str, spaces.Box]) -> spaces.Box:
 
 
 def flattened(parts: Parts) -> NDArray[np.float32]:
-    """Returns the parts as one vector of 32-bit floats, in their order."""
+    """Returns the parts, each shape (..., n), as one of 32-bit floats, side by side in their order."""
     # Of 32-bit floats already, unless an image is among them.
-    return np.concatenate([part.ravel() for part in parts.values()]).astype(np.float32, copy=False)
+    return np.concatenate(list(parts.values()), axis=-1).astype(np.float32, copy=False)

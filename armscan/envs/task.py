@@ -22,7 +22,7 @@ from armscan.anatomy import (
 )
 from armscan.checks import check_bool, check_choice, check_float, check_int, check_numbers
 from armscan.envs.actions import free_components
-from armscan.envs.observations import Observation, View, smallest_shape, with_action_reward
+from armscan.envs.observations import Observation, View, observe_all, smallest_shape, with_action_reward
 from armscan.envs.scene import RandomTransform, Scene, SceneSampler, slice_geometry
 from armscan.envs.spaces import MultiBoxSpace, Parts, flat_space, flattened
 from armscan.errors import InvalidValueError, OptimalPlaneError, listed
@@ -134,7 +134,14 @@ class Task:
     def observe(self, view: View) -> Observed:
         """Returns the observation of a view, within `observation_space`."""
         parts = self._observation.observe(view)
-        return flattened(parts) if self._is_flat else parts
+        return flattened({name: part.ravel() for name, part in parts.items()}) if self._is_flat else parts
+
+    def observe_all(self, views: Sequence[View]) -> Observed:
+        """Returns the observations of many views, shape (n_views, ...)."""
+        parts = observe_all(self._observation, views)
+        if not self._is_flat:
+            return parts
+        return flattened({name: part.reshape(len(views), -1) for name, part in parts.items()})
 
     def _view(self, scene: Scene, slice_xz: NDArray[np.uint8], landmarks: Landmarks) -> View:
         volume = scene.volume

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from armscan.checks import check_int
-from armscan.envs.episode import Episode, begin, checked_actions, look, wanted_volume
-from armscan.envs.history import Mask, observation_of, parts_of
+from armscan.envs.episode import INFO, Episode, begin, checked_actions, look, wanted_volume
+from armscan.envs.history import Mask
 from armscan.envs.task import Observed, Task, Volumes
 from armscan.errors import InvalidValueError, ResetNeededError
 from armscan.volumes.plane import FloatArray
@@ -102,7 +102,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         rewards = np.array([0.0 if over else e.view.reward for e, over in zip(episodes, is_over, strict=True)])
         terminated = np.array([episode.is_solved for episode in episodes]) & ~is_over
         truncated = np.array([episode.is_truncated for episode in episodes]) & ~is_over
-        return self._observed(), rewards, terminated, truncated, self._infos(range(self.num_envs))
+        return self._observed(), rewards, terminated, truncated, self._infos(np.arange(self.num_envs))
 
     @property
     def _action_shape(self) -> tuple[int, ...]:
@@ -121,22 +121,19 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
                 self._episodes[i] = episode
 
     def _observed(self) -> Observed:
-        observations = [parts_of(self.task.observe(self._episode(i).view)) for i in range(self.num_envs)]
-        return observation_of(
-            {name: np.stack([observation[name] for observation in observations]) for name in observations[0]}
-        )
+        return self.task.observe_all([self._episode(i).view for i in range(self.num_envs)])
 
-    def _infos(self, chosen: Collection[int]) -> dict[str, Any]:
+    def _infos(self, chosen: NDArray[np.int64]) -> dict[str, Any]:
         """Returns `info` as arrays, and under `_key` which environments it is given for, as Gymnasium has it."""
-        infos = {i: self._episode(i).info() for i in chosen}
-        is_given = np.isin(np.arange(self.num_envs), list(chosen))
-        batched: dict[str, Any] = {}
-        for key, example in next(iter(infos.values())).items():
-            values = np.array([info[key] for info in infos.values()], dtype=object if key == "volume" else None)
-            batched[key] = np.zeros((self.num_envs, *np.shape(example)), dtype=values.dtype)
-            batched[key][is_given] = values
-            batched[f"_{key}"] = is_given
-        return batched
+        episodes = [self._episode(i) for i in chosen]
+        is_given = np.isin(np.arange(self.num_envs), chosen)
+        infos: dict[str, Any] = {}
+        for key, gather in INFO.items():
+            values = np.asarray(gather(episodes), dtype=object if key == "volume" else None)
+            infos[key] = np.zeros((self.num_envs, *values.shape[1:]), dtype=values.dtype)
+            infos[key][is_given] = values
+            infos[f"_{key}"] = is_given
+        return infos
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
         if seed is None:
