@@ -8,6 +8,7 @@ from armscan.volumes.phantom import load_phantom, load_phantoms, make_phantom
 from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance, slid_into
 from armscan.volumes.reading import read_volume
 from armscan.volumes.report import VolumeReport
+from armscan.volumes.sharing import shared_volumes
 from armscan.volumes.volume import LABEL_NAMES, LANDMARK_LABELS, LabelVolume
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "read_markup",
     "read_volume",
     "record_planes",
+    "shared_volumes",
     "slid_into",
     "write_markup",
 ]

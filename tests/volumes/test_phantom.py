@@ -86,6 +86,8 @@ def test_phantom_refuses_a_seed_that_is_no_whole_number(seed):
 def test_cached_phantom_equals_a_new_one_and_is_not_made_again(tmp_path, monkeypatch):
     made = load_phantom(3, tmp_path)
     monkeypatch.setattr(cache.generate, "make_phantom", None)
+    assert load_phantom(3, tmp_path) is made
+    cache._IN_MEMORY.clear()
     cached = load_phantom(3, tmp_path)
     np.testing.assert_array_equal(cached.labels, made.labels)
     assert cached.optimal_action == made.optimal_action
@@ -96,6 +98,7 @@ def test_damaged_cache_is_replaced(tmp_path):
     made = load_phantom(3, tmp_path)
     (file,) = tmp_path.iterdir()
     file.write_bytes(file.read_bytes()[:5000])
+    cache._IN_MEMORY.clear()
     np.testing.assert_array_equal(load_phantom(3, tmp_path).labels, made.labels)
     np.testing.assert_array_equal(cache._read(file, 3).labels, made.labels)
 

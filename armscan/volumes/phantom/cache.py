@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
+from weakref import WeakValueDictionary
 
 import numpy as np
 import platformdirs
@@ -17,6 +18,9 @@ from armscan.files import write_whole
 from armscan.volumes.phantom import generate, tube, wrist
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.volume import LabelVolume
+
+# Environments that are made one by one share their phantoms; those that nobody has any more are forgotten.
+_IN_MEMORY: WeakValueDictionary[Path, LabelVolume] = WeakValueDictionary()
 
 
 def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None) -> dict[str, LabelVolume]:
@@ -35,6 +39,13 @@ def load_phantom(seed: int, cache_dir: Path | None = None) -> LabelVolume:
         The same volume as `make_phantom(seed)`.
     """
     path = (cache_dir or default_cache_dir()) / f"phantom-{_generator_version()}-{seed}.npz"
+    volume = _IN_MEMORY.get(path)
+    if volume is None:
+        _IN_MEMORY[path] = volume = _read_or_made(path, seed)
+    return volume
+
+
+def _read_or_made(path: Path, seed: int) -> LabelVolume:
     try:
         return _read(path, seed)
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
