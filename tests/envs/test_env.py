@@ -14,6 +14,7 @@ import armscan
 from armscan.anatomy import LandmarkReward, Scanner
 from armscan.envs import ArmscanEnv, ClusterObservation, ManipulatorAction, RandomTransform
 from armscan.errors import InvalidValueError, ManifestError, ResetNeededError, VolumeError
+from armscan.volumes import LabelVolume
 
 OBSERVATIONS = ["action_reward", "cluster"]
 PROJECTIONS = ["x", "y", "xy", "zy", "full", ["rz", "tx"]]
@@ -248,3 +249,22 @@ def test_transform_about_the_first_voxel_can_be_chosen(phantom):
     env = ArmscanEnv([phantom], transform=RandomTransform(centre="first_voxel", rz_deg=2.0))
     env.reset(seed=0)
     assert env.scene.transform.centre_mm == (0.0, 0.0, 0.0)
+
+
+def test_env_takes_volumes_of_different_spacing_by_metric_clustering(dataset):
+    """The same arm in its own and in finer pixels: the same plane shows the same tissues and earns the same."""
+    volume = list(dataset.values())[1]
+    s_x, s_y, s_z = volume.spacing
+    finer = LabelVolume(volume.labels.repeat(2, axis=0), (s_x / 2, s_y, s_z), "finer", volume.optimal_action)
+    env = ArmscanEnv(
+        [volume, finer], clustering="metric", transform=None, projection="zy", rotation_bounds_deg=(90, 45)
+    )
+    seen = []
+    for name in env.volumes:
+        env.reset(seed=0, options={"volume": name})
+        observed, reward, *_ = env.step(env.scene.optimum_normalised[[0, 3]])
+        assert env.observation_space.contains(observed)
+        assert reward == 0.0
+        seen.append(observed[:12].reshape(3, 4))
+    np.testing.assert_array_equal(seen[0][:, 0], seen[1][:, 0])
+    np.testing.assert_allclose(seen[0], seen[1], atol=0.12)
