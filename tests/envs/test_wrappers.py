@@ -3,8 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.wrappers import FlattenObservation, FrameStackObservation
 
-from armscan.envs import ArmscanEnv, BestActionMemory, make_armscan_env
+from armscan.envs import ArmscanEnv, BestActionMemory, FrameStack, make_armscan_env
 from armscan.errors import InvalidValueError
 
 
@@ -19,6 +21,20 @@ def test_stack_holds_the_last_observations_and_is_filled_with_the_first(phantom)
         latest = [*latest[1:], bare.step(np.array([action]))[0]]
         observed = stacked.step(np.array([action]))[0]
         np.testing.assert_array_equal(observed.reshape(3, size), latest)
+
+
+@pytest.mark.parametrize("observation", ["cluster", "slice"])
+def test_stack_gives_what_gymnasiums_own_gives(phantom, observation):
+    def bare():
+        return ArmscanEnv([phantom], observation=observation, projection="zy", max_steps=5)
+
+    ours, theirs = FrameStack(bare(), 3), FrameStackObservation(bare(), 3, padding_type="reset")
+    theirs = FlattenObservation(theirs) if observation == "cluster" else theirs
+    assert ours.observation_space == theirs.observation_space
+    for seed in (0, 1):
+        assert data_equivalence(ours.reset(seed=seed)[0], theirs.reset(seed=seed)[0], exact=True)
+        for action in np.linspace(-1, -0.9, 5):
+            assert data_equivalence(ours.step(np.full(2, action))[0], theirs.step(np.full(2, action))[0], exact=True)
 
 
 class Scripted(gym.Env):

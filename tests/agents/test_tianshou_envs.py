@@ -1,0 +1,75 @@
+"""The vector environment under Tianshou's interface."""
+
+import numpy as np
+import pytest
+from tianshou.data import Batch
+from tianshou.env import BaseVectorEnv
+
+from armscan.agents.tianshou_envs import SideBySide
+from armscan.envs import ArmscanEnv, EnvMaker
+
+
+@pytest.fixture
+def make(phantom):
+    def make(**rules):
+        maker = EnvMaker(projection="zy", max_steps=4, **rules)
+        envs = SideBySide(maker.many(3, [phantom], autoreset_mode="Disabled"))
+        envs.seed([7, 8, 9])
+        return envs
+
+    return make
+
+
+def test_side_by_side_steps_as_single_environments_do(make, phantom):
+    envs = make()
+    assert isinstance(envs, BaseVectorEnv)
+    assert len(envs) == 3
+    observed, _ = envs.reset()
+    single = ArmscanEnv([phantom], projection="zy", max_steps=4)
+    np.testing.assert_array_equal(observed[1], single.reset(seed=8)[0])
+    action = np.array([0.1, -0.3])
+    observed, rewards, terminated, truncated, info = envs.step(np.tile(action, (3, 1)))
+    expected, reward, *ends, _ = single.step(action)
+    np.testing.assert_array_equal(observed[1], expected)
+    assert (rewards[1], [terminated[1], truncated[1]]) == (reward, ends)
+    assert [each["env_id"] for each in info] == [0, 1, 2]
+
+
+def test_side_by_side_resets_only_those_it_is_asked_for(make):
+    envs = make()
+    envs.reset()
+    before, *_ = envs.step(np.zeros((3, 2)))
+    observed, info = envs.reset([2])
+    assert observed.shape == (1, before.shape[1])
+    assert info[0]["env_id"] == 2
+    # The start of an episode: the free components in the middle.
+    np.testing.assert_array_equal(observed[0, -3:-1], [0, 0])
+
+
+def test_side_by_side_gives_images_as_batches(make):
+    envs = make(observation="slice", stack=2)
+    envs.reset()
+    observed, _ = envs.reset([0, 1])
+    assert isinstance(observed, Batch)
+    assert observed.slice.shape == (2, 2, 360, 80)
+
+
+def test_collector_steps_the_vector_environment(make, phantom, monkeypatch):
+    """Tianshou's own collector, on environments of our factory: all planes of a step are looked at together."""
+    from armscan.agents import MLP, SAC, LearningSetup
+    from armscan.anatomy import Scanner
+
+    maker = EnvMaker(projection="zy", max_steps=4)
+    setup = LearningSetup(
+        make_envs=lambda n: maker.many(n, [phantom], autoreset_mode="Disabled"),
+        observation_space=maker.one([phantom]).observation_space,
+        total_env_steps=60,
+        seed=0,
+        device="cpu",
+    )
+    learner = SAC(network=MLP((8,)), num_envs=4, random_env_steps=20, batch_size=8).learner(setup)
+    looked_at = []
+    look_all = Scanner.look_all
+    monkeypatch.setattr(Scanner, "look_all", lambda *a: looked_at.append(len(a[1])) or look_all(*a))
+    learner.warm_up()
+    assert looked_at.count(4) >= 5
