@@ -6,6 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
+
+# Whatever is compiled at first, or waits for a busy machine, takes longer than any deadline.
+settings.register_profile("armscan", deadline=None)
+settings.load_profile("armscan")
 
 DATA = Path(__file__).parent / "data"
 

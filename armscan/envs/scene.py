@@ -144,7 +144,8 @@ class SceneSampler:
         bounds = self.bounds(volume)
         optimum = volume.optimal_action if transform is None else transform.inverse_plane(volume.optimal_action)
         within = slid_into(optimum, bounds.translation_mm)
-        if within is None or (np.abs(within.rotation) > self.rotation_bounds_deg).any():
+        (rz, rx), (bound_rz, bound_rx) = optimum.rotation, self.rotation_bounds_deg
+        if within is None or abs(rz) > bound_rz or abs(rx) > bound_rx:
             return None
         return Scene(volume, transform, within, bounds)
 

@@ -167,7 +167,7 @@ def slid_into(action: ManipulatorAction, bounds_mm: tuple[float, float]) -> Mani
     Returns:
         The same plane with its picture shifted across, or None where the plane misses the box altogether.
     """
-    direction = action.matrix[:2, 0]
+    direction = action.matrix[:2, 0].tolist()
     lowest, highest = -np.inf, np.inf
     for position, step, bound in zip(action.translation, direction, bounds_mm, strict=True):
         if abs(step) < 1e-12:
@@ -179,8 +179,11 @@ def slid_into(action: ManipulatorAction, bounds_mm: tuple[float, float]) -> Mani
     if lowest > highest:
         return None
     shift_mm = min(max(0.0, lowest), highest)
-    slid = np.clip(np.array(action.translation) + shift_mm * direction, 0.0, bounds_mm)
-    return ManipulatorAction(action.rotation, (slid[0], slid[1]))
+    tx, ty = (
+        min(max(position + shift_mm * step, 0.0), bound)
+        for position, step, bound in zip(action.translation, direction, bounds_mm, strict=True)
+    )
+    return ManipulatorAction(action.rotation, (tx, ty))
 
 
 def plane_distance(
