@@ -151,7 +151,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         # Deferred: drawing is not needed to step.
         from armscan.envs.rendering import draw_frame
 
-        return draw_frame(self.scene, self.plane, self.episode.view, self.episode.n_steps)
+        return draw_frame(self.episode)
 
     def _seen(self) -> tuple[Observed, dict[str, Any]]:
         look(self.task, [self.episode])
