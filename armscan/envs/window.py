@@ -87,7 +87,9 @@ def opened(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tup
     height, width, _ = picture.shape
     size = width / DPI, (height + height_below) / DPI
     try:
-        figure = pyplot.figure(figsize=size, dpi=DPI, facecolor=picture[0, 0] / 255)
+        # Not by itself, as a notebook would where it is interactive: it is shown once, by `Figure.show`.
+        with pyplot.ioff():
+            figure = pyplot.figure(figsize=size, dpi=DPI, facecolor=picture[0, 0] / 255)
     # What a backend raises where it meets no display is its own: Tk's TclError is nothing but an Exception.
     except Exception as error:
         raise _no_display(" ".join(str(error).split())) from error
