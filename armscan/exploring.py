@@ -149,6 +149,8 @@ class Explorer:
         )
         for text in (slider.label, slider.valtext):
             text.set_color(_rgb(INK))
+        # Drawn with the picture, once.
+        slider.drawon = False
         slider.on_changed(self._slid)
         return slider
 

@@ -9,6 +9,7 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.backend_bases import MouseButton, MouseEvent
 
+import armscan.exploring
 from armscan.envs.rendering import HEIGHT, WIDTH, Beside, draw_plane, view_of
 from armscan.errors import DisplayError, InvalidValueError
 from armscan.explore import explore, main
@@ -112,11 +113,15 @@ def test_explore_needs_no_optimal_plane_that_can_be_reached(phantom, unseen_wind
     assert explorer.rewards[-1] == 0.0
 
 
-def test_explore_remembers_the_last_rewards_only_in_its_picture(explorer):
-    for along_mm in np.linspace(10.0, 150.0, 70):
+def test_explore_shows_the_last_rewards_in_its_picture(explorer, monkeypatch):
+    monkeypatch.setattr(armscan.exploring, "N_REMEMBERED", 3)
+    drawn = []
+    monkeypatch.setattr(armscan.exploring, "History", lambda rewards, places, *_: drawn.append((rewards, places)))
+    for along_mm in (20.0, 60.0, 100.0, 140.0):
         explorer.sliders["ty"].set_val(along_mm)
-    assert len(explorer.rewards) == 71
-    assert explorer.picture().shape == (HEIGHT, WIDTH, 3)
+    assert len(explorer.rewards) == 5
+    assert drawn[0] == (explorer.rewards[:2], range(1, 4))
+    assert drawn[-1] == (explorer.rewards[2:], range(3, 6))
 
 
 def test_explore_goes_on_while_nobody_holds_the_explorer(phantom, unseen_windows):
