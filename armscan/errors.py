@@ -48,6 +48,10 @@ class CheckpointError(ArmscanError, ValueError):
     """A checkpoint cannot be read, or belongs to another agent."""
 
 
+class DisplayError(ArmscanError, RuntimeError):
+    """There is no screen, notebook or library that could show a window."""
+
+
 class TrackingError(ArmscanError, RuntimeError):
     """The tracking store cannot be reached or used."""
 

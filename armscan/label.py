@@ -21,18 +21,16 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
-from yaml import YAMLError
 
 from armscan.anatomy import checked_tissues
 from armscan.checks import check_bool
-from armscan.errors import ArmscanError, InvalidValueError, is_interruption, listed
+from armscan.errors import InvalidValueError
 from armscan.labelling import DELTA, Labelled, Request, label
 from armscan.volumes.markups import MARKUP_SUFFIX
+from armscan.words import answered, read_words
 
 # Within the folder of the data, where no other is asked for.
 PICTURES = "labelling"
@@ -47,42 +45,24 @@ def parse(words: Sequence[str]) -> Request:
         InvalidValueError: if a word is something else, a key unknown, or a value of another kind.
     """
     allowed = ["clustering" if field.name == "tissues" else field.name for field in fields(Request)]
-    for word in words:
-        key, equals, text = word.partition("=")
-        if not equals:
-            raise InvalidValueError(f"{word!r} cannot be read: give key=value, with a key of {listed(allowed)}")
-        if key not in allowed:
-            raise InvalidValueError(f"there is no key {key!r}, but only {listed(allowed)}")
-        if not text:
-            raise InvalidValueError(f"{key} is empty, but it must have a value")
-    texts = {word.partition("=")[0]: word.partition("=")[2] for word in words}
-    values = _values([word for word in words if word.partition("=")[0] not in TEXTS])
-    if "data" not in texts:
+    values = read_words(words, allowed, TEXTS)
+    if "data" not in values:
         raise InvalidValueError("data is not set, but it must be: give data=FOLDER (--help explains)")
-    if ("markup" in texts) != ("volume" in texts):
+    if ("markup" in values) != ("volume" in values):
         raise InvalidValueError("markup and volume must be given together: which file, and for which volume")
-    if idle := [key for key in ("volumes", "overwrite") if key in texts and "markup" in texts]:
+    if idle := [key for key in ("volumes", "overwrite") if key in values and "markup" in values]:
         raise InvalidValueError(f"{idle[0]} is for a search, but markup and volume say which plane and for what")
-    data = Path(texts["data"])
+    data = Path(values["data"])
     return Request(
         data=data,
-        tissues=checked_tissues(texts.get("clustering", "pixels")),
+        tissues=checked_tissues(values.get("clustering", "pixels")),
         volumes=_names(values["volumes"]) if "volumes" in values else None,
         overwrite=check_bool("overwrite", values.get("overwrite", False)),
-        pictures=Path(texts["pictures"]) if "pictures" in texts else data / PICTURES,
+        pictures=Path(values["pictures"]) if "pictures" in values else data / PICTURES,
         markups=check_bool("markups", values.get("markups", False)),
-        markup=Path(texts["markup"]) if "markup" in texts else None,
-        volume=texts.get("volume"),
+        markup=Path(values["markup"]) if "markup" in values else None,
+        volume=values.get("volume"),
     )
-
-
-def _values(words: list[str]) -> dict[str, Any]:
-    """What words whose values are no plain texts say."""
-    try:
-        values: Any = OmegaConf.to_container(OmegaConf.from_dotlist(words), resolve=True)
-    except (OmegaConfBaseException, YAMLError) as error:
-        raise InvalidValueError(f"{' '.join(words)!r} cannot be read ({' '.join(str(error).split())})") from error
-    return dict(values)
 
 
 def _names(value: Any) -> tuple[str, ...]:
@@ -124,22 +104,12 @@ def print_report(request: Request, labelled: Sequence[Labelled]) -> None:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Runs what the command line asks for; returns the exit code."""
-    words = sys.argv[1:] if words is None else words
-    if {"-h", "--help"} & set(words):
-        print(__doc__)
-        return 0
-    try:
-        request = parse(words)
-        labelled, failures = label(request)
-    # Raised inside compiled code, an interrupt can come out as any other error.
-    except (KeyboardInterrupt, Exception) as error:
-        if is_interruption(error):
-            print("\ninterrupted; the planes found so far are in the manifest", file=sys.stderr)
-            return 130
-        if not isinstance(error, ArmscanError):
-            raise
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return answered(_run, words, usage=__doc__ or "", left="the planes found so far are in the manifest")
+
+
+def _run(words: Sequence[str]) -> int:
+    request = parse(words)
+    labelled, failures = label(request)
     if labelled:
         print_report(request, labelled)
     elif not failures:

@@ -8,11 +8,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from armscan.anatomy import Judge, LandmarkReward, Scanner, Tissues, find_optimal_plane
-from armscan.envs.actions import ActionBounds
-from armscan.envs.observations import View
-from armscan.envs.rendering import draw_frame
-from armscan.envs.scene import Scene, slice_geometry
+from armscan.anatomy import Judge, LandmarkReward, Tissues, find_optimal_plane
+from armscan.envs.rendering import Beside, draw_plane, view_of
 from armscan.errors import InvalidValueError, OptimalPlaneError, listed
 from armscan.files import write_whole
 from armscan.volumes import (
@@ -139,20 +136,10 @@ def _make_folder(folder: Path) -> None:
 def _write_picture(path: Path, plane: Labelled, tissues: Tissues) -> None:
     """Draws the slice, and the plane from two sides; beside it the plane that the volume had before, if any."""
     volume = plane.volume
-    slice_xz, landmarks = Scanner([volume], tissues).look(0, plane.action.matrix, plane.action.offset_mm)
-    bounds = ActionBounds((180.0, 180.0), volume.size_mm[:2])
-    view = View(
-        slice_xz=slice_xz,
-        landmarks=landmarks,
-        tissues=tissues,
-        geometry=slice_geometry(volume),
-        smallest_shape=volume.slice_shape,
-        action=bounds.normalised(plane.action),
-        reward=plane.score,
-    )
-    scene = Scene(volume, None, volume.optimal_action or plane.action, bounds)
+    beside = None if volume.optimal_action is None else Beside(volume.optimal_action, "former plane")
+    drawn = draw_plane(volume, plane.action, view_of(volume, plane.action, tissues=tissues), beside=beside)
     picture = io.BytesIO()
-    Image.fromarray(draw_frame(scene, plane.action, view, 0)).save(picture, "PNG")
+    Image.fromarray(drawn).save(picture, "PNG")
     try:
         write_whole(path, lambda file: file.write(picture.getvalue()))
     except OSError as error:

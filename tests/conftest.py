@@ -92,3 +92,15 @@ def write_manifest(tmp_path):
         return tmp_path
 
     return write
+
+
+@pytest.fixture
+def unseen_windows():
+    """Lets windows open that nobody sees; those that are left open are closed."""
+    from matplotlib import pyplot
+
+    before = pyplot.get_backend()
+    pyplot.switch_backend("module://tests.unseen")
+    yield
+    pyplot.close("all")
+    pyplot.switch_backend(before)

@@ -61,7 +61,7 @@ def test_label_writes_planes_pictures_and_markups_and_says_what_to_do(bare, name
         offset_mm, angle_deg = plane_distance(found[name], dataset[name].optimal_action, (48.6, 21.7))
         assert (offset_mm < 6.0, angle_deg < 12.0) == (True, True)
         with Image.open(bare / "labelling" / f"{name}.png") as picture:
-            assert picture.size == (860, 480)
+            assert picture.size == (860, 512)
         markup = read_markup(bare / "labelling" / f"{name}.mrk.json", dataset[name])
         np.testing.assert_allclose(markup.to_array(), found[name].to_array(), atol=1e-6)
     ArmscanEnv(list(open_dataset(bare).volumes.values()), projection="zy").reset(seed=0)

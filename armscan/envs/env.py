@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +16,9 @@ from armscan.envs.task import Observed, Task, Volumes
 from armscan.errors import ResetNeededError
 from armscan.volumes import LabelVolume
 from armscan.volumes.plane import FloatArray, ManipulatorAction
+
+if TYPE_CHECKING:
+    from armscan.envs.window import Window
 
 
 class ArmscanEnv(gym.Env[Observed, FloatArray]):
@@ -62,7 +65,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
 
     Args:
         volumes: volumes by name or in a sequence, or the folder of a dataset; four phantoms where it is None.
-        render_mode: `rgb_array` or None.
+        render_mode: `rgb_array`, `render()` returns a picture; `human`, a window shows every reset and step; or None.
         observation: what the agent sees: a name of the table above, a list of names, or an object with the methods of
             `Observation`.
         flat: whether the observation is one vector; None makes it one where every part is a vector.
@@ -81,10 +84,11 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     Raises:
         InvalidValueError: if an argument is outside what is allowed.
         OptimalPlaneError: if a volume's labelled plane is missing, outside the bounds, or scores no better than -delta.
+        DisplayError: if the mode is `human` and no window can be opened.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
-        "render_modes": ["rgb_array"],
+        "render_modes": ["human", "rgb_array"],
         "render_fps": 4,
     }
 
@@ -94,6 +98,12 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         self.observation_space = self.task.observation_space  # type: ignore[assignment]
         self.action_space: spaces.Box = self.task.action_space  # type: ignore[assignment]
         self._episode: Episode | None = None
+        self._window: Window | None = None
+        if self.render_mode == "human":
+            # Deferred, as drawing is below: steps need neither.
+            from armscan.envs.window import Window
+
+            self._window = Window("armscan", self.metadata["render_fps"])
 
     @property
     def volumes(self) -> dict[str, LabelVolume]:
@@ -144,15 +154,26 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         return observation, episode.view.reward, episode.is_solved, episode.is_truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Returns a picture of the current step, shape (height, width, 3), None without a render mode."""
+        """Returns a picture of the current step, shape (512, 860, 3); None in `human`, whose window has it already."""
         if self.render_mode is None:
             gym.logger.warn("render() was called without a render_mode; make the environment with 'rgb_array'.")
             return None
-        # Deferred: drawing is not needed to step.
-        from armscan.envs.rendering import draw_frame
+        episode = self.episode
+        return _drawn(episode) if self._window is None else None
 
-        return draw_frame(self.scene, self.plane, self.episode.view, self.episode.n_steps)
+    def close(self) -> None:
+        """Closes the window, where there is one."""
+        if self._window is not None:
+            self._window.close()
 
     def _seen(self) -> tuple[Observed, dict[str, Any]]:
         look(self.task, [self.episode])
+        if self._window is not None:
+            self._window.show(_drawn(self.episode))
         return self.task.observe(self.episode.view), info_of(self.episode)
+
+
+def _drawn(episode: Episode) -> NDArray[np.uint8]:
+    from armscan.envs.rendering import draw_frame
+
+    return draw_frame(episode)

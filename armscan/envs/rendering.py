@@ -1,153 +1,223 @@
-"""Pictures of an episode: the slice, the plane in the volume from two sides, the reward and the step."""
+"""Pictures of an episode, and of a plane outside of one: what it shows, where it lies, what it is worth."""
 
 from __future__ import annotations
 
-from functools import lru_cache
-from weakref import WeakKeyDictionary
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
+from armscan.anatomy import PIXEL_TISSUES, LandmarkReward, Reward, Scanner, Tissues
+from armscan.envs.episode import Episode
 from armscan.envs.observations import View
-from armscan.envs.scene import Scene
-from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
+from armscan.envs.panels import (
+    BACKGROUND,
+    FAINT_INK,
+    INK,
+    OPTIMUM_INK,
+    PLANE_INK,
+    TISSUE_INKS,
+    OutlinedPlane,
+    font,
+    reward_panel,
+    side_panels,
+    slice_panel,
+)
+from armscan.envs.scene import slice_geometry
+from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance
 from armscan.volumes.volume import LABEL_NAMES, LabelVolume
 
-WIDTH, HEIGHT = 860, 480
-SLICE_BOX = (16, 48, 532, 292)
-FRONTAL_BOX = (548, 48, 738, 464)
-SAGITTAL_BOX = (754, 48, 844, 464)
-TEXT_BOX = (16, 312)
-
-BACKGROUND = (18, 20, 26)
-INK = (226, 230, 238)
-FAINT_INK = (140, 148, 162)
-PLANE_INK = (255, 214, 64)
-OPTIMUM_INK = (96, 222, 255)
-# Background, bones, tendons, artery, nerve.
-TISSUE_INKS = np.array([(34, 38, 48), (224, 214, 190), (72, 178, 118), (226, 74, 70), (168, 138, 220)], dtype=np.uint8)
-UNCLUSTERED = 0.45
+WIDTH, HEIGHT = 860, 512
+# (left, top, right, bottom)
+SLICE_BOX = (16, 40, 532, 276)
+FRONTAL_BOX = (548, 40, 738, 496)
+SAGITTAL_BOX = (754, 40, 844, 496)
+REWARD_BOX = (300, 314, 532, 464)
+FACTS_AT, FACTS_WIDTH = (16, 288), 276
+LEGEND_AT = (16, 474)
+TITLE_GAP = 7
 
 Box = tuple[int, int, int, int]
-# Drawn once a volume, and forgotten with it.
-_PROJECTIONS: WeakKeyDictionary[LabelVolume, tuple[NDArray[np.uint8], NDArray[np.uint8]]] = WeakKeyDictionary()
 
 
-def draw_frame(scene: Scene, plane: ManipulatorAction, view: View, n_steps: int) -> NDArray[np.uint8]:
-    """Draws one step of an episode.
+@dataclass(frozen=True)
+class Beside:
+    """Another plane that is drawn beside the current one.
 
     Args:
-        scene: the episode's volume.
-        plane: the current plane.
-        view: what it shows.
-        n_steps: steps taken so far.
+        action: the plane.
+        name: what it is called: `optimal plane`.
+    """
+
+    action: ManipulatorAction
+    name: str
+
+
+@dataclass(frozen=True)
+class History:
+    """The rewards that led here.
+
+    Args:
+        rewards: from the first to the current one, each in [-1, 0].
+        places: their numbers, and those of the ones that can follow.
+        threshold: above which a plane is good enough, -delta.
+        title: what they are: `reward by step`.
+    """
+
+    rewards: Sequence[float]
+    places: range
+    threshold: float
+    title: str
+
+
+def draw_frame(episode: Episode) -> NDArray[np.uint8]:
+    """Draws an episode as it stands.
+
+    Args:
+        episode: one whose first plane has been looked at.
 
     Returns:
-        The picture, shape (480, 860, 3).
+        The picture, shape (512, 860, 3).
+    """
+    scene, task = episode.scene, episode.task
+    return draw_plane(
+        scene.volume,
+        episode.plane,
+        episode.view,
+        transform=scene.transform,
+        beside=Beside(scene.optimum, "optimal plane"),
+        history=History(episode.rewards, range(task.max_steps + 1), -task.delta, "reward by step"),
+        caption=f"step {episode.n_steps}",
+    )
+
+
+def draw_plane(
+    volume: LabelVolume,
+    plane: ManipulatorAction,
+    view: View,
+    *,
+    transform: RigidTransform | None = None,
+    beside: Beside | None = None,
+    history: History | None = None,
+    caption: str = "",
+) -> NDArray[np.uint8]:
+    """Draws a plane: its slice, the volume from two sides, what it is worth.
+
+    Args:
+        volume: where the plane lies.
+        plane: the plane, in the frame of the moved volume.
+        view: what it shows.
+        transform: how the volume is moved, None where it is as it is.
+        beside: another plane to draw, and to measure the distance from.
+        history: the rewards before.
+        caption: written before the reward.
+
+    Returns:
+        The picture, shape (512, 860, 3).
     """
     picture = Image.new("RGB", (WIDTH, HEIGHT), BACKGROUND)
     draw = ImageDraw.Draw(picture)
-    _title(draw, SLICE_BOX, "slice")
-    _title(draw, FRONTAL_BOX, "from the palm")
-    _title(draw, SAGITTAL_BOX, "from the side")
-    across_mm, along_mm, depth_mm = scene.volume.size_mm
-    # Rows of the slice's picture run from the palm, at high z, to the back of the hand.
-    slice_mm = (view.geometry.shape[0] * view.geometry.pixel_mm[0], view.geometry.shape[1] * view.geometry.pixel_mm[1])
-    picture.paste(_fitted(_slice_inks(view).transpose(1, 0, 2)[::-1], SLICE_BOX, slice_mm), SLICE_BOX[:2])
-    frontal, sagittal = _projections(scene.volume)
-    picture.paste(_with_planes(frontal, FRONTAL_BOX, (across_mm, along_mm), scene, plane, (0, 1)), FRONTAL_BOX[:2])
-    picture.paste(_with_planes(sagittal, SAGITTAL_BOX, (depth_mm, along_mm), scene, plane, (2, 1)), SAGITTAL_BOX[:2])
-    _write_facts(draw, scene, plane, view, n_steps)
+    planes = [] if beside is None else [OutlinedPlane(beside.action, OPTIMUM_INK, 1)]
+    planes.append(OutlinedPlane(plane, PLANE_INK, 2))
+    frontal, sagittal = side_panels(volume, transform, planes, (_room(FRONTAL_BOX), _room(SAGITTAL_BOX)))
+    for box, title, panel in (
+        (SLICE_BOX, "slice, palm up", slice_panel(view, _room(SLICE_BOX))),
+        (FRONTAL_BOX, "frontal, from the palm", frontal),
+        (SAGITTAL_BOX, "sagittal", sagittal),
+    ):
+        _place(picture, draw, box, title, panel)
+    if history is not None:
+        panel = reward_panel(history.rewards, history.places, history.threshold, _room(REWARD_BOX))
+        _place(picture, draw, REWARD_BOX, history.title, panel)
+        goal_at = REWARD_BOX[2], REWARD_BOX[1] - TITLE_GAP
+        draw.text(goal_at, f"goal: above {history.threshold:g}", fill=INK, font=font(14), anchor="rs")
+    _write_facts(draw, volume, plane, view, beside, caption)
+    _write_legend(draw, beside)
     return np.asarray(picture)
 
 
-def _slice_inks(view: View) -> NDArray[np.uint8]:
-    """Colours a slice by tissue, shape (across, depth, 3); landmark pixels outside every cluster are darker."""
-    inks = TISSUE_INKS[view.slice_xz]
-    clustered = np.any([tissue.image > 0 for tissue in view.clusters.each()], axis=0)
-    dark = (view.slice_xz > 0) & (view.slice_xz < 4) & ~clustered
-    inks[dark] = (inks[dark] * UNCLUSTERED).astype(np.uint8)
-    return inks
-
-
-def _projections(volume: LabelVolume) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """The volume seen from the palm, (along, across, 3), and from the side, (along, depth, 3), fingers up."""
-    if volume not in _PROJECTIONS:
-        _PROJECTIONS[volume] = _projected(volume)
-    return _PROJECTIONS[volume]
-
-
-def _projected(volume: LabelVolume) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    from_palm = np.where(volume.labels.any(axis=2), _first_seen(volume.labels[:, :, ::-1], 2), 0)
-    from_side = np.where(volume.labels.any(axis=0), _first_seen(volume.labels, 0), 0)
-    return TISSUE_INKS[from_palm.T], TISSUE_INKS[from_side]
-
-
-def _first_seen(labels_xyz: NDArray[np.uint8], axis: int) -> NDArray[np.uint8]:
-    """The first label that is not background along an axis."""
-    first = np.expand_dims((labels_xyz > 0).argmax(axis=axis), axis)
-    return np.take_along_axis(labels_xyz, first, axis).squeeze(axis)
-
-
-def _with_planes(
-    inks: NDArray[np.uint8],
-    box: Box,
-    size_mm: tuple[float, float],
-    scene: Scene,
+def view_of(
+    volume: LabelVolume,
     plane: ManipulatorAction,
-    axes: tuple[int, int],
-) -> Image.Image:
-    """A projection of the volume with the outlines of the optimal and the current plane."""
-    picture = _fitted(inks, box, size_mm)
-    draw = ImageDraw.Draw(picture)
-    scale = np.array([picture.width, picture.height]) / size_mm
-    for action, ink, width in ((scene.optimum, OPTIMUM_INK, 1), (plane, PLANE_INK, 2)):
-        corners = _corners_mm(scene, action)[:, axes] * scale
-        draw.line([(x, y) for x, y in (*corners, corners[0])], fill=ink, width=width)
-    return picture
+    *,
+    tissues: Tissues = PIXEL_TISSUES,
+    reward: Reward = LandmarkReward(),  # noqa: B008 - it is not changed
+) -> View:
+    """Looks at a plane outside of an episode, in a volume as it was read.
+
+    Args:
+        volume: the volume.
+        plane: the plane, anywhere.
+        tissues: how what is seen is clustered.
+        reward: scores it.
+
+    Returns:
+        What is seen; no action led there, so its `action` is empty.
+    """
+    slice_xz, landmarks = Scanner([volume], tissues).look(0, plane.matrix, plane.offset_mm)
+    return View(
+        slice_xz=slice_xz,
+        landmarks=landmarks,
+        tissues=tissues,
+        geometry=slice_geometry(volume),
+        smallest_shape=volume.slice_shape,
+        action=np.zeros(0),
+        reward=reward.score(landmarks, volume.pixel_mm),
+    )
 
 
-def _corners_mm(scene: Scene, action: ManipulatorAction) -> FloatArray:
-    """The four corners of a slice where they lie in the volume as it was read, shape (4, 3)."""
-    matrix, offset_mm = (scene.transform or RigidTransform()).plane_map(action)
-    across_mm, _, depth_mm = scene.volume.size_mm
-    corners = np.array([[0, 0, 0], [across_mm, 0, 0], [across_mm, 0, depth_mm], [0, 0, depth_mm]])
-    return corners @ matrix.T + offset_mm
+def _room(box: Box) -> tuple[int, int]:
+    return box[2] - box[0], box[3] - box[1]
 
 
-def _fitted(inks: NDArray[np.uint8], box: Box, size_mm: tuple[float, float]) -> Image.Image:
-    """Scales colours, shape (rows, columns, 3), to the largest picture of true proportions that fits a box."""
-    room = (box[2] - box[0], box[3] - box[1])
-    scale = min(room[0] / size_mm[0], room[1] / size_mm[1])
-    shape = (max(1, round(size_mm[0] * scale)), max(1, round(size_mm[1] * scale)))
-    return Image.fromarray(np.ascontiguousarray(inks)).resize(shape, Image.Resampling.NEAREST)
+def _place(picture: Image.Image, draw: ImageDraw.ImageDraw, box: Box, title: str, panel: Image.Image) -> None:
+    draw.text((box[0], box[1] - TITLE_GAP), title, fill=FAINT_INK, font=font(14), anchor="ls")
+    picture.paste(panel, box[:2])
 
 
-@lru_cache
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)
-
-
-def _title(draw: ImageDraw.ImageDraw, box: Box, text: str) -> None:
-    draw.text((box[0], box[1] - 24), text, fill=FAINT_INK, font=_font(15))
-
-
-def _write_facts(draw: ImageDraw.ImageDraw, scene: Scene, plane: ManipulatorAction, view: View, n_steps: int) -> None:
-    x, y = TEXT_BOX
-    distance_mm, distance_deg = scene.distance(plane)
+def _write_facts(
+    draw: ImageDraw.ImageDraw,
+    volume: LabelVolume,
+    plane: ManipulatorAction,
+    view: View,
+    beside: Beside | None,
+    caption: str,
+) -> None:
+    x, y = FACTS_AT
+    heading = f"{caption}    reward {view.reward:.3f}" if caption else f"reward {view.reward:.3f}"
+    draw.text((x, y), heading, fill=INK, font=font(22))
     bones, tendons, artery = view.clusters.counts
     rz, rx, tx, ty = plane.to_array()
-    draw.text((x, y), f"step {n_steps}    reward {view.reward:.3f}", fill=INK, font=_font(24))
-    lines = (
-        f"{scene.volume.name}:  clusters: bones {bones}, tendons {tendons}, artery {artery}",
-        f"rz {rz:.1f}°, rx {rx:.1f}°,  tx {tx:.1f} mm, ty {ty:.1f} mm",
-        f"{distance_mm:.1f} mm and {distance_deg:.1f}° from the optimal plane",
-    )
+    lines = [
+        volume.name,
+        f"clusters: bones {bones}, tendons {tendons}, artery {artery}",
+        f"rz {rz:.1f}°, rx {rx:.1f}°",
+        f"tx {tx:.1f} mm, ty {ty:.1f} mm",
+    ]
+    if beside is not None:
+        centre_mm = volume.centre_mm
+        distance_mm, distance_deg = plane_distance(plane, beside.action, (centre_mm[0], centre_mm[2]))
+        lines += [f"{distance_mm:.1f} mm and {distance_deg:.1f}°", f"from the {beside.name}"]
     for row, line in enumerate(lines):
-        draw.text((x, y + 42 + 24 * row), line, fill=INK, font=_font(16))
-    legend = [("current plane", PLANE_INK), ("optimal plane", OPTIMUM_INK)]
-    legend += [(name, tuple(TISSUE_INKS[label])) for label, name in LABEL_NAMES.items() if label > 0]
+        draw.text((x, y + 38 + 22 * row), _shortened(line), fill=INK, font=font(15))
+
+
+def _shortened(line: str) -> str:
+    """A line that fits beside the rewards: the middle of a long file name is left out."""
+    n_kept = len(line)
+    shortened = line
+    while font(15).getlength(shortened) > FACTS_WIDTH:
+        n_kept -= 1
+        shortened = line[: n_kept // 2] + "…" + line[len(line) - n_kept // 2 :]
+    return shortened
+
+
+def _write_legend(draw: ImageDraw.ImageDraw, beside: Beside | None) -> None:
+    x, y = LEGEND_AT
+    legend = [("current plane", PLANE_INK)] + ([(beside.name, OPTIMUM_INK)] if beside else [])
+    legend += [(name, tuple(TISSUE_INKS[label].tolist())) for label, name in LABEL_NAMES.items() if label > 0]
     for text, ink in legend:
-        draw.text((x, y + 124), text, fill=ink, font=_font(15))
-        x += 16 + round(_font(15).getlength(text))
+        draw.text((x, y), text, fill=ink, font=font(15))
+        x += 16 + round(font(15).getlength(text))

@@ -11,7 +11,7 @@ from armscan.training.evaluation import Env
 
 FRAME_MS = 600
 LAST_FRAME_MS = 2400
-MAX_COLOURS = 64
+MAX_COLOURS = 128
 MAX_ATTEMPTS = 20
 
 

@@ -1,32 +1,146 @@
-"""Pictures of an episode."""
+"""Pictures of an episode, and of a plane outside of one."""
 
 import numpy as np
 import pytest
+from gymnasium.wrappers import RecordEpisodeStatistics
 
-from armscan.envs import ArmscanEnv
-from armscan.envs.rendering import OPTIMUM_INK, PLANE_INK, TISSUE_INKS
+from armscan.envs import ArmscanEnv, ManipulatorAction
+from armscan.envs.panels import (
+    OPTIMUM_INK,
+    OUTLINE_INK,
+    PLANE_INK,
+    REWARD_INK,
+    SHADES,
+    TISSUE_INKS,
+    UNCLUSTERED,
+    slice_panel,
+)
+from armscan.envs.rendering import FRONTAL_BOX, HEIGHT, REWARD_BOX, SAGITTAL_BOX, WIDTH, Beside, draw_plane, view_of
 from armscan.errors import ResetNeededError
+from armscan.volumes import LabelVolume
 
 
-def shows(picture, ink):
-    return (picture == np.array(ink, dtype=np.uint8)).all(axis=-1).any()
+def n_shown(picture, ink):
+    return int((picture == np.array(ink, dtype=np.uint8)).all(axis=-1).sum())
 
 
-def test_render_shows_slice_planes_and_changes_with_the_step(phantom):
+def within(picture, box):
+    left, top, right, bottom = box
+    return picture[top:bottom, left:right]
+
+
+def shaded(label, shade):
+    return (TISSUE_INKS[label] * shade).astype(np.uint8)
+
+
+@pytest.fixture
+def env(phantom):
     env = ArmscanEnv([phantom], projection="zy", render_mode="rgb_array")
     env.reset(seed=0)
+    return env
+
+
+def test_render_shows_slice_planes_and_changes_with_the_step(env):
     first = env.render()
-    assert first.shape == (480, 860, 3)
+    assert first.shape == (HEIGHT, WIDTH, 3)
     assert first.dtype == np.uint8
     for ink in (PLANE_INK, OPTIMUM_INK, *TISSUE_INKS):
-        assert shows(first, ink)
+        assert n_shown(first, ink) > 0
+    for box in (FRONTAL_BOX, SAGITTAL_BOX):
+        assert n_shown(within(first, box), PLANE_INK) > 100
+        assert n_shown(within(first, box), OPTIMUM_INK) > 20
     env.step(np.array([0.2, 0.5]))
     assert (env.render() != first).any()
+
+
+def test_render_draws_the_reward_of_every_step(env):
+    lasts = []
+    for _ in range(4):
+        columns = (within(env.render(), REWARD_BOX) == REWARD_INK).all(axis=-1).any(axis=0)
+        lasts.append(int(np.flatnonzero(columns).max()))
+        if env.episode.is_running:
+            env.step(np.array([0.9, -0.9]))
+    assert len(lasts) == 4
+    assert lasts == sorted(set(lasts))
+
+
+def test_render_shows_each_cluster_of_the_optimal_plane_apart(phantom):
+    view = view_of(phantom, phantom.optimal_action)
+    picture = np.asarray(slice_panel(view, (516, 236)))
+    assert view.clusters.counts == (4, 3, 1)
+    for label, n_clusters in ((1, 4), (2, 3), (3, 1)):
+        for shade in SHADES[:n_clusters]:
+            assert n_shown(picture, shaded(label, shade)) > 50
+    assert n_shown(picture, OUTLINE_INK) > 300
+
+
+def test_render_outlines_clusters_alone():
+    labels = np.zeros((60, 3, 30), dtype=np.uint8)
+    labels[2:12, :, 2:14], labels[30:40, :, 2:14] = 1, 1
+    labels[50:56, :, 20:26] = 2
+    labels[20:21, :, 20:21] = 3
+    view = view_of(LabelVolume(labels, (1.0, 1.0, 1.0), "blocks"), ManipulatorAction((0.0, 0.0), (0.0, 1.0)))
+    assert view.clusters.counts == (2, 1, 0)
+    picture = np.asarray(slice_panel(view, (600, 300)))
+    assert picture.shape == (300, 600, 3)
+    # Ten pixels a voxel, depth going up.
+    voxels = picture[::-1].reshape(30, 10, 60, 10, 3)
+    for (across, depth), ink in (
+        ((6, 6), shaded(1, SHADES[0])),
+        ((34, 6), shaded(1, SHADES[1])),
+        ((20, 20), shaded(3, UNCLUSTERED)),
+        ((40, 20), TISSUE_INKS[0]),
+    ):
+        assert (voxels[depth, :, across] == ink).all()
+    is_clustered = sum(tissue.image > 0 for tissue in view.clusters.each()) > 0
+    has_outline = (voxels == OUTLINE_INK).all(axis=-1).any(axis=(1, 3)).T
+    assert has_outline.sum() > 80
+    assert not has_outline[~is_clustered].any()
+
+
+def test_draw_plane_without_an_episode_names_no_step_and_no_optimal_plane(phantom, monkeypatch):
+    from PIL import ImageDraw
+
+    written = []
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda _, __, text, **___: written.append(text))
+    plane = ManipulatorAction((3.0, 0.0), (0.0, 100.0))
+    view = view_of(phantom, plane)
+    draw_plane(phantom, plane, view)
+    assert f"reward {view.reward:.3f}" in written
+    assert not [text for text in written if "step" in text or "optimal" in text or "from the p" in text[:10]]
+    written.clear()
+    draw_plane(phantom, plane, view, beside=Beside(plane, "former plane"))
+    assert {"former plane", "0.0 mm and 0.0°", "from the former plane"} <= set(written)
+
+
+def test_draw_plane_shortens_a_long_name(phantom, monkeypatch):
+    from PIL import ImageDraw
+
+    written = []
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda _, __, text, **___: written.append(text))
+    plane = phantom.optimal_action
+    volume = LabelVolume(phantom.labels, phantom.spacing, "subject-" * 20 + "left.nii.gz")
+    draw_plane(volume, plane, view_of(volume, plane))
+    (name,) = [text for text in written if "…" in text]
+    assert name.startswith("subject-")
+    assert name.endswith("left.nii.gz")
+
+
+def test_render_draws_a_volume_one_voxel_thick(phantom):
+    labels = phantom.labels[:, :1].copy()
+    labels[:3, 0, 0] = 1, 2, 3
+    volume = LabelVolume(labels, phantom.spacing, "thin")
+    plane = ManipulatorAction((0.0, 0.0), (0.0, 0.0))
+    assert draw_plane(volume, plane, view_of(volume, plane)).shape == (HEIGHT, WIDTH, 3)
 
 
 def test_render_needs_an_episode(phantom):
     with pytest.raises(ResetNeededError):
         ArmscanEnv([phantom], render_mode="rgb_array").render()
+
+
+def test_render_goes_through_wrappers(env):
+    assert RecordEpisodeStatistics(env).render().shape == (HEIGHT, WIDTH, 3)
 
 
 def test_render_without_a_mode_warns(phantom):

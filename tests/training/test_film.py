@@ -18,4 +18,4 @@ def test_film_has_a_frame_for_the_start_and_for_every_step(phantom, tmp_path):
     with Image.open(tmp_path / "episode.gif") as film:
         # The last two pictures show the same plane, but another step.
         assert film.n_frames == 4
-        assert film.size == (860, 480)
+        assert film.size == (860, 512)

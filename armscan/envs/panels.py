@@ -1,0 +1,207 @@
+"""The parts of an episode's picture: the slice with its clusters, the volume from two sides, the rewards so far."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple, TypeVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from armscan.envs.observations import View
+from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
+from armscan.volumes.volume import LabelVolume
+
+BACKGROUND = (18, 20, 26)
+INK = (226, 230, 238)
+FAINT_INK = (140, 148, 162)
+LINE_INK = (62, 68, 82)
+PLANE_INK = (255, 214, 64)
+OPTIMUM_INK = (96, 222, 255)
+REWARD_INK = (255, 150, 80)
+# Background, bones, tendons, artery, nerve.
+TISSUE_INKS = np.array([(34, 38, 48), (224, 214, 190), (72, 178, 118), (226, 74, 70), (168, 138, 220)], dtype=np.uint8)
+# Clusters 1, 2, 3, 4 of a tissue, and so on from the first again: each its own shade of the tissue's colour.
+SHADES = (1.0, 0.84, 0.92, 0.76)
+UNCLUSTERED = 0.45
+OUTLINE_INK = (255, 255, 255)
+NUMBER_INK = (12, 14, 18)
+# In pixels of the picture: a smaller cluster would be hidden under its number.
+LEAST_NUMBERED = 300
+
+Inks = NDArray[np.uint8]
+Pixel = TypeVar("Pixel", bound=np.generic)
+Ink = tuple[int, int, int]
+Size = tuple[int, int]
+# Drawn once a volume, and forgotten with it.
+_SIDES: WeakKeyDictionary[LabelVolume, tuple[Inks, Inks]] = WeakKeyDictionary()
+
+
+class OutlinedPlane(NamedTuple):
+    """A plane to draw in the volume, in the frame of the moved volume."""
+
+    action: ManipulatorAction
+    ink: Ink
+    width: int
+
+
+@lru_cache
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Returns the font of every text, loaded once a size."""
+    return ImageFont.load_default(size)
+
+
+def slice_panel(view: View, room: Size) -> Image.Image:
+    """Draws a slice, palm up: each cluster outlined, numbered, and in a shade of its tissue's colour.
+
+    Pixels of a landmark that belong to no cluster are darker.
+
+    Args:
+        view: what is seen.
+        room: (width, height) that the picture fits into, its proportions kept.
+    """
+    numbers = _cluster_numbers(view)
+    (n_across, n_depth), (across_mm, depth_mm) = view.geometry.shape, view.geometry.pixel_mm
+    size_mm = n_across * across_mm, n_depth * depth_mm
+    size = _size(size_mm, _scale(size_mm, room))
+    # Rows of the picture run from the palm, at high z, to the back of the hand.
+    inks = _resized(_slice_inks(view, numbers).transpose(1, 0, 2)[::-1], size)
+    codes = np.where(numbers > 0, view.slice_xz * np.int32(numbers.max() + 1) + numbers, 0)
+    inks[_outlines(_resized(codes.T[::-1], size))] = OUTLINE_INK
+    picture = Image.fromarray(inks)
+    draw = ImageDraw.Draw(picture)
+    scale = np.divide(size, (n_across, n_depth))
+    for tissue in view.clusters.each():
+        for number, ((across, depth), n_pixels) in enumerate(zip(tissue.centres, tissue.sizes, strict=True), 1):
+            if n_pixels * scale.prod() >= LEAST_NUMBERED:
+                middle = (across + 0.5) * scale[0], (n_depth - depth - 0.5) * scale[1]
+                draw.text(middle, str(number), fill=NUMBER_INK, font=font(13), anchor="mm")
+    return picture
+
+
+def _cluster_numbers(view: View) -> NDArray[np.int32]:
+    """The number of each pixel's cluster among those of its tissue, from 1; 0 where it has none."""
+    # No pixel is of two tissues.
+    return sum((tissue.image for tissue in view.clusters.each()), start=np.zeros(view.slice_xz.shape, np.int32))
+
+
+def _slice_inks(view: View, numbers: NDArray[np.int32]) -> Inks:
+    """The colours of a slice, shape (across, depth, 3)."""
+    inks = TISSUE_INKS[view.slice_xz]
+    shades = np.array(SHADES)[(numbers - 1) % len(SHADES)]
+    shades[numbers == 0] = UNCLUSTERED
+    is_landmark = (view.slice_xz > 0) & (view.slice_xz < 4)
+    inks[is_landmark] = (inks[is_landmark] * shades[is_landmark, None]).astype(np.uint8)
+    return inks
+
+
+def _outlines(codes: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Where a pixel of a cluster, one whose code is not 0, lies beside one that is not of it."""
+    framed = np.pad(codes, 1)
+    middle = framed[1:-1, 1:-1]
+    beside = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
+    edges: NDArray[np.bool_] = (middle > 0) & np.any([middle != other for other in beside], axis=0)
+    return edges
+
+
+def side_panels(
+    volume: LabelVolume,
+    transform: RigidTransform | None,
+    planes: Sequence[OutlinedPlane],
+    rooms: tuple[Size, Size],
+) -> tuple[Image.Image, Image.Image]:
+    """Draws the volume as it was read from the palm (frontal) and from the side (sagittal), fingers up, in one scale.
+
+    Args:
+        volume: the volume.
+        transform: how it is moved in the episode, None where it is as it is.
+        planes: what is outlined in it, the last one on top.
+        rooms: (width, height) that either picture fits into, its proportions kept.
+    """
+    if volume not in _SIDES:
+        _SIDES[volume] = _from_two_sides(volume)
+    across_mm, along_mm, depth_mm = volume.size_mm
+    sizes_mm = (across_mm, along_mm), (depth_mm, along_mm)
+    scale = min(_scale(size_mm, room) for size_mm, room in zip(sizes_mm, rooms, strict=True))
+    frontal, sagittal = (
+        Image.fromarray(_resized(inks, _size(size_mm, scale)))
+        for inks, size_mm in zip(_SIDES[volume], sizes_mm, strict=True)
+    )
+    for plane in planes:
+        corners_mm = _corners_mm(volume, transform, plane.action)
+        for picture, axes in ((frontal, [0, 1]), (sagittal, [2, 1])):
+            corners = corners_mm[:, axes] * picture.size / np.array(volume.size_mm)[axes]
+            outline = [(x, y) for x, y in (*corners, corners[0])]
+            ImageDraw.Draw(picture).line(outline, fill=plane.ink, width=plane.width)
+    return frontal, sagittal
+
+
+def _from_two_sides(volume: LabelVolume) -> tuple[Inks, Inks]:
+    """The volume from the palm, shape (along, across, 3), and from the side, (along, depth, 3)."""
+    from_palm = _first_seen(volume.labels[:, :, ::-1], 2)
+    from_side = _first_seen(volume.labels, 0)
+    return TISSUE_INKS[from_palm.T], TISSUE_INKS[from_side]
+
+
+def _first_seen(labels_xyz: NDArray[np.uint8], axis: int) -> NDArray[np.uint8]:
+    """The first label along an axis that is not background, 0 where there is none."""
+    first = np.expand_dims((labels_xyz > 0).argmax(axis=axis), axis)
+    return np.take_along_axis(labels_xyz, first, axis).squeeze(axis)
+
+
+def _corners_mm(volume: LabelVolume, transform: RigidTransform | None, action: ManipulatorAction) -> FloatArray:
+    """The four corners of a slice where they lie in the volume as it was read, shape (4, 3)."""
+    matrix, offset_mm = (transform or RigidTransform()).plane_map(action)
+    across_mm, _, depth_mm = volume.size_mm
+    corners = np.array([[0, 0, 0], [across_mm, 0, 0], [across_mm, 0, depth_mm], [0, 0, depth_mm]])
+    return corners @ matrix.T + offset_mm
+
+
+def reward_panel(rewards: Sequence[float], places: range, threshold: float, size: Size) -> Image.Image:
+    """Draws rewards from left to right between 0, at the top, and -1.
+
+    Args:
+        rewards: one for each place from the first, at least one, each in [-1, 0].
+        places: the numbers of the places that there is room for.
+        threshold: drawn as a line across.
+        size: (width, height).
+    """
+    width, height = size
+    left, top, right, bottom = 36, 8, width - 8, height - 22
+    picture = Image.new("RGB", size, BACKGROUND)
+    draw = ImageDraw.Draw(picture)
+
+    def y_of(reward: float) -> float:
+        return top - reward * (bottom - top)
+
+    for reward in (0.0, -0.5, -1.0):
+        draw.line([(left, y_of(reward)), (right, y_of(reward))], fill=LINE_INK)
+        draw.text((left - 6, y_of(reward)), f"{reward:g}", fill=FAINT_INK, font=font(12), anchor="rm")
+    draw.line([(left, y_of(threshold)), (right, y_of(threshold))], fill=INK)
+    for end, place, anchor in ((left, places[0], "la"), (right, places[-1], "ra")):
+        draw.text((end, bottom + 8), str(place), fill=FAINT_INK, font=font(12), anchor=anchor)
+    step = (right - left) / max(1, len(places) - 1)
+    points = [(left + place * step, y_of(reward)) for place, reward in enumerate(rewards)]
+    draw.line(points, fill=REWARD_INK, width=2)
+    x, y = points[-1]
+    draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=REWARD_INK)
+    return picture
+
+
+def _scale(size_mm: tuple[float, float], room: Size) -> float:
+    """The pixels a mm of the largest picture that fits into a room."""
+    return min(room[0] / size_mm[0], room[1] / size_mm[1])
+
+
+def _size(size_mm: tuple[float, float], scale: float) -> Size:
+    return max(1, round(size_mm[0] * scale)), max(1, round(size_mm[1] * scale))
+
+
+def _resized(pixels: NDArray[Pixel], size: Size) -> NDArray[Pixel]:
+    """Pixels, shape (rows, columns, ...), as many as a picture of (width, height) has: the nearest to each of them."""
+    rows, columns = ((np.arange(n) * 2 + 1) * m // (2 * n) for n, m in zip(size[::-1], pixels.shape[:2], strict=True))
+    resized: NDArray[Pixel] = pixels[rows[:, None], columns]
+    return resized

@@ -1,0 +1,121 @@
+"""A window that shows pictures as they come; Matplotlib's, which also has the sliders of `armscan.explore`."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.errors import DisplayError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+DPI = 100
+# Of the backends that draw into files or a notebook's page, and so neither move nor can be clicked.
+STILL_BACKENDS = ("agg", "cairo", "inline", "pdf", "pgf", "ps", "svg", "template")
+
+
+class Window:
+    """Shows pictures, each until the next one comes; opened by the first.
+
+    A window that a person closes stays closed, until `close` has been called and another picture comes.
+
+    Args:
+        title: of the window.
+        frames_per_s: how fast pictures follow each other at most.
+
+    Raises:
+        DisplayError: if no window can be shown here.
+    """
+
+    def __init__(self, title: str, frames_per_s: float) -> None:
+        check_display()
+        self.title = title
+        self._interval_s = 1.0 / frames_per_s
+        self._figure: Figure | None = None
+        self._image: AxesImage | None = None
+        self._is_open = False
+        self._shown_s = 0.0
+
+    def show(self, picture: NDArray[np.uint8]) -> None:
+        """Shows a picture, shape (height, width, 3), not before the last one has been seen long enough."""
+        if self._figure is None or self._image is None:
+            self._figure, self._image = opened(self.title, picture)
+            self._figure.canvas.mpl_connect("close_event", self._was_closed)
+            self._figure.show()
+            self._is_open = True
+        elif self._is_open:
+            wait_s = self._shown_s + self._interval_s - time.monotonic()
+            if wait_s > 0:
+                self._figure.canvas.start_event_loop(wait_s)
+            self._image.set_data(picture)
+        if self._is_open:
+            self._figure.canvas.draw()
+            self._figure.canvas.flush_events()
+            self._shown_s = time.monotonic()
+
+    def close(self) -> None:
+        """Closes the window; nothing happens where none is open."""
+        if self._figure is not None:
+            from matplotlib import pyplot
+
+            pyplot.close(self._figure)
+        self._figure = self._image = None
+        self._is_open = False
+
+    def _was_closed(self, _: Any) -> None:
+        self._is_open = False
+
+
+def opened(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tuple[Figure, AxesImage]:
+    """Makes a figure, not shown yet, that a picture fills in its own pixels.
+
+    Args:
+        title: of the window.
+        picture: shape (height, width, 3).
+        height_below: pixels left free below the picture.
+
+    Raises:
+        DisplayError: if the window cannot be opened.
+    """
+    from matplotlib import pyplot
+
+    height, width, _ = picture.shape
+    size = width / DPI, (height + height_below) / DPI
+    try:
+        # Not by itself, as a notebook would where it is interactive: it is shown once, by `Figure.show`.
+        with pyplot.ioff():
+            figure = pyplot.figure(figsize=size, dpi=DPI, facecolor=picture[0, 0] / 255)
+    # What a backend raises where it meets no display is its own: Tk's TclError is nothing but an Exception.
+    except Exception as error:
+        raise _no_display(" ".join(str(error).split())) from error
+    if figure.canvas.manager is not None:
+        figure.canvas.manager.set_window_title(title)
+    axes = figure.add_axes((0.0, height_below / (height + height_below), 1.0, height / (height + height_below)))
+    axes.set_axis_off()
+    return figure, axes.imshow(picture, aspect="equal")
+
+
+def check_display() -> None:
+    """Raises `DisplayError` unless Matplotlib can show a window here."""
+    try:
+        from matplotlib import pyplot
+
+        # Where nothing else is set, this looks for a backend that works here.
+        backend = str(pyplot.get_backend())
+        pyplot.switch_backend(backend)
+    except (ImportError, ValueError) as error:
+        raise _no_display(" ".join(str(error).split())) from error
+    if any(still in backend.lower().split(".")[-1].split("_") for still in STILL_BACKENDS):
+        raise _no_display(f"Matplotlib's backend is {backend!r}, which shows none")
+
+
+def _no_display(reason: str) -> DisplayError:
+    return DisplayError(
+        f"no window can be opened ({reason}): this needs a display, and Tk (python3-tk on Debian) or another of "
+        "Matplotlib's interactive backends; in a notebook: pip install 'armscan[notebook]', then %matplotlib widget"
+    )
