@@ -41,17 +41,19 @@ class SliceFrame:
         self.crop = None if crop is None else _checked_shape("crop", crop)
         self.shape = None if shape is None else _checked_shape("shape", shape)
 
-    def observed_shape(self, smallest: Shape) -> Shape:
-        """Returns the shape of what is observed of slices of at least the shape `smallest`."""
-        return self.shape or self.crop or smallest
+    def observed_shape(self, geometries: Sequence[SliceGeometry]) -> Shape:
+        """Returns the shape of what is observed of slices of any of these geometries.
 
-    def check(self, smallest: Shape) -> None:
-        """Raises `InvalidValueError` if the crop is larger than the smallest slice."""
+        Raises:
+            InvalidValueError: if the crop is larger than the smallest slice.
+        """
+        smallest = smallest_shape(geometries)
         if self.crop is not None and (self.crop[0] > smallest[0] or self.crop[1] > smallest[1]):
             raise InvalidValueError(
                 f"crop is {self.crop}, but it must be at most {smallest}, the smallest slice (across, depth) of the "
                 "volumes"
             )
+        return self.shape or self.crop or smallest
 
     def cropped(self, view: View) -> NDArray[np.uint8]:
         """Returns the middle of a slice."""
@@ -88,9 +90,7 @@ class SliceObservation:
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
-        smallest = smallest_shape(geometries)
-        self._frame.check(smallest)
-        return {"slice": spaces.Box(0, max(LABEL_NAMES), self._frame.observed_shape(smallest), np.uint8)}
+        return {"slice": spaces.Box(0, max(LABEL_NAMES), self._frame.observed_shape(geometries), np.uint8)}
 
     def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
@@ -117,15 +117,13 @@ class SliceChannelsObservation:
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
-        smallest = smallest_shape(geometries)
-        self._frame.check(smallest)
-        shape = (len(LANDMARK_LABELS), *self._frame.observed_shape(smallest))
+        shape = (len(LANDMARK_LABELS), *self._frame.observed_shape(geometries))
         return {"channels": spaces.Box(0, 1, shape, np.uint8)}
 
     def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
         cropped = self._frame.cropped(view)
-        channels = np.empty((len(LANDMARK_LABELS), *self._frame.observed_shape(view.smallest_shape)), dtype=np.uint8)
+        channels = np.empty((len(LANDMARK_LABELS), *(self._frame.shape or cropped.shape)), dtype=np.uint8)
         for channel, label in zip(channels, LANDMARK_LABELS, strict=True):
             if self._frame.shape is None:
                 np.equal(cropped, label, out=channel.view(np.bool_))
