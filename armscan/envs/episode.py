@@ -110,7 +110,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
         received = np.array(actions, dtype=np.float64)
         if received.shape == shape and (np.abs(received) <= 1.0).all():
             return received
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         received = np.empty(0)
     if received.shape != shape or not np.isfinite(received).all():
         raise InvalidValueError(f"action is {actions!r}, but it must be an array of shape {shape} of finite numbers")
