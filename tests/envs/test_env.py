@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import armscan
-from armscan.anatomy import LandmarkReward, Scanner
+from armscan.anatomy import METRIC_TISSUES, AgreementReward, LandmarkReward, Scanner, TissueClusters, landmark_reward
 from armscan.envs import ArmscanEnv, ClusterObservation, ManipulatorAction, RandomTransform
-from armscan.errors import InvalidValueError, ManifestError, ResetNeededError, VolumeError
+from armscan.errors import InvalidValueError, ManifestError, OptimalPlaneError, ResetNeededError, VolumeError
 
 
 @pytest.fixture
@@ -225,3 +225,70 @@ def test_transform_about_the_first_voxel_can_be_chosen(phantom):
     env = ArmscanEnv([phantom], transform=RandomTransform(centre="first_voxel", rz_deg=2.0))
     env.reset(seed=0)
     assert env.scene.transform.centre_mm == (0.0, 0.0, 0.0)
+
+
+class ArteryOnly:
+    """A user's own reward: 0 where exactly one artery is seen."""
+
+    def fitted_to(self, volumes):
+        return self
+
+    def score(self, landmarks, pixel_mm):
+        return 0.0 if landmarks[2, 0] == 1 else -1.0
+
+
+def agreement(volume):
+    return AgreementReward().fitted_to([volume])
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (AgreementReward(), agreement),
+        (LandmarkReward((5, 3, 1)), lambda _: LandmarkReward((5, 3, 1))),
+        (LandmarkReward(), lambda _: LandmarkReward()),
+        (ArteryOnly(), lambda _: ArteryOnly()),
+    ],
+    ids=["agreement", "other_targets", "published", "own"],
+)
+def test_env_takes_rewards_as_objects(wrist, given, expected):
+    env = ArmscanEnv([wrist], reward=given, projection="full", max_steps=20)
+    expected = expected(wrist)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    rewards, terminated = [], False
+    while not terminated and len(rewards) < 12:
+        _, reward, terminated, _, info = env.step(env.action_space.sample())
+        rewards.append(reward)
+        assert reward == info["reward"] == expected.score(env.episode.view.landmarks, wrist.pixel_mm)
+        assert terminated == (reward > -0.05)
+    env.reset(seed=0)
+    assert env.step(env.scene.optimum_normalised)[2]
+
+
+def test_env_fits_a_reward_to_its_volumes_and_leaves_the_one_given_as_it_is(wrist):
+    given = AgreementReward()
+    fitted = ArmscanEnv([wrist], reward=given).task.reward
+    assert isinstance(fitted, AgreementReward)
+    with pytest.raises(InvalidValueError, match="fitted_to"):
+        given.score(np.zeros((3, 4)), wrist.pixel_mm)
+    assert ArmscanEnv([wrist], reward=fitted).task.reward is fitted
+
+
+def test_env_refuses_volumes_that_do_not_show_the_other_published_targets(wrist):
+    with pytest.raises(OptimalPlaneError, match=r"wrist: the labelled optimal plane scores -0\.\d+"):
+        ArmscanEnv([wrist], targets=(7, 5, 1))
+    assert ArmscanEnv([wrist], targets=(7, 5, 1), delta=0.2).reset(seed=0)
+
+
+@pytest.mark.parametrize("clustering", ["metric", METRIC_TISSUES], ids=["name", "tissues"])
+def test_env_clusters_by_millimetres(wrist, clustering):
+    env = ArmscanEnv([wrist], clustering=clustering, projection="full")
+    env.reset(seed=0)
+    info = env.step(env.scene.optimum_normalised)[4]
+    view = env.episode.view
+    metric = TissueClusters.from_slice(env.slice_xz, **METRIC_TISSUES._asdict(), pixel_mm=wrist.pixel_mm)
+    np.testing.assert_array_equal(view.landmarks, metric.landmarks)
+    assert (view.landmarks != TissueClusters.from_slice(env.slice_xz).landmarks).any()
+    assert view.clusters.counts == metric.counts == tuple(info["counts"])
+    assert info["reward"] == landmark_reward(metric) > -0.05
