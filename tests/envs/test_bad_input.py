@@ -181,6 +181,16 @@ def test_actions_of_junk(wrist, value):
             assert (np.abs(step[4]["action"]) <= 1.0).all()
 
 
+@pytest.mark.parametrize(
+    "wrong", [["0.5", "0"], np.array([1j, 0]), [b"1", b"0"], [10**400, 0], [[0.0], 0.0], {0.0, 1.0}]
+)
+def test_actions_that_are_no_numbers_are_refused(wrist, wrong):
+    env = ArmscanEnv([wrist], projection="zy")
+    env.reset(seed=0)
+    with pytest.raises(InvalidValueError, match="action is"):
+        env.step(wrong)
+
+
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
 def test_actions_that_are_not_finite_are_refused_and_others_clipped(wrist, wrong):
     env = ArmscanEnv([wrist], projection="zy")
