@@ -70,15 +70,32 @@ def check_numbers(name: str, value: Any, length: int, meaning: str) -> tuple[flo
     if type(value) is tuple and [type(number) for number in value] == [float] * length and math.isfinite(sum(value)):
         # What every step of an environment gives; the checks below cost more than the rest of its plane.
         return value
-    is_sequence = isinstance(value, list | tuple | np.ndarray)
+    is_sequence = isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
     if not is_sequence or len(value) != length or not all(map(_is_finite, value)):
         raise InvalidValueError(f"{name} is {value!r}, but it must be {length} finite numbers, {meaning}")
     return tuple(float(number) for number in value)
 
 
+def check_ints(name: str, value: Any, length: int | None, meaning: str, **bounds: int) -> tuple[int, ...]:
+    """Returns `value` as a tuple of `length` whole numbers, of any number of them where it is None.
+
+    Args:
+        name: of the argument.
+        value: a sequence; text and bytes are none.
+        length: how many.
+        meaning: says of what: '(across, depth)'.
+        **bounds: of each, as in `check_int`.
+    """
+    is_sequence = isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray | memoryview)
+    if not is_sequence or (length is not None and len(value) != length):
+        wanted = "a list of" if length is None else str(length)
+        raise InvalidValueError(f"{name} is {value!r}, but it must be {wanted} whole numbers{meaning and ' '}{meaning}")
+    return tuple(check_int(f"each of {name}", number, **bounds) for number in value)
+
+
 def check_path(name: str, value: Any) -> Path:
     """Returns `value` as a path if it is a text or a path."""
-    if not isinstance(value, str | Path):
+    if not isinstance(value, str | Path) or "\0" in str(value):
         raise InvalidValueError(f"{name} is {value!r}, but it must be the path of a file or folder")
     return Path(value)
 

@@ -10,7 +10,7 @@ from tianshou.highlevel.module.actor import ActorFactory, ActorFactoryDefault, C
 from tianshou.highlevel.module.critic import CriticFactory, CriticFactoryDefault
 from torch import nn
 
-from armscan.checks import check_choice, check_int
+from armscan.checks import check_choice, check_ints
 from armscan.errors import InvalidValueError
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "gelu": nn.GELU}
@@ -41,11 +41,7 @@ class MLP:
     """
 
     def __init__(self, hidden_sizes: Sequence[int] = (64, 64), activation: str = "relu") -> None:
-        if isinstance(hidden_sizes, str) or not isinstance(hidden_sizes, Sequence):
-            raise InvalidValueError(f"hidden_sizes is {hidden_sizes!r}, but it must be a list of whole numbers")
-        self.hidden_sizes = [
-            check_int("each of hidden_sizes", size, at_least=1, at_most=65536) for size in hidden_sizes
-        ]
+        self.hidden_sizes = list(check_ints("hidden_sizes", hidden_sizes, None, "", at_least=1, at_most=65536))
         self.activation = ACTIVATIONS[check_choice("activation", activation, list(ACTIVATIONS))]
 
     def check(self, observation_space: spaces.Space[Any]) -> None:

@@ -62,6 +62,9 @@ class SAC:
     """Gradient steps for each environment step; they are what training costs."""
 
     def __post_init__(self) -> None:
+        is_network = all(callable(getattr(self.network, name, None)) for name in ("actor_factory", "critic_factory"))
+        if isinstance(self.network, type) or not is_network:
+            raise InvalidValueError(f"agent.network is {self.network!r}, but it must have the methods of Network")
         for name in ("lr", "entropy_lr"):
             check_float(f"agent.{name}", getattr(self, name), above=0.0, at_most=1.0)
         for name in ("initial_entropy_coefficient", "updates_per_env_step"):
@@ -124,4 +127,4 @@ class SAC:
 
     def _rounded_up(self, n_env_steps: int) -> int:
         """The next multiple of the number of environments, which Tianshou takes in any case."""
-        return math.ceil(n_env_steps / self.num_envs) * self.num_envs
+        return -(-n_env_steps // self.num_envs) * self.num_envs

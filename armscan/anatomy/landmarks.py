@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.anatomy.clustering import cluster_label
-from armscan.anatomy.tissues import ARTERY, BONES, TENDONS, USUAL_PIXEL_MM, Tissue
+from armscan.anatomy.tissues import ARTERY, BONES, TENDONS, USUAL_PIXEL_MM, Tissue, checked_tissue
 from armscan.errors import InvalidValueError
 
 Landmarks = NDArray[np.float64]
@@ -48,8 +48,13 @@ class Clusters:
     def of_tissue(
         cls, slice_xz: NDArray[np.uint8], tissue: Tissue, pixel_mm: tuple[float, float] = USUAL_PIXEL_MM
     ) -> Self:
-        """Clusters the pixels of one tissue."""
-        return cls(*cluster_label(slice_xz, tissue.label, *tissue.neighbourhood(pixel_mm)))
+        """Clusters the pixels of one tissue.
+
+        Raises:
+            InvalidValueError: if the slice is not a 2-D array of integers, or the tissue is none.
+        """
+        neighbourhood = checked_tissue("tissue", tissue).neighbourhood(pixel_mm)
+        return cls(*cluster_label(_checked_slice(slice_xz), tissue.label, *neighbourhood))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +87,7 @@ class TissueClusters:
         Raises:
             InvalidValueError: if the slice is not a 2-D array of integers.
         """
-        slice_xz = np.asarray(slice_xz)
-        if slice_xz.ndim != 2 or not np.issubdtype(slice_xz.dtype, np.integer):
-            raise InvalidValueError(
-                f"the slice is an array of shape {slice_xz.shape} and type {slice_xz.dtype}, "
-                "but it must be 2-D (across, depth) and hold integer labels"
-            )
+        slice_xz = _checked_slice(slice_xz)
         return cls(*(Clusters.of_tissue(slice_xz, tissue, pixel_mm) for tissue in (bones, tendons, artery)))
 
     def each(self) -> tuple[Clusters, Clusters, Clusters]:
@@ -103,3 +103,16 @@ class TissueClusters:
     def landmarks(self) -> Landmarks:
         """The summary that rewards are computed from, shape (3, 4)."""
         return np.array([[len(tissue), tissue.n_points, *tissue.mean_centre] for tissue in self.each()])
+
+
+def _checked_slice(slice_xz: Any) -> NDArray[Any]:
+    try:
+        checked = np.asarray(slice_xz)
+    except (TypeError, ValueError) as error:
+        raise InvalidValueError(f"the slice is {slice_xz!r}, but it must be an array ({error})") from error
+    if checked.ndim != 2 or checked.dtype.kind not in "iu":
+        raise InvalidValueError(
+            f"the slice is an array of shape {checked.shape} and type {checked.dtype}, "
+            "but it must be 2-D (across, depth) and hold integer labels"
+        )
+    return checked

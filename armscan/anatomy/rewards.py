@@ -10,7 +10,7 @@ import numpy as np
 
 from armscan.anatomy.landmarks import Landmarks, TissueClusters
 from armscan.anatomy.tissues import USUAL_PIXEL_MM
-from armscan.checks import check_float, check_int
+from armscan.checks import check_float, check_ints
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.volumes.volume import LabelVolume
 
@@ -43,7 +43,7 @@ class LandmarkReward:
             other published description.
 
     Raises:
-        InvalidValueError: if `targets` is not three whole numbers of at least 1.
+        InvalidValueError: if `targets` is not three whole numbers from 1 to 1000.
     """
 
     def __init__(self, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
@@ -94,10 +94,12 @@ class AgreementReward:
         slack_mm: float = 0.5,
     ) -> None:
         self.published = LandmarkReward(targets)
-        self.area_tolerance = check_float("area_tolerance", area_tolerance, above=0.0)
-        self.distance_tolerance_mm = check_float("distance_tolerance_mm", distance_tolerance_mm, above=0.0)
+        self.area_tolerance = check_float("area_tolerance", area_tolerance, at_least=0.001, at_most=1000.0)
+        self.distance_tolerance_mm = check_float(
+            "distance_tolerance_mm", distance_tolerance_mm, at_least=0.001, at_most=1000.0
+        )
         self.slack = check_float("slack", slack, at_least=0.0, at_most=1.0)
-        self.slack_mm = check_float("slack_mm", slack_mm, at_least=0.0)
+        self.slack_mm = check_float("slack_mm", slack_mm, at_least=0.0, at_most=1000.0)
         self._ranges: list[Range] | None = None
 
     def fitted_to(self, volumes: Iterable[LabelVolume]) -> Self:
@@ -108,6 +110,10 @@ class AgreementReward:
         """
         if self._ranges is not None:
             return self
+        try:
+            volumes = list(volumes)
+        except TypeError as error:
+            raise InvalidValueError(f"volumes is {volumes!r}, but it must be a list of LabelVolumes") from error
         features = np.array([self._labelled_features(volume) for volume in volumes])
         if not len(features):
             raise InvalidValueError("volumes is empty, but a reward is fitted to at least one")
@@ -144,6 +150,8 @@ class AgreementReward:
 
     @staticmethod
     def _labelled_features(volume: LabelVolume) -> list[float]:
+        if not isinstance(volume, LabelVolume):
+            raise InvalidValueError(f"volumes holds {volume!r}, but each must be a LabelVolume")
         if volume.optimal_action is None:
             raise OptimalPlaneError(f"{volume.name}: has no labelled optimal plane, which the reward is fitted to")
         clusters = TissueClusters.from_slice(volume.slice(volume.optimal_action), pixel_mm=volume.pixel_mm)
@@ -193,14 +201,14 @@ def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED
         targets: how many clusters of bones, tendons and artery the wanted plane shows.
 
     Raises:
-        InvalidValueError: if `targets` is not three whole numbers of at least 1.
+        InvalidValueError: if `targets` is not three whole numbers from 1 to 1000, or `clusters` none.
     """
+    if not isinstance(clusters, TissueClusters):
+        raise InvalidValueError(f"clusters is {clusters!r}, but it must be a TissueClusters")
     return LandmarkReward(targets).score(clusters.landmarks, USUAL_PIXEL_MM)
 
 
 def checked_targets(targets: Sequence[int]) -> tuple[int, int, int]:
-    """Returns the targets as a tuple of three ints, each at least 1."""
-    if isinstance(targets, str) or not isinstance(targets, Sequence) or len(targets) != 3:
-        raise InvalidValueError(f"targets is {targets!r}, but it must be 3 whole numbers (bones, tendons, artery)")
-    bones, tendons, artery = (check_int("each of targets", target, at_least=1) for target in targets)
+    """Returns the targets as a tuple of three ints, each from 1 to 1000."""
+    bones, tendons, artery = check_ints("targets", targets, 3, "(bones, tendons, artery)", at_least=1, at_most=1000)
     return bones, tendons, artery

@@ -11,6 +11,9 @@ from armscan.checks import check_float, check_int, check_numbers
 from armscan.errors import InvalidValueError
 
 USUAL_PIXEL_MM = (0.27, 0.55)
+LARGEST_EPS_PX = 1000.0
+# More than a disc of the largest radius has pixels.
+MOST_SAMPLES = 10_000_000
 
 
 class Neighbourhood(NamedTuple):
@@ -47,8 +50,8 @@ class PixelTissue:
 
     def __post_init__(self) -> None:
         check_int("label", self.label, at_least=0, at_most=255)
-        check_float(f"eps_px of label {self.label}", self.eps_px, above=0.0, at_most=1000.0)
-        check_int(f"min_samples of label {self.label}", self.min_samples, at_least=1)
+        check_float(f"eps_px of label {self.label}", self.eps_px, above=0.0, at_most=LARGEST_EPS_PX)
+        check_int(f"min_samples of label {self.label}", self.min_samples, at_least=1, at_most=MOST_SAMPLES)
 
     def neighbourhood(self, pixel_mm: tuple[float, float]) -> Neighbourhood:
         """See `Tissue.neighbourhood`."""
@@ -80,6 +83,11 @@ class MetricTissue:
         across_mm, depth_mm = check_numbers("pixel_mm", pixel_mm, 2, "(across, depth) in mm")
         if min(across_mm, depth_mm) <= 0:
             raise InvalidValueError(f"pixel_mm is {pixel_mm!r}, but both must be above 0")
+        if self.eps_mm > LARGEST_EPS_PX * min(across_mm, depth_mm):
+            raise InvalidValueError(
+                f"eps_mm of label {self.label} is {self.eps_mm:g}, but with pixels of {across_mm:g} x {depth_mm:g} mm "
+                f"it must be at most {LARGEST_EPS_PX * min(across_mm, depth_mm):g}, {LARGEST_EPS_PX:g} pixels"
+            )
         half_widths = disc_half_widths(float(self.eps_mm), across_mm, depth_mm)
         return Neighbourhood(half_widths, math.ceil(self.density * count_disc_pixels(half_widths)))
 
@@ -119,4 +127,14 @@ def checked_tissues(clustering: str | Tissues) -> Tissues:
         raise InvalidValueError(
             f"clustering is {clustering!r}, but it must be {' or '.join(CLUSTERINGS)}, or an armscan.anatomy.Tissues"
         )
+    for name, tissue in clustering._asdict().items():
+        checked_tissue(name, tissue)
     return clustering
+
+
+def checked_tissue(name: str, tissue: Tissue) -> Tissue:
+    """Returns `tissue` if it has what `Tissue` has."""
+    has_parts = hasattr(tissue, "label") and callable(getattr(tissue, "neighbourhood", None))
+    if isinstance(tissue, type) or not has_parts:
+        raise InvalidValueError(f"{name} is {tissue!r}, but it must be a PixelTissue, a MetricTissue or the like")
+    return tissue

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.checks import check_float
+from armscan.checks import check_float, check_numbers
 from armscan.errors import InvalidValueError, listed
 from armscan.volumes.plane import FloatArray, ManipulatorAction
 
@@ -21,6 +21,9 @@ PROJECTIONS: dict[str, tuple[str, ...]] = {
 }
 
 
+MAX_TRANSLATION_MM = 1e6
+
+
 @dataclass(frozen=True)
 class ActionBounds:
     """What the normalised vector (rz, rx, tx, ty) in [-1, 1]^4 stands for.
@@ -29,17 +32,19 @@ class ActionBounds:
 
     Args:
         rotation_deg: bounds of rz and rx, each in [0, 180].
-        translation_mm: bounds of tx and ty, each at least 0.
+        translation_mm: bounds of tx and ty, each in [0, 1e6].
     """
 
     rotation_deg: tuple[float, float]
     translation_mm: tuple[float, float]
 
     def __post_init__(self) -> None:
-        for name, bound in zip(("rz", "rx"), self.rotation_deg, strict=True):
+        rotation_deg = check_numbers("rotation bounds", self.rotation_deg, 2, "for rz and rx")
+        translation_mm = check_numbers("translation bounds", self.translation_mm, 2, "for tx and ty")
+        for name, bound in zip(("rz", "rx"), rotation_deg, strict=True):
             check_float(f"rotation bound of {name} in degrees", bound, at_least=0.0, at_most=180.0)
-        for name, bound in zip(("tx", "ty"), self.translation_mm, strict=True):
-            check_float(f"translation bound of {name} in mm", bound, at_least=0.0)
+        for name, bound in zip(("tx", "ty"), translation_mm, strict=True):
+            check_float(f"translation bound of {name} in mm", bound, at_least=0.0, at_most=MAX_TRANSLATION_MM)
 
     def denormalised(self, normalised: Sequence[float]) -> ManipulatorAction:
         """Returns the plane of a normalised vector (rz, rx, tx, ty)."""

@@ -118,8 +118,8 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
         InvalidValueError: if the shape is another, or a value is not finite.
     """
     try:
-        # A copy: what the caller does with the array afterwards must not change what was done.
-        received = np.array(actions, dtype=np.float64)
+        # A copy: what the caller does with the array afterwards must not change what was done. Text is no number.
+        received = np.asarray(actions).astype(np.float64, casting="same_kind")
         if received.shape == shape and (np.abs(received) <= 1.0).all():
             return received
     except (TypeError, ValueError):

@@ -46,6 +46,22 @@ def observation_of(parts: Parts) -> NDArray[Any] | Parts:
     return parts.get(FLAT, parts)
 
 
+def checked_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozenset[str]:
+    """Returns the names of the parts that are not stacked.
+
+    Raises:
+        InvalidValueError: if it is no collection of names, or one is not among those of `boxes`.
+    """
+    named = [name for name in boxes if name != FLAT]
+    is_collection = isinstance(excluded, list | tuple | set | frozenset)
+    if not is_collection or not all(isinstance(name, str) and name in named for name in excluded):
+        raise InvalidValueError(
+            f"stack_exclude is {excluded!r}, but it must be a list of "
+            f"{listed(named) if named else 'nothing, because the observation is one vector'}"
+        )
+    return frozenset(excluded)
+
+
 class FrameHistory:
     """The last observations of a batch of environments, from the oldest to the latest.
 
@@ -60,14 +76,8 @@ class FrameHistory:
     """
 
     def __init__(self, boxes: Mapping[str, spaces.Box], size: int, excluded: Collection[str], n_envs: int) -> None:
-        named = [name for name in boxes if name != FLAT]
-        if isinstance(excluded, str) or not set(excluded) <= set(named):
-            raise InvalidValueError(
-                f"stack_exclude is {excluded!r}, but it must be a list of "
-                f"{listed(named) if named else 'nothing, because the observation is one vector'}"
-            )
         self._size = size
-        self._excluded = frozenset(excluded)
+        self._excluded = checked_exclusions(excluded, boxes)
         # Every frame is written twice, `size` apart, so that the last ones always lie in one piece.
         self._frames = {
             name: np.empty((2 * size, n_envs, *box.shape), dtype=box.dtype)

@@ -10,10 +10,11 @@ from gymnasium.vector import VectorEnv
 from armscan.anatomy import PUBLISHED_TARGETS
 from armscan.checks import check_bool, check_int
 from armscan.envs.env import ArmscanEnv
+from armscan.envs.history import boxes_of, checked_exclusions
 from armscan.envs.task import Volumes, checked_reward
 from armscan.envs.vector_env import ArmscanVectorEnv
 from armscan.envs.vector_wrappers import VectorBestActionMemory, VectorFrameStack
-from armscan.envs.wrappers import BestActionMemory, Env, FrameStack
+from armscan.envs.wrappers import MOST_KEPT, BestActionMemory, Env, FrameStack
 from armscan.volumes import LabelVolume
 
 
@@ -60,9 +61,12 @@ def make_armscan_env(
         stack_memory: whether the memory is stacked with the rest; otherwise it is added after the stack.
         **kwargs: the other arguments of `ArmscanEnv`.
     """
+    order = _wrapper_order(stack, memory, stack_memory)
     env: Env = ArmscanEnv(volumes, **kwargs)
-    for wrapper in _wrapper_order(stack, memory, stack_memory):
+    for wrapper in order:
         env = FrameStack(env, stack, exclude=stack_exclude) if wrapper == "stack" else BestActionMemory(env, memory)
+    if "stack" not in order:
+        checked_exclusions(stack_exclude, boxes_of(env.observation_space, "FrameStack"))
     return env
 
 
@@ -87,20 +91,23 @@ def make_armscan_vector_env(
         stack_memory: likewise.
         **kwargs: the other arguments of `ArmscanVectorEnv`.
     """
+    order = _wrapper_order(stack, memory, stack_memory)
     env: VectorEnv[Any, Any, Any] = ArmscanVectorEnv(num_envs, volumes, **kwargs)
-    for wrapper in _wrapper_order(stack, memory, stack_memory):
+    for wrapper in order:
         if wrapper == "stack":
             env = VectorFrameStack(env, stack, exclude=stack_exclude)
         else:
             env = VectorBestActionMemory(env, memory)
+    if "stack" not in order:
+        checked_exclusions(stack_exclude, boxes_of(env.single_observation_space, "VectorFrameStack"))
     return env
 
 
 def _wrapper_order(stack: int, memory: int, stack_memory: bool) -> list[str]:
     """Returns which wrappers are put around an environment, the innermost first: `stack`, `memory`."""
     wanted = {
-        "stack": check_int("stack", stack, at_least=1) > 1,
-        "memory": check_int("memory", memory, at_least=0) > 0,
+        "stack": check_int("stack", stack, at_least=1, at_most=MOST_KEPT) > 1,
+        "memory": check_int("memory", memory, at_least=0, at_most=MOST_KEPT) > 0,
     }
     order = ("memory", "stack") if check_bool("stack_memory", stack_memory) else ("stack", "memory")
     return [name for name in order if wanted[name]]

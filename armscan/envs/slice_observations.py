@@ -10,13 +10,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from armscan.checks import check_int
+from armscan.checks import check_ints
 from armscan.envs.observations import SliceGeometry, View, smallest_shape
 from armscan.envs.spaces import Parts
 from armscan.errors import InvalidValueError
 from armscan.volumes.volume import LABEL_NAMES, LANDMARK_LABELS
 
 Shape = tuple[int, int]
+LONGEST_SIDE_PX = 4096
 # Which label a reduced pixel shows when several meet in it: the one that is rarer, and so would get lost, first.
 RANKS = np.array([0, 1, 2, 4, 3], dtype=np.uint8)
 LABEL_OF_RANK = np.argsort(RANKS).astype(np.uint8)
@@ -34,7 +35,7 @@ class SliceFrame:
         shape: (across, depth) of what is observed; None to leave what was cropped as it is.
 
     Raises:
-        InvalidValueError: if a shape is not two whole numbers of at least 1.
+        InvalidValueError: if a shape is not two whole numbers from 1 to 4096.
     """
 
     def __init__(self, crop: Sequence[int] | None, shape: Sequence[int] | None) -> None:
@@ -133,7 +134,5 @@ class SliceChannelsObservation:
 
 
 def _checked_shape(name: str, shape: Any) -> Shape:
-    if isinstance(shape, str) or not isinstance(shape, Sequence) or len(shape) != 2:
-        raise InvalidValueError(f"{name} is {shape!r}, but it must be 2 whole numbers (across, depth)")
-    across, depth = (check_int(f"each of {name}", n_pixels, at_least=1, at_most=65536) for n_pixels in shape)
+    across, depth = check_ints(name, shape, 2, "(across, depth)", at_least=1, at_most=LONGEST_SIDE_PX)
     return across, depth

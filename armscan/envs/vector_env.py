@@ -18,6 +18,7 @@ from armscan.envs.task import Observed, Task, Volumes
 from armscan.errors import InvalidValueError, ResetNeededError
 from armscan.volumes.plane import FloatArray
 
+MOST_ENVS = 65536
 VectorStep = tuple[Observed, FloatArray, Mask, Mask, dict[str, Any]]
 
 
@@ -50,7 +51,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         render_mode: None = None,
         **rules: Any,
     ) -> None:
-        self.num_envs = check_int("num_envs", num_envs, at_least=1)
+        self.num_envs = check_int("num_envs", num_envs, at_least=1, at_most=MOST_ENVS)
         if render_mode is not None:
             raise InvalidValueError(f"render_mode is {render_mode!r}, but many environments are not drawn: use one")
         self._autoreset_mode = _checked_mode(autoreset_mode)
@@ -161,7 +162,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
 
 def _checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
     allowed = (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
-    found = [known for known in allowed if mode in (known, known.value)]
+    found = [known for known in allowed if isinstance(mode, str | AutoresetMode) and mode in (known, known.value)]
     if not found:
         raise InvalidValueError(
             f"autoreset_mode is {mode!r}, but it must be {' or '.join(known.value for known in allowed)}"

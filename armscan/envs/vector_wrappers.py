@@ -13,14 +13,14 @@ from armscan.checks import check_int
 from armscan.envs.history import BestPairs, FrameHistory, Mask, boxes_of, observation_of, parts_of, space_of
 from armscan.envs.task import Observed
 from armscan.envs.vector_env import VectorStep
-from armscan.envs.wrappers import with_memory, with_memory_box
+from armscan.envs.wrappers import MOST_KEPT, checked_env, with_memory, with_memory_box
 
 
 class _VectorRemembering(VectorWrapper):
     """A wrapper whose observations depend on those before them in the episodes."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
-        super().__init__(env)
+        super().__init__(checked_env(env, VectorEnv))
         self._has_ended = np.zeros(env.num_envs, dtype=np.bool_)
 
     def reset(
@@ -64,7 +64,9 @@ class VectorFrameStack(_VectorRemembering):
     def __init__(self, env: VectorEnv[Any, Any, Any], stack: int, *, exclude: Collection[str] = ()) -> None:
         super().__init__(env)
         boxes = boxes_of(env.single_observation_space, "VectorFrameStack")
-        self._history = FrameHistory(boxes, check_int("stack", stack, at_least=1), exclude, env.num_envs)
+        self._history = FrameHistory(
+            boxes, check_int("stack", stack, at_least=1, at_most=MOST_KEPT), exclude, env.num_envs
+        )
         self.single_observation_space = space_of(self._history.boxes)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
@@ -89,7 +91,7 @@ class VectorBestActionMemory(_VectorRemembering):
     def __init__(self, env: VectorEnv[Any, Any, Any], memory: int) -> None:
         super().__init__(env)
         n_free = int(np.prod(env.single_action_space.shape or ()))
-        self._best = BestPairs(check_int("memory", memory, at_least=1), n_free, env.num_envs)
+        self._best = BestPairs(check_int("memory", memory, at_least=1, at_most=MOST_KEPT), n_free, env.num_envs)
         boxes = boxes_of(env.single_observation_space, "VectorBestActionMemory")
         self.single_observation_space = space_of(with_memory_box(boxes, self._best))
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)

@@ -34,6 +34,17 @@ MEMORY = "memory"
 ALL = np.array([True])
 
 
+# Observations of a stack, and pairs of a memory.
+MOST_KEPT = 1000
+
+
+def checked_env(env: Any, kind: type[Any]) -> Any:
+    """Returns `env` if it is an environment of the given kind."""
+    if not isinstance(env, kind):
+        raise InvalidValueError(f"env is {env!r}, but it must be a gymnasium {kind.__name__}")
+    return env
+
+
 class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs):
     """A wrapper whose observation depends on those before it in the episode."""
 
@@ -64,14 +75,15 @@ class FrameStack(_Remembering):
         exclude: parts of a `Dict` observation that are not stacked.
 
     Raises:
-        InvalidValueError: if `stack` is not a whole number of at least 1, or a part to leave out does not exist.
+        InvalidValueError: if `stack` is not a whole number from 1 to 1000, or a part to leave out does not exist.
     """
 
     def __init__(self, env: Env, stack: int, *, exclude: Collection[str] = ()) -> None:
+        boxes = boxes_of(checked_env(env, gym.Env).observation_space, "FrameStack")
+        size = check_int("stack", stack, at_least=1, at_most=MOST_KEPT)
+        self._history = FrameHistory(boxes, size, exclude, 1)
         RecordConstructorArgs.__init__(self, stack=stack, exclude=exclude)
         gym.Wrapper.__init__(self, env)
-        size = check_int("stack", stack, at_least=1)
-        self._history = FrameHistory(boxes_of(env.observation_space, "FrameStack"), size, exclude, 1)
         self.observation_space = space_of(self._history.boxes)
 
     def _remembering(self, observation: Observed, info: dict[str, Any], *, is_first: bool) -> Observed:
@@ -94,17 +106,16 @@ class BestActionMemory(_Remembering):
         memory: how many pairs.
 
     Raises:
-        InvalidValueError: if `memory` is not a whole number of at least 1, or the observation has a part of that name.
+        InvalidValueError: if `memory` is not a whole number from 1 to 1000, or the observation has a part of that name.
     """
 
     def __init__(self, env: Env, memory: int) -> None:
+        n_free = int(np.prod(checked_env(env, gym.Env).action_space.shape or ()))
+        self._best = BestPairs(check_int("memory", memory, at_least=1, at_most=MOST_KEPT), n_free, 1)
+        boxes = with_memory_box(boxes_of(env.observation_space, "BestActionMemory"), self._best)
         RecordConstructorArgs.__init__(self, memory=memory)
         gym.Wrapper.__init__(self, env)
-        n_free = int(np.prod(env.action_space.shape or ()))
-        self._best = BestPairs(check_int("memory", memory, at_least=1), n_free, 1)
-        self.observation_space = space_of(
-            with_memory_box(boxes_of(env.observation_space, "BestActionMemory"), self._best)
-        )
+        self.observation_space = space_of(boxes)
 
     def _remembering(self, observation: Observed, info: dict[str, Any], *, is_first: bool) -> Observed:
         actions, rewards = info["action"][None], np.array([info["reward"]])

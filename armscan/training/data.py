@@ -9,7 +9,7 @@ from itertools import islice
 
 import numpy as np
 
-from armscan.checks import check_float, check_int, check_path, check_seed
+from armscan.checks import LARGEST_SEED, check_float, check_int, check_path, check_seed
 from armscan.errors import InvalidValueError, listed
 from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
@@ -71,7 +71,7 @@ def phantom_data(
     """
     check_int("data.n_training", n_training, at_least=1)
     check_int("data.n_validation", n_validation, at_least=1, at_most=TEST_FIRST_SEED - VALIDATION_FIRST_SEED)
-    check_int("data.n_test", n_test, at_least=1)
+    check_int("data.n_test", n_test, at_least=1, at_most=LARGEST_SEED + 1 - TEST_FIRST_SEED)
     check_int("data.first_seed", first_seed, at_least=0)
     if first_seed + n_training > VALIDATION_FIRST_SEED:
         raise InvalidValueError(

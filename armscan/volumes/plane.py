@@ -15,6 +15,7 @@ from armscan.checks import check_numbers
 from armscan.errors import InvalidValueError
 
 FloatArray = NDArray[np.float64]
+LARGEST_SHIFT_MM = 1e6
 
 
 @numba.njit(cache=True)
@@ -103,7 +104,7 @@ class RigidTransform:
         centre_mm: c, the point that the rotation leaves in place.
 
     Raises:
-        InvalidValueError: if a component is not a finite number.
+        InvalidValueError: if a component is not a finite number, or one in mm is beyond 1e6.
     """
 
     rotation: tuple[float, float] = (0.0, 0.0)
@@ -112,8 +113,14 @@ class RigidTransform:
 
     def __post_init__(self) -> None:
         check_numbers("rotation", self.rotation, 2, "(rz, rx) in degrees")
-        check_numbers("translation", self.translation, 2, "(tx, ty) in mm")
-        check_numbers("centre_mm", self.centre_mm, 3, "(x, y, z) in mm")
+        shift_mm = check_numbers("translation", self.translation, 2, "(tx, ty) in mm")
+        centre_mm = check_numbers("centre_mm", self.centre_mm, 3, "(x, y, z) in mm")
+        # The differences of numbers much larger are no numbers any more.
+        if max(map(abs, shift_mm + centre_mm)) > LARGEST_SHIFT_MM:
+            raise InvalidValueError(
+                f"translation is {shift_mm} and centre_mm is {centre_mm}, but each must be within "
+                f"+-{LARGEST_SHIFT_MM:g} mm"
+            )
 
     @cached_property
     def matrix(self) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from armscan.volumes.slicing import sample_plane
 LABEL_NAMES = {0: "background", 1: "bones", 2: "tendons", 3: "artery", 4: "nerve"}
 LANDMARK_LABELS = (1, 2, 3)
 LONGEST_SIDE_PX = 65536
+# Far beyond what any image has; the ratio of two spacings still is a number that a slice can be looked up with.
+SMALLEST_SPACING_MM, LARGEST_SPACING_MM = 1e-6, 1e6
 # Of scalar products of unit vectors; files keep them with six digits or more.
 RIGHT_ANGLE_TOLERANCE = 1e-3
 
@@ -58,6 +61,12 @@ class LabelVolume:
             raise VolumeError(
                 f"{self.name}: optimal_action is {self.optimal_action!r}, but it must be a ManipulatorAction or None"
             )
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # A copy, or one in another process, is as constant as this one: arrays forget that on their way.
+        for array in (state["labels"], state["direction"]):
+            array.flags.writeable = False
+        self.__dict__.update(state)
 
     def __repr__(self) -> str:
         n_x, n_y, n_z = self.shape
@@ -167,6 +176,11 @@ def _checked_spacing(spacing: tuple[float, float, float], name: str) -> tuple[fl
         raise VolumeError(f"{name}: {error}") from error
     if min(s_x, s_y, s_z) <= 0:
         raise VolumeError(f"{name}: spacing is {(s_x, s_y, s_z)}, but each must be above 0 mm")
+    if min(s_x, s_y, s_z) < SMALLEST_SPACING_MM or max(s_x, s_y, s_z) > LARGEST_SPACING_MM:
+        raise VolumeError(
+            f"{name}: spacing is {(s_x, s_y, s_z)}, but each must be from {SMALLEST_SPACING_MM:g} to "
+            f"{LARGEST_SPACING_MM:g} mm"
+        )
     return s_x, s_y, s_z
 
 

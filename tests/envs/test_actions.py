@@ -38,7 +38,7 @@ def test_zero_bounds_fix_their_components_at_zero():
 
 @pytest.mark.parametrize("rotation", [(181.0, 1.0), (-1.0, 1.0), (float("nan"), 1.0)])
 def test_bounds_refuse_impossible_rotations(rotation):
-    with pytest.raises(InvalidValueError, match="rotation bound of rz"):
+    with pytest.raises(InvalidValueError, match="rotation bound"):
         ActionBounds(rotation, (1.0, 1.0))
 
 

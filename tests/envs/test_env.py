@@ -3,44 +3,21 @@
 import json
 import subprocess
 import sys
-import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import armscan
-from armscan.anatomy import LandmarkReward, Scanner
+from armscan.anatomy import METRIC_TISSUES, AgreementReward, LandmarkReward, Scanner, TissueClusters, landmark_reward
 from armscan.envs import ArmscanEnv, ClusterObservation, ManipulatorAction, RandomTransform
-from armscan.errors import InvalidValueError, ManifestError, ResetNeededError, VolumeError
+from armscan.errors import InvalidValueError, ManifestError, OptimalPlaneError, ResetNeededError, VolumeError
 from armscan.volumes import LabelVolume
-
-OBSERVATIONS = ["action_reward", "cluster"]
-PROJECTIONS = ["x", "y", "xy", "zy", "full", ["rz", "tx"]]
 
 
 @pytest.fixture
 def env(phantom):
     return ArmscanEnv([phantom])
-
-
-@pytest.mark.parametrize("projection", PROJECTIONS, ids=str)
-@pytest.mark.parametrize("observation", OBSERVATIONS)
-@pytest.mark.parametrize("wrappers", [{}, {"stack": 3}, {"memory": 2}, {"stack": 2, "memory": 3}], ids=str)
-def test_env_passes_the_checker_without_a_warning(phantom, observation, projection, wrappers):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        arguments = {"volumes": [phantom], "observation": observation, "projection": projection}
-        env = gym.make(armscan.ENV_ID, **arguments, **wrappers)
-        check_env(env.unwrapped, skip_render_check=True)
-        # The checker insists on the bare environment; the passive one inside `make` watches the wrapped one.
-        env.reset(seed=0)
-        for _ in range(3):
-            observed, _, terminated, _, _ = env.step(env.action_space.sample())
-            assert env.observation_space.contains(observed)
-            if terminated:
-                env.reset()
 
 
 def test_make_without_arguments_gives_phantoms():
@@ -268,3 +245,70 @@ def test_env_takes_volumes_of_different_spacing_by_metric_clustering(dataset):
         seen.append(observed[:12].reshape(3, 4))
     np.testing.assert_array_equal(seen[0][:, 0], seen[1][:, 0])
     np.testing.assert_allclose(seen[0], seen[1], atol=0.12)
+
+
+class ArteryOnly:
+    """A user's own reward: 0 where exactly one artery is seen."""
+
+    def fitted_to(self, volumes):
+        return self
+
+    def score(self, landmarks, pixel_mm):
+        return 0.0 if landmarks[2, 0] == 1 else -1.0
+
+
+def agreement(volume):
+    return AgreementReward().fitted_to([volume])
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (AgreementReward(), agreement),
+        (LandmarkReward((5, 3, 1)), lambda _: LandmarkReward((5, 3, 1))),
+        (LandmarkReward(), lambda _: LandmarkReward()),
+        (ArteryOnly(), lambda _: ArteryOnly()),
+    ],
+    ids=["agreement", "other_targets", "published", "own"],
+)
+def test_env_takes_rewards_as_objects(wrist, given, expected):
+    env = ArmscanEnv([wrist], reward=given, projection="full", max_steps=20)
+    expected = expected(wrist)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    rewards, terminated = [], False
+    while not terminated and len(rewards) < 12:
+        _, reward, terminated, _, info = env.step(env.action_space.sample())
+        rewards.append(reward)
+        assert reward == info["reward"] == expected.score(env.episode.view.landmarks, wrist.pixel_mm)
+        assert terminated == (reward > -0.05)
+    env.reset(seed=0)
+    assert env.step(env.scene.optimum_normalised)[2]
+
+
+def test_env_fits_a_reward_to_its_volumes_and_leaves_the_one_given_as_it_is(wrist):
+    given = AgreementReward()
+    fitted = ArmscanEnv([wrist], reward=given).task.reward
+    assert isinstance(fitted, AgreementReward)
+    with pytest.raises(InvalidValueError, match="fitted_to"):
+        given.score(np.zeros((3, 4)), wrist.pixel_mm)
+    assert ArmscanEnv([wrist], reward=fitted).task.reward is fitted
+
+
+def test_env_refuses_volumes_that_do_not_show_the_other_published_targets(wrist):
+    with pytest.raises(OptimalPlaneError, match=r"wrist: the labelled optimal plane scores -0\.\d+"):
+        ArmscanEnv([wrist], targets=(7, 5, 1))
+    assert ArmscanEnv([wrist], targets=(7, 5, 1), delta=0.2).reset(seed=0)
+
+
+@pytest.mark.parametrize("clustering", ["metric", METRIC_TISSUES], ids=["name", "tissues"])
+def test_env_clusters_by_millimetres(wrist, clustering):
+    env = ArmscanEnv([wrist], clustering=clustering, projection="full")
+    env.reset(seed=0)
+    info = env.step(env.scene.optimum_normalised)[4]
+    view = env.episode.view
+    metric = TissueClusters.from_slice(env.slice_xz, **METRIC_TISSUES._asdict(), pixel_mm=wrist.pixel_mm)
+    np.testing.assert_array_equal(view.landmarks, metric.landmarks)
+    assert (view.landmarks != TissueClusters.from_slice(env.slice_xz).landmarks).any()
+    assert view.clusters.counts == metric.counts == tuple(info["counts"])
+    assert info["reward"] == landmark_reward(metric) > -0.05

@@ -1,10 +1,19 @@
 """What the agent gets to see."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from armscan.anatomy import PIXEL_TISSUES
-from armscan.envs import ActionRewardObservation, ClusterObservation, MergedObservation, SliceGeometry, View
+from armscan.envs import (
+    ActionRewardObservation,
+    ArmscanEnv,
+    ClusterObservation,
+    MergedObservation,
+    SliceGeometry,
+    SliceObservation,
+    View,
+)
 from armscan.envs.observations import with_action_reward
 from armscan.envs.spaces import flat_space, flattened
 from armscan.errors import InvalidValueError
@@ -90,3 +99,56 @@ def test_with_action_reward_names_what_there_is():
         match="observation is 'slices', but it must be action_reward, cluster, slice or slice_channels",
     ):
         with_action_reward("slices")
+
+
+@pytest.mark.parametrize(
+    "observation",
+    [
+        ["cluster", "slice"],
+        ("cluster", SliceObservation()),
+        MergedObservation(["cluster", "slice"]),
+        MergedObservation([ClusterObservation(), MergedObservation([SliceObservation()])]),
+        ["cluster", "slice", "action_reward"],
+    ],
+    ids=["names", "tuple", "object", "nested", "with_action_reward"],
+)
+def test_merged_observations_come_by_name_in_a_list_or_as_objects(wrist, observation):
+    env = ArmscanEnv([wrist], observation=observation)
+    observed, info = env.reset(seed=0)
+    assert observed.keys() == {"clusters", "slice", "action", "reward"} == set(env.observation_space)
+    np.testing.assert_array_equal(observed["slice"], env.slice_xz)
+    np.testing.assert_allclose(observed["clusters"].reshape(3, 4)[:, 0] * (4, 3, 1), info["counts"], rtol=1e-6)
+    np.testing.assert_array_equal(observed["action"], info["action"])
+
+
+def test_merged_observations_become_one_vector_in_their_order(wrist):
+    parts = ArmscanEnv([wrist], observation=["slice", "cluster"])
+    flat = ArmscanEnv([wrist], observation=["slice", "cluster"], flat=True)
+    observed, _ = parts.reset(seed=0)
+    expected = [observed[name].ravel() for name in ("slice", "clusters", "action", "reward")]
+    np.testing.assert_array_equal(flat.reset(seed=0)[0], np.concatenate(expected))
+
+
+@pytest.mark.parametrize("observation", [["slice", "slice"], ["action_reward", "cluster", "cluster"]], ids=str)
+def test_env_refuses_two_parts_of_one_name(wrist, observation):
+    with pytest.raises(InvalidValueError, match="both have the key"):
+        ArmscanEnv([wrist], observation=observation)
+
+
+class DepthProfile:
+    """A user's own observation: which share of each depth is tissue."""
+
+    def spaces(self, geometries, n_free):
+        return {"profile": gym.spaces.Box(0, 1, (min(g.shape[1] for g in geometries),), np.float32)}
+
+    def observe(self, view):
+        return {"profile": (view.slice_xz > 0).mean(axis=0, dtype=np.float32)[: view.smallest_shape[1]]}
+
+
+@pytest.mark.parametrize("observation", [DepthProfile(), ["cluster", DepthProfile()]], ids=["alone", "merged"])
+def test_env_takes_a_users_own_observation(wrist, observation):
+    env = ArmscanEnv([wrist], observation=observation, flat=False)
+    observed, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observed)
+    np.testing.assert_allclose(observed["profile"], (env.slice_xz > 0).mean(axis=0), rtol=1e-6)
+    assert {"action", "reward"} < observed.keys()

@@ -6,7 +6,7 @@ import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation
 
-from armscan.envs import ArmscanEnv, BestActionMemory, FrameStack, make_armscan_env
+from armscan.envs import ArmscanEnv, BestActionMemory, FrameStack, SliceObservation, make_armscan_env
 from armscan.errors import InvalidValueError
 
 
@@ -106,3 +106,95 @@ def test_make_refuses_impossible_wrappers(phantom, arguments):
 
 def test_make_without_wrappers_gives_the_bare_environment(phantom):
     assert isinstance(make_armscan_env([phantom]), ArmscanEnv)
+
+
+def image_env(wrist, **wrappers):
+    """An environment with a Dict observation: a small image, action and reward."""
+    observation = SliceObservation(shape=(24, 20))
+    return make_armscan_env([wrist], observation=observation, projection="zy", max_steps=9, **wrappers)
+
+
+def steps(env, n_steps=4):
+    """Yields what is observed from a reset on, and `info`."""
+    env.action_space.seed(0)
+    yield env.reset(seed=1)
+    for _ in range(n_steps):
+        observed, *_, info = env.step(env.action_space.sample())
+        assert env.observation_space.contains(observed)
+        yield observed, info
+
+
+@pytest.mark.parametrize("exclude", [[], ["action"], ["reward", "slice"], ["action", "reward", "slice"]], ids=str)
+def test_stack_gives_each_part_of_a_dict_a_leading_axis_but_those_left_out(wrist, exclude):
+    stacked = image_env(wrist, stack=3, stack_exclude=exclude)
+    latest = []
+    for (bare, _), (observed, _) in zip(steps(image_env(wrist)), steps(stacked), strict=True):
+        latest = [*(latest or [bare] * 2), bare][-3:]
+        for name, part in observed.items():
+            expected = bare[name] if name in exclude else np.stack([frame[name] for frame in latest])
+            np.testing.assert_array_equal(part, expected)
+            assert part.dtype == bare[name].dtype
+
+
+def test_stack_begins_anew_with_each_episode(wrist):
+    env = image_env(wrist, stack=3)
+    list(steps(env))
+    observed, _ = env.reset(seed=2)
+    assert all((part == part[0]).all() for part in observed.values())
+
+
+@pytest.mark.parametrize(
+    ("flat", "exclude"), [(True, ["action"]), (False, ["clusters"]), (False, "action"), (False, [["action"]])]
+)
+def test_stack_refuses_to_leave_out_what_is_not_there(wrist, flat, exclude):
+    with pytest.raises(InvalidValueError, match="stack_exclude is"):
+        make_armscan_env([wrist], observation="action_reward", flat=flat, stack=2, stack_exclude=exclude)
+
+
+def test_memory_is_a_part_of_a_dict(wrist):
+    env = image_env(wrist, memory=2)
+    pairs = []
+    for (bare, _), (observed, info) in zip(steps(image_env(wrist)), steps(env), strict=True):
+        pair = np.array([*info["action"], info["reward"]], np.float32)
+        if not pairs:
+            pairs = [pair, pair]
+        elif pair[-1] > pairs[-1][-1]:
+            pairs = sorted([pairs[0], pair], key=lambda kept: -kept[-1])
+        np.testing.assert_array_equal(observed.pop("memory"), np.concatenate(pairs))
+        assert observed.keys() == bare.keys()
+        for name, part in bare.items():
+            np.testing.assert_array_equal(observed[name], part)
+
+
+@pytest.mark.parametrize("flat", [True, False], ids=["flat", "dict"])
+def test_memory_is_stacked_or_not_as_the_order_says(wrist, flat):
+    arguments = {"observation": "action_reward", "projection": "zy", "flat": flat, "stack": 3, "memory": 2}
+    after = make_armscan_env([wrist], **arguments)
+    before = make_armscan_env([wrist], **arguments, stack_memory=True)
+    alone = make_armscan_env([wrist], **arguments | {"stack": 1})
+    frames = []
+    for (a, _), (b, _), (bare, _) in zip(steps(after), steps(before), steps(alone), strict=True):
+        frames = [*(frames or [bare] * 2), bare][-3:]
+        if flat:
+            np.testing.assert_array_equal(b, np.concatenate(frames))
+            np.testing.assert_array_equal(a, np.concatenate([*(frame[:3] for frame in frames), bare[3:]]))
+        else:
+            np.testing.assert_array_equal(b["memory"], [frame["memory"] for frame in frames])
+            np.testing.assert_array_equal(a["memory"], bare["memory"])
+            np.testing.assert_array_equal(a["action"], b["action"])
+
+
+def test_memory_refuses_an_observation_that_has_one(wrist):
+    with pytest.raises(InvalidValueError, match="already has a part 'memory'"):
+        BestActionMemory(image_env(wrist, memory=1), 1)
+
+
+@pytest.mark.parametrize("wrapper", [FrameStack, BestActionMemory])
+@pytest.mark.parametrize(
+    "space", [gym.spaces.Box(0, 1, (2, 2)), gym.spaces.Discrete(3), gym.spaces.Dict({"a": gym.spaces.Discrete(3)})]
+)
+def test_wrappers_refuse_observations_that_they_cannot_hold(wrapper, space):
+    env = Scripted([])
+    env.observation_space = space
+    with pytest.raises(InvalidValueError, match=f"{wrapper.__name__} wraps observations that are vectors or a Dict"):
+        wrapper(env, 2)

@@ -63,7 +63,10 @@ def test_volume_refuses_an_optimal_plane_that_is_none():
         LabelVolume(labels_with(1, 2, 3), SPACING, "wrist", optimal_action=(0, 1))
 
 
-@pytest.mark.parametrize("spacing", [(0, 1, 1), (-1, 1, 1), (np.nan, 1, 1), (np.inf, 1, 1), (1, 1), "abc", None])
+@pytest.mark.parametrize(
+    "spacing",
+    [(1e-308, 1.0, 1.0), (1.0, 1e308, 1.0), (0, 1, 1), (-1, 1, 1), (np.nan, 1, 1), (np.inf, 1, 1), (1, 1), "abc", None],
+)
 def test_volume_refuses_impossible_spacing(spacing):
     with pytest.raises(VolumeError, match="wrist: spacing is"):
         LabelVolume(labels_with(1, 2, 3), spacing, "wrist")

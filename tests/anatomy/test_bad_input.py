@@ -1,0 +1,111 @@
+"""Wrong arguments: accepted where they are right after all, else refused by one of the project's own exceptions."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from armscan.anatomy import (
+    BONES,
+    METRIC_TISSUES,
+    AgreementReward,
+    Clusters,
+    LandmarkReward,
+    MetricTissue,
+    PixelTissue,
+    TissueClusters,
+    Tissues,
+    checked_tissues,
+    landmark_reward,
+)
+from armscan.errors import InvalidValueError
+
+from ..junk import SETTINGS, junk, refuses
+
+SLICE = np.ones((9, 7), np.uint8)
+
+
+@pytest.mark.parametrize("changed", ["label", "eps_px", "min_samples"])
+@SETTINGS
+@given(junk)
+def test_pixel_tissue_with_junk(changed, value):
+    tissue = refuses(lambda: PixelTissue(**{"label": 1, "eps_px": 2.0, "min_samples": 3} | {changed: value}))
+    if tissue is not None:
+        Clusters.of_tissue(SLICE, tissue)
+
+
+@pytest.mark.parametrize("changed", ["label", "eps_mm", "density"])
+@SETTINGS
+@given(junk)
+def test_metric_tissue_with_junk(changed, value):
+    tissue = refuses(lambda: MetricTissue(**{"label": 1, "eps_mm": 2.0, "density": 0.5} | {changed: value}))
+    if tissue is not None:
+        refuses(lambda: Clusters.of_tissue(SLICE, tissue))
+
+
+@SETTINGS
+@given(junk | st.tuples(*[st.floats(0.005, 1e308) | st.floats(0, 1e-6)] * 2))
+def test_pixel_size_of_junk(pixel_mm):
+    refuses(lambda: METRIC_TISSUES.bones.neighbourhood(pixel_mm))
+    refuses(lambda: TissueClusters.from_slice(SLICE, **METRIC_TISSUES._asdict(), pixel_mm=pixel_mm))
+
+
+@SETTINGS
+@given(junk)
+def test_clusters_of_junk(slice_xz):
+    refuses(lambda: TissueClusters.from_slice(slice_xz))
+    refuses(lambda: Clusters.of_tissue(slice_xz, BONES))
+
+
+@SETTINGS
+@given(junk)
+def test_clusters_by_junk(tissue):
+    refuses(lambda: TissueClusters.from_slice(SLICE, tendons=tissue))
+    refuses(lambda: Clusters.of_tissue(SLICE, tissue))
+    refuses(lambda: checked_tissues(tissue))
+    refuses(lambda: checked_tissues(Tissues(BONES, tissue, BONES)))
+
+
+@pytest.mark.parametrize("shape", [(0, 5), (5, 0), (0, 0), (1, 1)])
+def test_clusters_of_a_slice_without_tissue_are_none(shape):
+    clusters = TissueClusters.from_slice(np.zeros(shape, np.uint8))
+    assert clusters.counts == (0, 0, 0)
+    assert clusters.bones.image.shape == shape
+    assert landmark_reward(clusters) == -1.0
+
+
+@SETTINGS
+@given(junk)
+def test_landmark_reward_with_junk(value):
+    reward = refuses(lambda: LandmarkReward(value))
+    if reward is not None:
+        assert -1.0 <= reward.score(np.ones((3, 4)), (0.3, 0.5)) <= 0.0
+    refuses(lambda: landmark_reward(TissueClusters.from_slice(SLICE), value))
+    assert refuses(lambda: landmark_reward(value)) is None
+
+
+@pytest.mark.parametrize("changed", ["targets", "area_tolerance", "distance_tolerance_mm", "slack", "slack_mm"])
+@SETTINGS
+@given(value=junk)
+def test_agreement_reward_with_junk(phantom_reward_volumes, changed, value):
+    reward = refuses(lambda: AgreementReward(**{changed: value}))
+    if reward is not None:
+        fitted = reward.fitted_to(phantom_reward_volumes)
+        assert -1.0 <= fitted.score(np.ones((3, 4)), (0.3, 0.5)) <= 0.0
+
+
+@pytest.fixture(scope="module")
+def phantom_reward_volumes(phantom):
+    return [phantom]
+
+
+@SETTINGS
+@given(value=junk)
+def test_agreement_reward_fitted_to_junk(phantom, value):
+    assert refuses(lambda: AgreementReward().fitted_to(value)) is None
+    assert refuses(lambda: AgreementReward().fitted_to([phantom, value])) is None
+
+
+def test_landmark_reward_says_what_clusters_are():
+    with pytest.raises(InvalidValueError, match="clusters is 3, but it must be a TissueClusters"):
+        landmark_reward(3)

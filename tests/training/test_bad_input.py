@@ -1,0 +1,39 @@
+"""Wrong arguments of what a run is made from."""
+
+import pytest
+from hypothesis import given
+
+from armscan.training import Budget, SolvedCriterion, data, phantom_data
+
+from ..junk import SETTINGS, junk, refuses
+
+
+@pytest.mark.parametrize("changed", ["env_steps", "epoch_env_steps", "validation_episodes", "solved"])
+@SETTINGS
+@given(value=junk)
+def test_budget_with_junk(changed, value):
+    figures = {"env_steps": 9, "epoch_env_steps": 3, "validation_episodes": 2}
+    budget = refuses(lambda: Budget(**figures | {changed: value}))
+    assert budget is None or changed != "solved" or value is None
+
+
+@pytest.mark.parametrize("changed", ["success_rate", "mean_steps", "n_epochs"])
+@SETTINGS
+@given(value=junk)
+def test_solved_criterion_with_junk(changed, value):
+    criterion = refuses(lambda: SolvedCriterion(**{changed: value}))
+    assert criterion is None or criterion.holds([]) is False
+
+
+@pytest.mark.parametrize("changed", ["n_training", "n_validation", "n_test", "first_seed", "cache_dir"])
+@SETTINGS
+@given(value=junk)
+def test_phantom_data_with_junk(changed, value, phantom, monkeypatch):
+    """The phantoms themselves are left out: thousands of them may have been asked for."""
+
+    def load(seeds, folder):
+        assert seeds[-1] < 2**31
+        return {f"phantom-{seeds[0]}": phantom}
+
+    monkeypatch.setattr(data, "load_phantoms", load)
+    refuses(lambda: phantom_data(**{changed: value}))
