@@ -1,8 +1,13 @@
-"""What is in a folder of volumes: python -m armscan.data FOLDER."""
+"""The command `python -m armscan.data`: what is in a folder of volumes.
+
+    python -m armscan.data FOLDER
+
+reads the folder's labelmaps as its manifest says (docs/manifest.md), or as an empty manifest would, and prints for each
+which tissues it holds, what they are in the file, and what is missing or ignored.
+"""
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 
@@ -10,25 +15,22 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from armscan.errors import ArmscanError
+from armscan.errors import InvalidValueError
 from armscan.volumes import LABEL_NAMES, Dataset, open_dataset
 from armscan.volumes.labelmap import shown
 from armscan.volumes.report import VolumeReport
+from armscan.words import answered
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(words: Sequence[str] | None = None) -> int:
     """Prints what the volumes of a folder hold, read as its manifest says; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m armscan.data",
-        description="Reads a folder of labelmaps as its manifest says (docs/manifest.md) and tells what it found.",
-    )
-    parser.add_argument("folder", help="of the volumes; without a manifest it is read as if it had an empty one")
-    try:
-        dataset = open_dataset(parser.parse_args(arguments).folder, require_manifest=False)
-    except ArmscanError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print_dataset(dataset, Console())
+    return answered(_run, words, usage=__doc__ or "", left="nothing was written")
+
+
+def _run(words: Sequence[str]) -> int:
+    if len(words) != 1 or not words[0]:
+        raise InvalidValueError(f"the words are {list(words)}, but they must be one folder (--help explains)")
+    print_dataset(open_dataset(words[0], require_manifest=False), Console())
     return 0
 
 
@@ -49,7 +51,7 @@ def report_table(report: VolumeReport) -> Table:
     table = Table()
     for heading in ("tissue", "in the file (voxels)"):
         table.add_column(heading)
-    for heading in ("voxels", "mm³"):
+    for heading in ("voxels", "mm3"):
         table.add_column(heading, justify="right")
     for label, tissue in LABEL_NAMES.items():
         sources = ", ".join(f"{each.source} ({each.n_voxels})" for each in report.stored.found if each.label == label)

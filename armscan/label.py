@@ -8,7 +8,7 @@ clustering=metric   cluster what is seen by millimetres, for volumes of another 
 volumes=[A,B]       only these, by their file names
 overwrite=true      volumes that have a plane as well
 pictures=FOLDER     where pictures go, FOLDER/labelling of the data where nothing is said
-markups=true        a markups file (.mrk.json) for 3D Slicer beside each picture
+markups=true        a markups file (.mrk.json) for 3D Slicer beside each picture, and for volumes that have a plane
 markup=FILE         read the plane from this markups file ...
 volume=NAME         ... for this volume, whether it has a plane or not
 """
@@ -98,6 +98,8 @@ def print_report(request: Request, labelled: Sequence[Labelled]) -> None:
     print(
         "reject    take rotation, translation and score out of the volume's entry, or give the entry an exclude: REASON"
     )
+    if not request.markups:
+        print("          (markups=true writes the planes as files for 3D Slicer)")
     print("correct   move the plane in 3D Slicer, save it, and read it back:")
     print(f"          python -m armscan.label data={request.data} volume=NAME markup=FILE{MARKUP_SUFFIX}")
 
@@ -114,6 +116,8 @@ def _run(words: Sequence[str]) -> int:
         print_report(request, labelled)
     elif not failures:
         print("every volume has a plane already; overwrite=true looks for new ones")
+        if request.markups:
+            print(f"their planes as files for 3D Slicer are in {request.pictures}")
     for failure in failures:
         print(f"error: {failure}", file=sys.stderr)
     return 2 if failures else 0

@@ -82,7 +82,8 @@ def label(request: Request) -> tuple[list[Labelled], list[OptimalPlaneError]]:
     """
     dataset = open_dataset(request.data, require_manifest=False)
     volumes = _wanted(request, dataset)
-    _make_folder(request.pictures)
+    if request.markups and request.markup is None:
+        _write_known_markups(request, dataset.volumes, set(volumes))
     labelled: list[Labelled] = []
     failures: list[OptimalPlaneError] = []
     for number, (name, volume) in enumerate(volumes.items(), 1):
@@ -93,6 +94,7 @@ def label(request: Request) -> tuple[list[Labelled], list[OptimalPlaneError]]:
             failures.append(error)
             continue
         # The manifest last: no plane stands there that nobody can look at.
+        _make_folder(request.pictures)
         _write_picture(request.pictures / f"{name}.png", plane, request.tissues)
         if request.markups:
             write_markup(request.pictures / f"{name}{MARKUP_SUFFIX}", volume, plane.action)
@@ -124,6 +126,15 @@ def _drawn(request: Request, volume: LabelVolume, markup: Path) -> Labelled:
     action = read_markup(markup, volume)
     score, counts = Judge(volume, LandmarkReward(), request.tissues).seen(action)
     return Labelled(volume, action, score, counts)
+
+
+def _write_known_markups(request: Request, volumes: dict[str, LabelVolume], to_label: set[str]) -> None:
+    """Writes the planes that are there already, and stay, so that they can be corrected too."""
+    for name, volume in volumes.items():
+        is_asked_for = request.volumes is None or name in request.volumes
+        if is_asked_for and name not in to_label and volume.optimal_action is not None:
+            _make_folder(request.pictures)
+            write_markup(request.pictures / f"{name}{MARKUP_SUFFIX}", volume, volume.optimal_action)
 
 
 def _make_folder(folder: Path) -> None:

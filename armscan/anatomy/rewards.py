@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol, Self
 import numpy as np
 
 from armscan.anatomy.landmarks import Landmarks, TissueClusters
-from armscan.anatomy.tissues import USUAL_PIXEL_MM
+from armscan.anatomy.tissues import PIXEL_TISSUES, USUAL_PIXEL_MM, Tissues
 from armscan.checks import check_float, check_ints
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.volumes.volume import LabelVolume
@@ -24,8 +24,11 @@ N_TISSUES = 3
 class Reward(Protocol):
     """Scores slices; implement both methods to make one's own."""
 
-    def fitted_to(self, volumes: Iterable[LabelVolume]) -> Reward:
-        """Returns the reward with what it takes from labelled planes of training volumes, if it has nothing yet."""
+    def fitted_to(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Reward:
+        """Returns the reward with what it takes from labelled planes of training volumes, if it has nothing yet.
+
+        `tissues` says how what they show is clustered.
+        """
 
     def score(self, landmarks: Landmarks, pixel_mm: tuple[float, float]) -> float:
         """Returns the reward, in [-1, 0], of a slice with this summary and pixels of this size, (across, depth)."""
@@ -49,7 +52,7 @@ class LandmarkReward:
     def __init__(self, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
         self.targets = checked_targets(targets)
 
-    def fitted_to(self, volumes: Iterable[LabelVolume]) -> Self:
+    def fitted_to(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Self:
         """Returns the reward as it is: it takes nothing from volumes."""
         return self
 
@@ -102,7 +105,12 @@ class AgreementReward:
         self.slack_mm = check_float("slack_mm", slack_mm, at_least=0.0, at_most=1000.0)
         self._ranges: list[Range] | None = None
 
-    def fitted_to(self, volumes: Iterable[LabelVolume]) -> Self:
+    @property
+    def targets(self) -> tuple[int, int, int]:
+        """Of the published reward."""
+        return self.published.targets
+
+    def fitted_to(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Self:
         """See `Reward.fitted_to`.
 
         Raises:
@@ -114,7 +122,7 @@ class AgreementReward:
             volumes = list(volumes)
         except TypeError as error:
             raise InvalidValueError(f"volumes is {volumes!r}, but it must be a list of LabelVolumes") from error
-        features = np.array([self._labelled_features(volume) for volume in volumes])
+        features = np.array([self._labelled_features(volume, tissues) for volume in volumes])
         if not len(features):
             raise InvalidValueError("volumes is empty, but a reward is fitted to at least one")
         fitted = copy(self)
@@ -149,12 +157,13 @@ class AgreementReward:
         return Range(lowest - self.slack_mm, highest + self.slack_mm, tolerance, tolerance)
 
     @staticmethod
-    def _labelled_features(volume: LabelVolume) -> list[float]:
+    def _labelled_features(volume: LabelVolume, tissues: Tissues) -> list[float]:
         if not isinstance(volume, LabelVolume):
             raise InvalidValueError(f"volumes holds {volume!r}, but each must be a LabelVolume")
         if volume.optimal_action is None:
             raise OptimalPlaneError(f"{volume.name}: has no labelled optimal plane, which the reward is fitted to")
-        clusters = TissueClusters.from_slice(volume.slice(volume.optimal_action), pixel_mm=volume.pixel_mm)
+        slice_xz = volume.slice(volume.optimal_action)
+        clusters = TissueClusters.from_slice(slice_xz, **tissues._asdict(), pixel_mm=volume.pixel_mm)
         features = _features(clusters.landmarks, volume.pixel_mm)
         known = [feature for feature in features if feature is not None]
         if len(known) < len(features):

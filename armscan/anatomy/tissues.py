@@ -11,6 +11,8 @@ from armscan.checks import check_float, check_int, check_numbers
 from armscan.errors import InvalidValueError
 
 USUAL_PIXEL_MM = (0.27, 0.55)
+# A pixel at exactly eps is a neighbour, also where its spacing was kept as a 32-bit float.
+ROUNDING = 1.0 + 1e-6
 LARGEST_EPS_PX = 1000.0
 # More than a disc of the largest radius has pixels.
 MOST_SAMPLES = 10_000_000
@@ -88,7 +90,7 @@ class MetricTissue:
                 f"eps_mm of label {self.label} is {self.eps_mm:g}, but with pixels of {across_mm:g} x {depth_mm:g} mm "
                 f"it must be at most {LARGEST_EPS_PX * min(across_mm, depth_mm):g}, {LARGEST_EPS_PX:g} pixels"
             )
-        half_widths = disc_half_widths(float(self.eps_mm), across_mm, depth_mm)
+        half_widths = disc_half_widths(ROUNDING * float(self.eps_mm), across_mm, depth_mm)
         return Neighbourhood(half_widths, math.ceil(self.density * count_disc_pixels(half_widths)))
 
 

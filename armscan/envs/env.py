@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from armscan.checks import check_choice
+from armscan.checks import check_choice, check_int
 from armscan.envs.episode import Episode, begin, checked_actions, info_of, look, wanted_volume
 from armscan.envs.scene import Scene
 from armscan.envs.task import Observed, Task, Volumes
@@ -134,14 +134,17 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     @property
     def slice_xz(self) -> NDArray[np.uint8]:
         """The current slice, indexed [across, depth]."""
-        return self.episode.view.slice_xz
+        slice_xz = self.episode.view.slice_xz.view()
+        slice_xz.flags.writeable = False
+        return slice_xz
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
         """Starts an episode; `options={"volume": name}` chooses its volume."""
-        super().reset(seed=seed)
-        (self._episode,) = begin(self.task, [self.np_random], wanted_volume(self.task, options))
+        volume_name = wanted_volume(self.task, options)
+        super().reset(seed=None if seed is None else check_int("seed", seed, at_least=0))
+        (self._episode,) = begin(self.task, [self.np_random], volume_name)
         return self._seen()
 
     def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from gymnasium.vector import VectorEnv
 
-from armscan.anatomy import PUBLISHED_TARGETS
+from armscan.anatomy import PUBLISHED_TARGETS, checked_tissues
 from armscan.checks import check_bool, check_int
 from armscan.envs.env import ArmscanEnv
 from armscan.envs.history import boxes_of, checked_exclusions
-from armscan.envs.task import Volumes, checked_reward
+from armscan.envs.task import Task, Volumes, checked_reward
 from armscan.envs.vector_env import ArmscanVectorEnv
 from armscan.envs.vector_wrappers import VectorBestActionMemory, VectorFrameStack
 from armscan.envs.wrappers import MOST_KEPT, BestActionMemory, Env, FrameStack
+from armscan.errors import InvalidValueError, listed
 from armscan.volumes import LabelVolume
 
 
@@ -23,15 +25,24 @@ class EnvMaker:
 
     Args:
         **rules: of every environment, as in `make_armscan_env`.
+
+    Raises:
+        InvalidValueError: if there is no such rule.
     """
 
     def __init__(self, **rules: Any) -> None:
+        allowed = [name for maker in (Task, make_armscan_env) for name in _keywords(maker)]
+        if unknown := [name for name in rules if name not in allowed]:
+            raise InvalidValueError(f"env has no rule {unknown[0]!r}, but only {listed(allowed)}")
         self.rules = rules
 
     def fitted_to(self, volumes: Mapping[str, LabelVolume]) -> EnvMaker:
         """Returns the maker with its reward fitted to these volumes, whichever volumes the environments then have."""
+        tissues = checked_tissues(self.rules.get("clustering", "pixels"))
         reward = checked_reward(self.rules.get("reward"), self.rules.get("targets", PUBLISHED_TARGETS))
-        return EnvMaker(**self.rules | {"reward": reward.fitted_to(volumes.values()), "targets": PUBLISHED_TARGETS})
+        return EnvMaker(
+            **self.rules | {"reward": reward.fitted_to(volumes.values(), tissues), "targets": PUBLISHED_TARGETS}
+        )
 
     def one(self, volumes: Volumes, *, render_mode: str | None = None) -> Env:
         """Makes one environment."""
@@ -101,6 +112,12 @@ def make_armscan_vector_env(
     if "stack" not in order:
         checked_exclusions(stack_exclude, boxes_of(env.single_observation_space, "VectorFrameStack"))
     return env
+
+
+def _keywords(maker: Callable[..., Any]) -> list[str]:
+    """The names of what can only be given by name."""
+    parameters = inspect.signature(maker).parameters.values()
+    return [parameter.name for parameter in parameters if parameter.kind is inspect.Parameter.KEYWORD_ONLY]
 
 
 def _wrapper_order(stack: int, memory: int, stack_memory: bool) -> list[str]:

@@ -77,7 +77,7 @@ class Observation(Protocol):
         """Returns the space of each part, for every geometry that can occur and `n_free` action components."""
 
     def observe(self, view: View) -> Parts:
-        """Returns the value of each part, within its space."""
+        """Returns the value of each part, within its space, in arrays that are not filled again."""
 
 
 def observe_all(observation: Observation, views: Sequence[View]) -> Parts:
@@ -190,15 +190,20 @@ class MergedObservation:
 
     Args:
         observations: what to merge, as objects or by name; no two may have a part of the same name.
+        targets: what `cluster`, given by name, divides its counts by.
 
     Raises:
         InvalidValueError: if there is none, or one is no observation.
     """
 
-    def __init__(self, observations: Sequence[str | Observation]) -> None:
+    def __init__(
+        self, observations: Sequence[str | Observation], *, targets: Sequence[int] = PUBLISHED_TARGETS
+    ) -> None:
         if isinstance(observations, str) or not isinstance(observations, Sequence) or not observations:
             raise InvalidValueError(f"observations is {observations!r}, but it must be a list of at least one")
-        self.observations = tuple(checked_observation(observation) for observation in observations)
+        self.observations = tuple(
+            member for observation in observations for member in members_of(checked_observation(observation, targets))
+        )
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`.
@@ -236,17 +241,28 @@ def named_observations() -> Mapping[str, type[Observation]]:
     }
 
 
-def checked_observation(observation: str | Observation | Sequence[str | Observation]) -> Observation:
+def members_of(observation: Observation) -> tuple[Observation, ...]:
+    """Returns what an observation is merged of, itself where it is not."""
+    return observation.observations if isinstance(observation, MergedObservation) else (observation,)
+
+
+def checked_observation(
+    observation: str | Observation | Sequence[str | Observation], targets: Sequence[int] = PUBLISHED_TARGETS
+) -> Observation:
     """Returns an observation given as such, by name, or as a list of those that are merged.
+
+    Args:
+        observation: likewise.
+        targets: what `cluster`, given by name, divides its counts by.
 
     Raises:
         InvalidValueError: if there is no observation of that name, or it is no observation.
     """
     names = named_observations()
     if isinstance(observation, str) and observation in names:
-        return names[observation]()
+        return ClusterObservation(targets=targets) if observation == "cluster" else names[observation]()
     if isinstance(observation, list | tuple):
-        return MergedObservation(observation)
+        return MergedObservation(observation, targets=targets)
     has_methods = all(callable(getattr(observation, method, None)) for method in ("spaces", "observe"))
     if isinstance(observation, str | type) or not has_methods:
         raise InvalidValueError(
@@ -256,10 +272,12 @@ def checked_observation(observation: str | Observation | Sequence[str | Observat
     return observation  # type: ignore[return-value]
 
 
-def with_action_reward(observation: str | Observation | Sequence[str | Observation]) -> Observation:
-    """Returns the observation with action and reward, which are part of every one."""
-    checked = checked_observation(observation)
-    members = checked.observations if isinstance(checked, MergedObservation) else (checked,)
+def with_action_reward(
+    observation: str | Observation | Sequence[str | Observation], targets: Sequence[int] = PUBLISHED_TARGETS
+) -> Observation:
+    """Returns the observation, as `checked_observation` does, with action and reward, which are part of every one."""
+    checked = checked_observation(observation, targets)
+    members = members_of(checked)
     if any(isinstance(member, ActionRewardObservation) for member in members):
         return checked
     return MergedObservation([*members, ActionRewardObservation()])

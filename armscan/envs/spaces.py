@@ -49,6 +49,31 @@ class MultiBoxSpace(spaces.Dict):
         return self.spaces  # type: ignore[return-value]
 
 
+def in_order(parts: Parts, boxes: Mapping[str, spaces.Box], leading: tuple[int, ...] = ()) -> Parts:
+    """Returns the parts of an observation in the order of their boxes.
+
+    Args:
+        parts: as an observation gave them.
+        boxes: what it said that it gives.
+        leading: shape before that of each box, of a batch.
+
+    Raises:
+        InvalidValueError: if a part is missing, unknown, or of another shape.
+    """
+    if parts.keys() != boxes.keys():
+        raise InvalidValueError(
+            f"the observation gave the parts {', '.join(parts)}, but its spaces are of {', '.join(boxes)}"
+        )
+    ordered = {}
+    for name, box in boxes.items():
+        ordered[name] = part = parts[name]
+        if np.shape(part) != leading + box.shape:
+            raise InvalidValueError(
+                f"the observation gave {name} of shape {np.shape(part)}, but its space has shape {leading + box.shape}"
+            )
+    return ordered
+
+
 def flat_space(boxes: Mapping[str, spaces.Box]) -> spaces.Box:
     """Returns the space of `flattened` parts, their bounds in the order of the data."""
     low = np.concatenate([box.low.ravel() for box in boxes.values()])

@@ -24,7 +24,7 @@ from armscan.checks import check_bool, check_choice, check_float, check_int, che
 from armscan.envs.actions import free_components
 from armscan.envs.observations import Observation, View, observe_all, smallest_shape, with_action_reward
 from armscan.envs.scene import RandomTransform, Scene, SceneSampler, slice_geometry
-from armscan.envs.spaces import MultiBoxSpace, Parts, flat_space, flattened
+from armscan.envs.spaces import MultiBoxSpace, Parts, flat_space, flattened, in_order
 from armscan.errors import InvalidValueError, OptimalPlaneError, listed
 from armscan.volumes import LabelVolume, load_phantoms, read_dataset
 from armscan.volumes.plane import ManipulatorAction
@@ -64,7 +64,7 @@ class Task:
         self.max_steps = check_int("max_steps", max_steps, at_least=1)
         self.start = check_choice("start", start, STARTS)
         self.tissues = checked_tissues(clustering)
-        self.reward = checked_reward(reward, targets).fitted_to(self.volumes.values())
+        self.reward = checked_reward(reward, targets).fitted_to(self.volumes.values(), self.tissues)
         rotation = check_numbers("rotation_bounds_deg", rotation_bounds_deg, 2, "for rz and rx")
         if translation_bounds_mm is not None:
             translation = check_numbers("translation_bounds_mm", translation_bounds_mm, 2, "for tx and ty")
@@ -81,8 +81,8 @@ class Task:
         self.action_space = spaces.Box(-1.0, 1.0, (len(self.free),), np.float32)
         self._geometries = {name: slice_geometry(volume) for name, volume in self.volumes.items()}
         self._smallest_shape = smallest_shape(list(self._geometries.values()))
-        self._observation = with_action_reward(observation)
-        boxes = self._observation.spaces(list(self._geometries.values()), len(self.free))
+        self._observation = with_action_reward(observation, getattr(self.reward, "targets", PUBLISHED_TARGETS))
+        self._boxes = boxes = self._observation.spaces(list(self._geometries.values()), len(self.free))
         are_vectors = all(len(box.shape) == 1 for box in boxes.values())
         self._is_flat = are_vectors if flat is None else check_bool("flat", flat)
         self.observation_space: spaces.Box | MultiBoxSpace = (
@@ -133,12 +133,12 @@ class Task:
 
     def observe(self, view: View) -> Observed:
         """Returns the observation of a view, within `observation_space`."""
-        parts = self._observation.observe(view)
+        parts = in_order(self._observation.observe(view), self._boxes)
         return flattened({name: part.ravel() for name, part in parts.items()}) if self._is_flat else parts
 
     def observe_all(self, views: Sequence[View]) -> Observed:
         """Returns the observations of many views, shape (n_views, ...)."""
-        parts = observe_all(self._observation, views)
+        parts = in_order(observe_all(self._observation, views), self._boxes, (len(views),))
         if not self._is_flat:
             return parts
         return flattened({name: part.reshape(len(views), -1) for name, part in parts.items()})
@@ -152,14 +152,19 @@ class Task:
             geometry=self._geometries[volume.name],
             smallest_shape=self._smallest_shape,
             action=np.zeros(len(self.free)),
-            reward=self.reward.score(landmarks, volume.pixel_mm),
+            reward=self._score(landmarks, volume),
         )
+
+    def _score(self, landmarks: Landmarks, volume: LabelVolume) -> float:
+        """The reward of a slice; raises `InvalidValueError` where a reward of one's own gives no number in [-1, 0]."""
+        score = self.reward.score(landmarks, volume.pixel_mm)
+        return check_float(f"what {type(self.reward).__name__} scored", score, at_least=-1.0, at_most=0.0)
 
     def _check_optimal_planes(self) -> None:
         for volume in self.volumes.values():
             scene = self._sampler.unmoved(volume)
             _, landmarks = self._scanner.look(self._place[volume.name], *scene.plane_map(scene.optimum))
-            score = self.reward.score(landmarks, volume.pixel_mm)
+            score = self._score(landmarks, volume)
             if score <= -self.delta:
                 counts = tuple(landmarks[:, 0].astype(int).tolist())
                 raise OptimalPlaneError(
@@ -189,6 +194,10 @@ def named_volumes(volumes: Volumes) -> dict[str, LabelVolume]:
     for volume in listed_volumes:
         if not isinstance(volume, LabelVolume):
             raise InvalidValueError(f"volumes holds {volume!r}, but each must be a LabelVolume")
+    if isinstance(volumes, Mapping):
+        for key, volume in volumes.items():
+            if key != volume.name:
+                raise InvalidValueError(f"volumes holds {volume.name!r} as {key!r}, but it must be under its name")
     named = {volume.name: volume for volume in listed_volumes}
     if len(named) < len(listed_volumes):
         raise InvalidValueError(f"volumes holds two of the same name among {listed(v.name for v in listed_volumes)}")

@@ -78,10 +78,11 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         """
         options = dict(options) if isinstance(options, dict) else options
         chosen = np.flatnonzero(self._popped_mask(options))
-        for i, one_seed in zip(range(self.num_envs), self._seeds(seed), strict=True):
+        volume_name, seeds = wanted_volume(self.task, options), self._seeds(seed)
+        for i, one_seed in enumerate(seeds):
             if one_seed is not None and i in chosen:
                 self._rngs[i] = seeding.np_random(one_seed)[0]
-        self._begin(chosen, wanted_volume(self.task, options))
+        self._begin(chosen, volume_name)
         look(self.task, [self._episode(int(i)) for i in chosen])
         return self._observed(), self._infos(chosen)
 
@@ -133,19 +134,20 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             values = np.asarray(gather(episodes), dtype=object if key == "volume" else None)
             infos[key] = np.zeros((self.num_envs, *values.shape[1:]), dtype=values.dtype)
             infos[key][is_given] = values
-            infos[f"_{key}"] = is_given
+            infos[f"_{key}"] = is_given.copy()
         return infos
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + i for i in range(self.num_envs)]
+        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+            first = check_int("seed", seed, at_least=0)
+            return [first + i for i in range(self.num_envs)]
         if not isinstance(seed, list | tuple) or len(seed) != self.num_envs:
             raise InvalidValueError(
                 f"seed is {seed!r}, but it must be a whole number, or a list of one for each of {self.num_envs}"
             )
-        return seed
+        return [None if one is None else check_int("each of seed", one, at_least=0) for one in seed]
 
     def _popped_mask(self, options: Any) -> Mask:
         if not isinstance(options, dict) or "reset_mask" not in options:

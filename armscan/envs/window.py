@@ -117,5 +117,5 @@ def check_display() -> None:
 def _no_display(reason: str) -> DisplayError:
     return DisplayError(
         f"no window can be opened ({reason}): this needs a display, and Tk (python3-tk on Debian) or another of "
-        "Matplotlib's interactive backends; in a notebook: pip install 'armscan[notebook]', then %matplotlib widget"
+        "Matplotlib's interactive backends; in a notebook: armscan's extra [notebook], and then %matplotlib widget"
     )

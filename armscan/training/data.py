@@ -44,7 +44,7 @@ class Split:
         if not all(parts.values()):
             raise InvalidValueError(
                 f"of {len(self.training)} volumes for training, {len(self.validation)} for validation and "
-                f"{len(self.test)} for the test, each must be at least 1"
+                f"{len(self.test)} for the test, each must be at least 1: the volumes must be of three subjects or more"
             )
         seen: dict[str, str] = {}
         for part, volumes in parts.items():

@@ -33,7 +33,7 @@ def check_orientation(value: Any) -> str | None:
     is_code = isinstance(value, str) and len(value) == 3
     if not is_code or any(sum(letter in pair for letter in value) != 1 for pair in WORLD_AXES):
         raise InvalidValueError(
-            f"orientation is {value!r}, but it must be None (as in the file) or three letters, one of R and L, one of "
+            f"orientation is {value!r}, but it must be null (as in the file) or three letters, one of R and L, one of "
             "A and P, one of S and I: what the file's first, second and third axis run towards"
         )
     return str(value)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import reprlib
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import yaml
+from filelock import FileLock
 
 from armscan.checks import check_float, check_path
 from armscan.errors import InvalidValueError, ManifestError, VolumeError, listed
@@ -109,6 +115,21 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
     files = volume_files(folder)
     if unknown := [name for name in recorded if name not in files]:
         raise ManifestError(f"{folder}: a plane is given for {listed(unknown)}, but the folder holds {listed(files)}")
+    with _alone_with(folder):
+        return _recorded(folder, recorded, files)
+
+
+@contextmanager
+def _alone_with(folder: Path) -> Iterator[None]:
+    """Keeps others that write planes of this folder waiting: what two write at the same time, one would lose."""
+    digest = hashlib.sha256(str(folder.resolve()).encode(errors="surrogateescape")).hexdigest()[:16]
+    # Not in the folder, where it would stay behind.
+    with FileLock(Path(tempfile.gettempdir()) / f"armscan-{digest}.lock"):
+        yield
+
+
+def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str, Path]) -> Path:
+    """Writes the keys of each volume's entry into the manifest, and returns it."""
     found = find_manifest(folder)
     path = found or folder / NEW_MANIFEST
     document = _load(path) if found else {}
@@ -144,6 +165,13 @@ def _checked_planes(planes: Any) -> dict[str, Document]:
     return recorded
 
 
+def _problem(error: yaml.MarkedYAMLError) -> str:
+    """What is wrong in a YAML text, and where, without the drawing that PyYAML makes of it."""
+    mark = error.problem_mark
+    where = "" if mark is None else f" in line {mark.line + 1}, column {mark.column + 1}"
+    return f"{error.problem or error.context}{where}"
+
+
 def _load(path: Path) -> Document:
     """Reads the file as it is, whichever of the two languages it is in."""
     language, load = ("JSON", _load_json) if path.suffix == ".json" else ("YAML", _load_yaml)
@@ -153,7 +181,7 @@ def _load(path: Path) -> Document:
         raise ManifestError(f"{path}: the manifest cannot be read ({error.strerror or error})") from error
     # PyYAML reports some damaged texts by whatever exception its constructors meet first: KeyError, AttributeError, ...
     except Exception as error:
-        reason = " ".join(str(error).split())[:300]
+        reason = _problem(error) if isinstance(error, yaml.MarkedYAMLError) else " ".join(str(error).split())[:300]
         raise ManifestError(f"{path}: the manifest cannot be read as {language} ({reason})") from error
     if document is None and language == "YAML":
         # An empty file, or nothing but comments.
@@ -173,8 +201,6 @@ def _load_json(text: str) -> Any:
 
 
 def _load_yaml(text: str) -> Any:
-    import yaml
-
     class Loader(yaml.SafeLoader):
         """Refuses a key that is there twice."""
 
@@ -198,8 +224,6 @@ def _check_no_duplicates(keys: list[str]) -> None:
 def _dumped(contents: Document, path: Path) -> str:
     if path.suffix == ".json":
         return json.dumps(contents, indent=1) + "\n"
-    import yaml
-
     return yaml.safe_dump(contents, sort_keys=False, allow_unicode=True)
 
 

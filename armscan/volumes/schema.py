@@ -27,7 +27,7 @@ def _score(value: Any) -> float:
 
 def _subjects(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list | tuple) or not value or not all(isinstance(name, str) and name for name in value):
-        raise InvalidValueError(f"a split is {value!r}, but it must be a list of subjects (texts)")
+        raise InvalidValueError(f"a split is {value!r}, but it must be a list of at least one subject (texts)")
     return tuple(value)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,13 @@ class LabelVolume:
         for array in (state["labels"], state["direction"]):
             array.flags.writeable = False
         self.__dict__.update(state)
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, _: dict[int, object]) -> Self:
+        """Volumes are constant, and large: Gymnasium copies the arguments of every environment it makes, deeply."""
+        return self
 
     def __repr__(self) -> str:
         n_x, n_y, n_z = self.shape

@@ -1,5 +1,6 @@
 """The environment, as Gymnasium and as its own page describe it."""
 
+import copy
 import json
 import subprocess
 import sys
@@ -250,7 +251,7 @@ def test_env_takes_volumes_of_different_spacing_by_metric_clustering(dataset):
 class ArteryOnly:
     """A user's own reward: 0 where exactly one artery is seen."""
 
-    def fitted_to(self, volumes):
+    def fitted_to(self, volumes, tissues):
         return self
 
     def score(self, landmarks, pixel_mm):
@@ -312,3 +313,58 @@ def test_env_clusters_by_millimetres(wrist, clustering):
     assert (view.landmarks != TissueClusters.from_slice(env.slice_xz).landmarks).any()
     assert view.clusters.counts == metric.counts == tuple(info["counts"])
     assert info["reward"] == landmark_reward(metric) > -0.05
+
+
+class Broken:
+    """A user's own reward that gives what no reward may be."""
+
+    def __init__(self, given):
+        self.given = given
+
+    def fitted_to(self, volumes, tissues):
+        return self
+
+    def score(self, landmarks, pixel_mm):
+        return self.given
+
+
+@pytest.mark.parametrize("given", [5.0, -1.5, float("nan"), None, "best", np.zeros(1)])
+def test_env_refuses_what_a_reward_of_ones_own_may_not_give(wrist, given):
+    with pytest.raises(InvalidValueError, match="what Broken scored is"):
+        ArmscanEnv([wrist], reward=Broken(given))
+
+
+def test_env_fits_a_reward_with_its_own_clustering(dataset):
+    given = AgreementReward(slack=0.0, slack_mm=0.0)
+    env = ArmscanEnv(dataset, reward=given, clustering="metric", transform=None, projection="full")
+    for name in dataset:
+        env.reset(options={"volume": name})
+        assert env.step(env.scene.optimum_normalised)[1] == 0.0
+
+
+def test_make_copies_no_volume(wrist):
+    env = gym.make(armscan.ENV_ID, volumes=[wrist], stack=2, memory=1)
+    assert env.spec.kwargs["volumes"][0] is wrist
+    assert copy.deepcopy(env).unwrapped.volumes["wrist"] is wrist
+
+
+def test_refused_reset_changes_nothing(wrist):
+    env, twin = (ArmscanEnv([wrist], start="random") for _ in range(2))
+    for each in (env, twin):
+        each.reset(seed=3)
+    for seed, options in ((9, {"volume": "nope"}), (-1, None), (1.5, None)):
+        with pytest.raises(InvalidValueError):
+            env.reset(seed=seed, options=options)
+    np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])
+
+
+def test_env_shows_its_slice_but_does_not_hand_it_out(wrist):
+    env = ArmscanEnv([wrist])
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="read-only"):
+        env.slice_xz[0, 0] = 1
+
+
+def test_env_takes_volumes_only_under_their_names(wrist):
+    with pytest.raises(InvalidValueError, match="volumes holds 'wrist' as 'a'"):
+        ArmscanEnv({"a": wrist})

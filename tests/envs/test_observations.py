@@ -3,11 +3,13 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from armscan.anatomy import PIXEL_TISSUES
 from armscan.envs import (
     ActionRewardObservation,
     ArmscanEnv,
+    ArmscanVectorEnv,
     ClusterObservation,
     MergedObservation,
     SliceGeometry,
@@ -152,3 +154,51 @@ def test_env_takes_a_users_own_observation(wrist, observation):
     assert env.observation_space.contains(observed)
     np.testing.assert_allclose(observed["profile"], (env.slice_xz > 0).mean(axis=0), rtol=1e-6)
     assert {"action", "reward"} < observed.keys()
+
+
+class Careless:
+    """A user's own observation that gives other parts than it said."""
+
+    def __init__(self, parts):
+        self.parts = parts
+
+    def spaces(self, geometries, n_free):
+        return {"a": spaces.Box(0, 1, (1,), np.float32), "b": spaces.Box(100, 200, (2,), np.float32)}
+
+    def observe(self, view):
+        return {name: np.array(values, dtype=np.float32) for name, values in self.parts.items()}
+
+
+def test_own_observation_may_give_its_parts_in_any_order(phantom):
+    for make in (lambda e: e, lambda e: ArmscanVectorEnv(2, [phantom], observation=e.task._observation)):
+        env = make(ArmscanEnv([phantom], observation=Careless({"b": [150, 160], "a": [0.5]})))
+        observed, _ = env.reset(seed=0)
+        assert env.observation_space.contains(observed)
+        np.testing.assert_array_equal(np.atleast_2d(observed)[0, :3], [0.5, 150, 160])
+
+
+@pytest.mark.parametrize("flat", [True, False])
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"a": [0.5]}, "gave the parts a, action, reward, but its spaces are of a, b, action, reward"),
+        ({"a": [0.5], "b": [150, 160], "c": [1]}, "gave the parts a, b, c, action, reward"),
+        ({"a": [0.5], "b": [150]}, r"gave b of shape \(1,\), but its space has shape \(2,\)"),
+    ],
+)
+def test_own_observation_that_gives_other_parts_is_refused(phantom, parts, message, flat):
+    env = ArmscanEnv([phantom], observation=Careless(parts), flat=flat)
+    with pytest.raises(InvalidValueError, match=message):
+        env.reset(seed=0)
+
+
+def test_cluster_observation_by_name_divides_by_the_rewards_targets(phantom):
+    env = ArmscanEnv([phantom], observation=["cluster"], targets=(7, 5, 1), delta=0.9, projection="full")
+    env.reset(seed=0)
+    observed, *_, info = env.step(env.scene.optimum_normalised)
+    np.testing.assert_allclose(observed[[0, 4, 8]], info["counts"] / (7, 5, 1), rtol=1e-6)
+
+
+def test_merged_observations_may_be_nested(phantom):
+    env = ArmscanEnv([phantom], observation=[["cluster", "action_reward"], "slice"])
+    assert list(env.observation_space) == ["action", "clusters", "reward", "slice"]

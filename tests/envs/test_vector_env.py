@@ -111,3 +111,20 @@ def test_vector_env_refuses_what_is_impossible(phantom):
     envs.step(np.full((2, 1), -1.0))
     with pytest.raises(ResetNeededError, match=r"environments \[0, 1\] have ended"):
         envs.step(np.zeros((2, 1)))
+
+
+def test_vector_env_that_refuses_a_reset_changes_nothing(phantom):
+    envs, twins = (ArmscanVectorEnv(2, [phantom], start="random") for _ in range(2))
+    for each in (envs, twins):
+        each.reset(seed=3)
+    for seed, options in ((9, {"volume": "nope"}), (-1, None), ([1, -2], None), ([1, "a"], None), (True, None)):
+        with pytest.raises(InvalidValueError):
+            envs.reset(seed=seed, options=options)
+    np.testing.assert_array_equal(envs.reset()[0], twins.reset()[0])
+
+
+def test_vector_env_gives_every_key_of_info_a_mask_of_its_own(phantom):
+    envs = ArmscanVectorEnv(2, [phantom])
+    infos = envs.reset(seed=0)[1]
+    infos["_reward"][:] = False
+    assert infos["_volume"].all()

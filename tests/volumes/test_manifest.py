@@ -2,6 +2,7 @@
 
 import json
 import math
+import multiprocessing
 import re
 from dataclasses import fields
 from pathlib import Path
@@ -88,8 +89,8 @@ def test_manifest_splits_by_subject(folder, write_labelmap):
         ({"train": ["S1"], "test": ["S2", "S2"]}, r"splits has the subject 'S2' in test and in test"),
         ({"train": ["S1"], "test": ["S3"]}, r"splits names S3, but the subjects are S1 or S2"),
         ({"train": ["S1"]}, r"splits does not name 'S2', the subject of b\.nrrd"),
-        ({"train": []}, r"splits: a split is \[\], but it must be a list of subjects"),
-        ({"train": [1]}, r"splits: a split is \[1\], but it must be a list of subjects"),
+        ({"train": []}, r"splits: a split is \[\], but it must be a list of at least one subject"),
+        ({"train": [1]}, r"splits: a split is \[1\], but it must be a list of at least one subject"),
         ({"trian": ["S1"]}, r"splits has the key 'trian', but only train, validation or test"),
         (["S1"], r"splits is \['S1'\], but it must be lists of subjects under train"),
     ],
@@ -111,7 +112,7 @@ def test_manifest_refuses_impossible_splits(folder, splits, message):
         ("[" * 10_000, "cannot be read as YAML"),
         ("axis: xyz", "has the key 'axis', but only labels, orientation, axes, overlap, spacing, splits or volumes"),
         ("axes: [x, y, z]", r"axes is \['x', 'y', 'z'\], but it must be the letters"),
-        ("orientation: LLS", "orientation is 'LLS', but it must be None"),
+        ("orientation: LLS", "orientation is 'LLS', but it must be null"),
         ("spacing: coarsest", "spacing is 'coarsest', but it must be own or finest"),
         ("overlap: none", "overlap is 'none', but it must be refuse, first or last"),
         ("labels: {bones: [1], tendons: [1], artery: [2]}", "labels: 1 is bones and tendons, but"),
@@ -228,3 +229,38 @@ def test_manifest_page_names_every_key_and_its_example_is_one(tmp_path):
     manifest = read_manifest(written(tmp_path, example) / "manifest.yaml")
     used = {key for entry in manifest.volumes.values() for key in entry.model_fields_set}
     assert used == set(VolumeEntry.model_fields)
+
+
+def _record_often(folder, name):
+    for rz in range(20):
+        record_planes(folder, {name: (ManipulatorAction((float(rz), 0.0), (0.0, 0.0)), 0.0)})
+
+
+def test_record_planes_of_two_processes_are_both_kept(folder):
+    names = ["a.nii.gz", "b.nrrd"]
+    writers = [
+        multiprocessing.get_context("spawn").Process(target=_record_often, args=(folder, name)) for name in names
+    ]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    entries = yaml.safe_load((folder / "manifest.yaml").read_text())["volumes"]
+    assert [entries[name]["rotation"] for name in names] == [[19.0, 0.0]] * 2
+
+
+def test_record_planes_writes_through_a_link_and_keeps_its_permissions(folder, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("elsewhere") / "manifest.yaml"
+    elsewhere.write_text("{}")
+    elsewhere.chmod(0o640)
+    (folder / "manifest.yaml").symlink_to(elsewhere)
+    _record_often(folder, "a.nii.gz")
+    assert (folder / "manifest.yaml").is_symlink()
+    assert "19.0" in elsewhere.read_text()
+    assert elsewhere.stat().st_mode & 0o777 == 0o640
+
+
+def test_manifest_that_is_no_yaml_is_answered_with_the_place(folder):
+    (folder / "manifest.yaml").write_text("volumes:\n  a.nii.gz: {exclude: bad: motion}\n")
+    with pytest.raises(ManifestError, match=r"as YAML \(expected .* in line 2, column \d+\)"):
+        open_dataset(folder)

@@ -14,12 +14,12 @@ from armscan.volumes import shared_volumes
 
 @pytest.fixture
 def shared(phantom):
-    with shared_volumes({"wrist": phantom}) as volumes:
+    with shared_volumes({"phantom-0": phantom}) as volumes:
         yield volumes
 
 
 def test_shared_volume_is_the_same_volume(shared, phantom):
-    volume = shared["wrist"]
+    volume = shared["phantom-0"]
     np.testing.assert_array_equal(volume.labels, phantom.labels)
     for name in ("spacing", "name", "optimal_action", "origin", "size_mm", "centre_mm"):
         assert getattr(volume, name) == getattr(phantom, name)
@@ -29,10 +29,10 @@ def test_shared_volume_is_the_same_volume(shared, phantom):
 
 
 def test_shared_volume_is_pickled_without_its_voxels(shared):
-    pickled = pickle.dumps(shared["wrist"])
+    pickled = pickle.dumps(shared["phantom-0"])
     assert len(pickled) < 2000
     opened = pickle.loads(pickled)
-    np.testing.assert_array_equal(opened.labels, shared["wrist"].labels)
+    np.testing.assert_array_equal(opened.labels, shared["phantom-0"].labels)
     assert len(pickle.dumps(opened)) < 2000
 
 
@@ -48,13 +48,13 @@ def test_shared_volumes_serve_environments_of_other_processes(shared):
 
 
 def test_shared_volumes_leave_no_file_behind(phantom):
-    with shared_volumes({"wrist": phantom}) as volumes:
-        path = volumes["wrist"].path
-        pickled = pickle.dumps(volumes["wrist"])
+    with shared_volumes({"phantom-0": phantom}) as volumes:
+        path = volumes["phantom-0"].path
+        pickled = pickle.dumps(volumes["phantom-0"])
         assert path.stat().st_size == phantom.labels.size
     assert not path.parent.exists()
     # Who has it keeps it; nobody else gets it.
-    np.testing.assert_array_equal(volumes["wrist"].labels, phantom.labels)
+    np.testing.assert_array_equal(volumes["phantom-0"].labels, phantom.labels)
     with pytest.raises(VolumeError, match="phantom-0: its shared voxels are gone"):
         pickle.loads(pickled)
 

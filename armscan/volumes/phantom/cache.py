@@ -13,6 +13,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 import platformdirs
 
+from armscan.checks import check_seed
 from armscan.errors import InvalidValueError
 from armscan.files import write_whole
 from armscan.volumes.phantom import generate, tube, wrist
@@ -38,6 +39,7 @@ def load_phantom(seed: int, cache_dir: Path | None = None) -> LabelVolume:
     Returns:
         The same volume as `make_phantom(seed)`.
     """
+    check_seed("seed", seed)
     path = (cache_dir or default_cache_dir()) / f"phantom-{_generator_version()}-{seed}.npz"
     volume = _IN_MEMORY.get(path)
     if volume is None:
