@@ -62,7 +62,7 @@ def _clusters_by_sklearn(slice_xz: np.ndarray, tissue) -> Clusters:
     return Clusters(image, centres, np.array([len(member) for member in members], dtype=np.int64))
 
 
-def one_environment(volumes: dict[str, LabelVolume], **changes) -> Callable[[], float]:
+def one_environment(volumes: dict[str, LabelVolume] | list[LabelVolume], **changes) -> Callable[[], float]:
     """Returns what measures the seconds a step of one environment."""
     env = gym.make(armscan.ENV_ID, volumes=volumes, disable_env_checker=True, **RULES | changes)
     env.action_space.seed(0)
@@ -134,8 +134,8 @@ def main() -> None:
             volumes, observation="slice_channels", stack=1, memory=0
         ),
         "one, slice_channels at full size, stack and memory": one_environment(volumes, observation="slice_channels"),
-        "one, on a single volume": one_environment({first.name: first}),
-        f"one, on that volume {TIMES_AS_LARGE} times as large": one_environment({first.name: larger(first)}),
+        "one, on a single volume": one_environment([first]),
+        f"one, on that volume {TIMES_AS_LARGE} times as large": one_environment([larger(first)]),
         plain: plain_pipeline(first),
     }
     for measure in measures.values():

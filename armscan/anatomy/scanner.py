@@ -15,6 +15,8 @@ from armscan.volumes.slicing import sample_plane
 from armscan.volumes.volume import LabelVolume
 
 Spacing = tuple[float, float, float]
+# Planes that a thread takes at a time, so that where one core is busy with other work, the other takes more.
+CHUNK = 4
 
 
 @numba.njit(cache=True, nogil=True)
@@ -135,18 +137,19 @@ class Scanner:
         shapes = [self._shapes[i] for i in which]
         slices = np.empty((len(which), max(n_across * n_depth for n_across, n_depth in shapes)), dtype=np.uint8)
         landmarks = np.empty((len(which), len(self._tissue_labels), 4))
-        _look_all(
-            self._typed_volumes,
-            which,
-            np.array(self._spacings),
-            matrices,
-            offsets_mm,
-            self._tissue_labels,
-            self._half_widths,
-            self._min_samples,
-            slices,
-            landmarks,
-        )
+        with numba.parallel_chunksize(CHUNK):
+            _look_all(
+                self._typed_volumes,
+                which,
+                np.array(self._spacings),
+                matrices,
+                offsets_mm,
+                self._tissue_labels,
+                self._half_widths,
+                self._min_samples,
+                slices,
+                landmarks,
+            )
         return [
             row[: n_across * n_depth].reshape(n_across, n_depth)
             for row, (n_across, n_depth) in zip(slices, shapes, strict=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -72,22 +72,36 @@ class Episode:
 
 def info_of(episode: Episode) -> dict[str, Any]:
     """Returns `info`, as `ArmscanEnv` describes it."""
-    return {name: gather([episode])[0] for name, gather in INFO.items()}
+    return {
+        name: field.of(episode) if field.dtype is None else np.array(field.of(episode), dtype=field.dtype)
+        for name, field in INFO.items()
+    }
 
 
-INFO: dict[str, Callable[[Sequence[Episode]], Any]] = {
-    "volume": lambda episodes: [e.scene.volume.name for e in episodes],
-    "rotation_deg": lambda episodes: np.array([e.plane.rotation for e in episodes]),
-    "translation_mm": lambda episodes: np.array([e.plane.translation for e in episodes]),
-    "counts": lambda episodes: np.array([e.view.landmarks[:, 0] for e in episodes], dtype=np.int64),
-    "is_success": lambda episodes: [e.is_solved for e in episodes],
-    "starts_solved": lambda episodes: [e.starts_solved for e in episodes],
-    "action": lambda episodes: np.array([e.action for e in episodes], dtype=np.float32),
-    "reward": lambda episodes: [e.view.reward for e in episodes],
-    "distance_mm": lambda episodes: [e.distance[0] for e in episodes],
-    "distance_deg": lambda episodes: [e.distance[1] for e in episodes],
+class InfoField(NamedTuple):
+    """What `info` holds under one key.
+
+    Args:
+        of: gives it.
+        dtype: of the array that it is, None where it is a text, a number or a truth value.
+    """
+
+    of: Callable[[Episode], Any]
+    dtype: type[np.generic] | None = None
+
+
+INFO = {
+    "volume": InfoField(lambda episode: episode.scene.volume.name),
+    "rotation_deg": InfoField(lambda episode: episode.plane.rotation, np.float64),
+    "translation_mm": InfoField(lambda episode: episode.plane.translation, np.float64),
+    "counts": InfoField(lambda episode: episode.view.landmarks[:, 0], np.int64),
+    "is_success": InfoField(lambda episode: episode.is_solved),
+    "starts_solved": InfoField(lambda episode: episode.starts_solved),
+    "action": InfoField(lambda episode: episode.action, np.float32),
+    "reward": InfoField(lambda episode: episode.view.reward),
+    "distance_mm": InfoField(lambda episode: episode.distance[0]),
+    "distance_deg": InfoField(lambda episode: episode.distance[1]),
 }
-"""What `info` holds, for a batch of episodes."""
 
 
 def begin(task: Task, rngs: Sequence[np.random.Generator], volume_name: str | None = None) -> list[Episode]:

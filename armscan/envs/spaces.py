@@ -66,10 +66,10 @@ def in_order(parts: Parts, boxes: Mapping[str, spaces.Box], leading: tuple[int, 
         )
     ordered = {}
     for name, box in boxes.items():
-        ordered[name] = part = parts[name]
-        if np.shape(part) != leading + box.shape:
+        ordered[name] = part = np.asarray(parts[name])
+        if part.shape != leading + box.shape:
             raise InvalidValueError(
-                f"the observation gave {name} of shape {np.shape(part)}, but its space has shape {leading + box.shape}"
+                f"the observation gave {name} of shape {part.shape}, but its space has shape {leading + box.shape}"
             )
     return ordered
 

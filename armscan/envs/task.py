@@ -32,6 +32,7 @@ from armscan.volumes.plane import ManipulatorAction
 STARTS = ("middle", "random")
 DEFAULT_PHANTOMS = range(4)
 MAX_DRAWS = 1000
+NO_ACTION = np.zeros(0)
 
 Volumes = Mapping[str, LabelVolume] | Sequence[LabelVolume] | str | Path | None
 ObservationLike = str | Observation | Sequence[str | Observation]
@@ -92,7 +93,7 @@ class Task:
     def look(self, scenes: Sequence[Scene], actions: Sequence[ManipulatorAction]) -> list[View]:
         """Looks at planes, one in each scene; many are looked at together, on all cores.
 
-        The views' `action` is left at zeros.
+        The views' `action` is left empty.
         """
         maps = [scene.plane_map(action) for scene, action in zip(scenes, actions, strict=True)]
         places = [self._place[scene.volume.name] for scene in scenes]
@@ -151,13 +152,15 @@ class Task:
             tissues=self.tissues,
             geometry=self._geometries[volume.name],
             smallest_shape=self._smallest_shape,
-            action=np.zeros(len(self.free)),
+            action=NO_ACTION,
             reward=self._score(landmarks, volume),
         )
 
     def _score(self, landmarks: Landmarks, volume: LabelVolume) -> float:
         """The reward of a slice; raises `InvalidValueError` where a reward of one's own gives no number in [-1, 0]."""
         score = self.reward.score(landmarks, volume.pixel_mm)
+        if type(score) is float and -1.0 <= score <= 0.0:
+            return score
         return check_float(f"what {type(self.reward).__name__} scored", score, at_least=-1.0, at_most=0.0)
 
     def _check_optimal_planes(self) -> None:

@@ -130,8 +130,10 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         episodes = [self._episode(i) for i in chosen]
         is_given = np.isin(np.arange(self.num_envs), chosen)
         infos: dict[str, Any] = {}
-        for key, gather in INFO.items():
-            values = np.asarray(gather(episodes), dtype=object if key == "volume" else None)
+        for key, field in INFO.items():
+            values = np.array([field.of(episode) for episode in episodes], dtype=field.dtype)
+            # Of texts Gymnasium makes arrays of objects.
+            values = values.astype(object) if values.dtype.kind == "U" else values
             infos[key] = np.zeros((self.num_envs, *values.shape[1:]), dtype=values.dtype)
             infos[key][is_given] = values
             infos[f"_{key}"] = is_given.copy()
