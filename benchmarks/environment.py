@@ -35,7 +35,7 @@ from armscan.envs import ManipulatorAction
 from armscan.volumes import LabelVolume, read_dataset
 
 DEFAULT_FOLDER = Path(__file__).parent.parent / "tests" / "data" / "volumes"
-N_ROUNDS, N_STEPS, N_VECTOR_STEPS, N_PLAIN_STEPS = 7, 2000, 60, 4
+N_ROUNDS, N_STEPS, N_VECTOR_STEPS, N_PLAIN_STEPS = 15, 2000, 60, 2
 NUM_ENVS = 64
 TIMES_AS_LARGE = 8
 RULES = {"projection": "zy", "rotation_bounds_deg": (90.0, 45.0), "stack": 8, "memory": 4}
