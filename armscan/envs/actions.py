@@ -56,11 +56,13 @@ class ActionBounds:
 
     def normalised(self, action: ManipulatorAction) -> FloatArray:
         """Returns the normalised vector of a plane, shape (4,); 0 (a translation: -1) where the bound is zero."""
-        rotation = np.divide(action.rotation, self.rotation_deg, out=np.zeros(2), where=np.array(self.rotation_deg) > 0)
-        translation = np.divide(
-            action.translation, self.translation_mm, out=np.zeros(2), where=np.array(self.translation_mm) > 0
+        rz, rx, tx, ty = (
+            value / bound if bound > 0 else 0.0
+            for value, bound in zip(
+                action.rotation + action.translation, self.rotation_deg + self.translation_mm, strict=True
+            )
         )
-        return np.concatenate([rotation, 2.0 * translation - 1.0])
+        return np.array([rz, rx, 2.0 * tx - 1.0, 2.0 * ty - 1.0])
 
 
 def free_components(projection: str | Sequence[str]) -> tuple[int, ...]:

@@ -158,10 +158,9 @@ class BestPairs:
 
     def push(self, actions: NDArray[Any], rewards: NDArray[Any]) -> None:
         """Adds the latest pair of every environment where it is good enough; shapes as in `refill`."""
-        latest = self._paired(actions, rewards)
-        enters = latest[:, -1] > self.pairs[:, -1, -1]
+        enters = rewards.astype(np.float32) > self.pairs[:, -1, -1]
         if enters.any():
-            self.pairs[enters, -1] = latest[enters]
+            self.pairs[enters, -1] = self._paired(actions, rewards)[enters]
             order = np.argsort(-self.pairs[enters, :, -1], axis=1, kind="stable")
             self.pairs[enters] = np.take_along_axis(self.pairs[enters], order[:, :, None], axis=1)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -106,7 +106,7 @@ class SceneSampler:
     def bounds(self, volume: LabelVolume) -> ActionBounds:
         """Returns the bounds that hold for every scene of a volume."""
         size_mm = volume.size_mm
-        return ActionBounds(self.rotation_bounds_deg, self.translation_bounds_mm or (size_mm[0], size_mm[1]))
+        return _bounds(self.rotation_bounds_deg, self.translation_bounds_mm or (size_mm[0], size_mm[1]))
 
     def unmoved(self, volume: LabelVolume) -> Scene:
         """Returns the scene of a volume as it is.
@@ -148,6 +148,10 @@ class SceneSampler:
         if within is None or abs(rz) > bound_rz or abs(rx) > bound_rx:
             return None
         return Scene(volume, transform, within, bounds)
+
+
+# Checked once, not at every reset.
+_bounds = lru_cache(ActionBounds)
 
 
 def slice_geometry(volume: LabelVolume) -> SliceGeometry:

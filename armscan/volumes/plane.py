@@ -147,20 +147,19 @@ class RigidTransform:
         Raises:
             InvalidValueError: if the moved plane never meets the volume's floor z = 0, where every plane begins.
         """
-        normal = self.matrix.T @ action.normal
-        origin_mm = self.matrix.T @ (action.offset_mm - self.offset_mm)
-        rx = np.arcsin(np.clip(normal[2], -1.0, 1.0))
-        rz = np.arctan2(-normal[0], normal[1])
+        n_x, n_y, n_z = (self.matrix.T @ action.normal).tolist()
+        x_mm, y_mm, z_mm = (self.matrix.T @ (action.offset_mm - self.offset_mm)).tolist()
+        rx, rz = math.asin(min(max(n_z, -1.0), 1.0)), math.atan2(-n_x, n_y)
         # The same plane has two descriptions; the one on the same side as `action` keeps the picture upright.
-        if np.cos(np.deg2rad(action.rotation[1])) < 0:
-            rx, rz = np.pi - rx, np.arctan2(normal[0], -normal[1])
-        moved = ManipulatorAction((wrapped_deg(np.rad2deg(rz)), wrapped_deg(np.rad2deg(rx))), (0.0, 0.0))
-        if origin_mm[2] != 0.0:
-            in_depth = moved.matrix[:, 2]
-            if abs(in_depth[2]) < 1e-9:
+        if math.cos(math.radians(action.rotation[1])) < 0:
+            rx, rz = math.pi - rx, math.atan2(n_x, -n_y)
+        rotation = wrapped_deg(math.degrees(rz)), wrapped_deg(math.degrees(rx))
+        if z_mm != 0.0:
+            in_depth_x, in_depth_y, in_depth_z = rotation_matrix(*rotation)[:, 2].tolist()
+            if abs(in_depth_z) < 1e-9:
                 raise InvalidValueError(f"{action}, moved by {self}, lies parallel to the volume's floor and above it")
-            origin_mm = origin_mm - origin_mm[2] / in_depth[2] * in_depth
-        return ManipulatorAction(moved.rotation, (origin_mm[0], origin_mm[1]))
+            x_mm, y_mm = x_mm - z_mm / in_depth_z * in_depth_x, y_mm - z_mm / in_depth_z * in_depth_y
+        return ManipulatorAction(rotation, (x_mm, y_mm))
 
 
 def wrapped_deg(angle_deg: float) -> float:
