@@ -15,8 +15,8 @@ from armscan.volumes.slicing import sample_plane
 from armscan.volumes.volume import LabelVolume
 
 Spacing = tuple[float, float, float]
-# Planes that a thread takes at a time, so that where one core is busy with other work, the other takes more.
-CHUNK = 4
+# Parts that many planes are taken in, so that where one core is busy with other work, the others take more of them.
+N_CHUNKS = 16
 
 
 @numba.njit(cache=True, nogil=True)
@@ -137,7 +137,7 @@ class Scanner:
         shapes = [self._shapes[i] for i in which]
         slices = np.empty((len(which), max(n_across * n_depth for n_across, n_depth in shapes)), dtype=np.uint8)
         landmarks = np.empty((len(which), len(self._tissue_labels), 4))
-        with numba.parallel_chunksize(CHUNK):
+        with numba.parallel_chunksize(max(1, len(which) // N_CHUNKS)):
             _look_all(
                 self._typed_volumes,
                 which,
