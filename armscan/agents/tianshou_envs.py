@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -34,7 +33,7 @@ class SideBySide(BaseVectorEnv):
         self.is_async = False
         self.is_closed = False
         self._envs = envs
-        self._seeds: Sequence[int | None] | None = None
+        self._seeds: list[int | None] | None = None
         self._action_spaces = [deepcopy(envs.single_action_space) for _ in range(envs.num_envs)]
 
     def get_env_attr(self, key: str, id: Ids = None) -> list[Any]:  # noqa: A002 - Tianshou's name
@@ -47,10 +46,8 @@ class SideBySide(BaseVectorEnv):
         """Starts episodes; returns the first observations of those environments, and no information."""
         ids = np.arange(self.env_num) if env_id is None else np.atleast_1d(env_id)
         mask = np.isin(np.arange(self.env_num), ids)
-        observations, _ = self._envs.reset(
-            seed=self._seeds,  # type: ignore[arg-type]
-            options={"reset_mask": mask},
-        )
+        # Gymnasium's types leave out the lists of seeds that its own vector environments take.
+        observations, _ = self._envs.reset(seed=self._seeds, options={"reset_mask": mask})  # type: ignore[arg-type]
         self._seeds = None
         return _batched(observations)[ids], self._no_info(ids)
 
@@ -63,7 +60,7 @@ class SideBySide(BaseVectorEnv):
     def seed(self, seed: int | list[int] | None = None) -> list[list[int] | None]:
         """Seeds the next reset and the random actions."""
         seeds = [seed + i for i in range(self.env_num)] if isinstance(seed, int) else seed
-        self._seeds = seeds
+        self._seeds = None if seeds is None else list(seeds)
         if seeds is not None:
             for space, one_seed in zip(self._action_spaces, seeds, strict=True):
                 space.seed(one_seed)

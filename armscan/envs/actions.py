@@ -19,8 +19,6 @@ PROJECTIONS: dict[str, tuple[str, ...]] = {
     "zy": ("rz", "ty"),
     "full": COMPONENTS,
 }
-
-
 MAX_TRANSLATION_MM = 1e6
 
 

@@ -26,8 +26,10 @@ def boxes_of(space: spaces.Space[Any], who: str) -> dict[str, spaces.Box]:
     """
     if isinstance(space, spaces.Box) and len(space.shape) == 1:
         return {FLAT: space}
-    if isinstance(space, spaces.Dict) and all(isinstance(box, spaces.Box) for box in space.values()):
-        return dict(space.items())  # type: ignore[arg-type]
+    if isinstance(space, spaces.Dict):
+        boxes = {name: box for name, box in space.items() if isinstance(box, spaces.Box)}
+        if len(boxes) == len(space):
+            return boxes
     raise InvalidValueError(f"{who} wraps observations that are vectors or a Dict of boxes, but the space is {space}")
 
 

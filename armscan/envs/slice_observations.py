@@ -76,7 +76,12 @@ def _reduce(image: NDArray[np.uint8], reduced: NDArray[np.uint8]) -> None:
             reduced[i, k] = highest
 
 
-class SliceObservation:
+class _Framed:
+    def __init__(self, *, crop: Sequence[int] | None = None, shape: Sequence[int] | None = None) -> None:
+        self._frame = SliceFrame(crop, shape)
+
+
+class SliceObservation(_Framed):
     """The slice as one image of labels, uint8: 0 background, 1 bones, 2 tendons, 3 artery, 4 nerve.
 
     Reduced, a pixel shows the rarest tissue of those that meet in it: artery, nerve, tendons, bones, in this order.
@@ -85,9 +90,6 @@ class SliceObservation:
         crop: as in `SliceFrame`.
         shape: as in `SliceFrame`.
     """
-
-    def __init__(self, *, crop: Sequence[int] | None = None, shape: Sequence[int] | None = None) -> None:
-        self._frame = SliceFrame(crop, shape)
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
@@ -103,7 +105,7 @@ class SliceObservation:
         return {"slice": LABEL_OF_RANK[reduced]}
 
 
-class SliceChannelsObservation:
+class SliceChannelsObservation(_Framed):
     """The slice as one channel for each of bones, tendons and artery, uint8: 1 where that tissue is, 0 elsewhere.
 
     Reduced, a pixel is 1 where any of the pixels it stands for is.
@@ -112,9 +114,6 @@ class SliceChannelsObservation:
         crop: as in `SliceFrame`.
         shape: as in `SliceFrame`.
     """
-
-    def __init__(self, *, crop: Sequence[int] | None = None, shape: Sequence[int] | None = None) -> None:
-        self._frame = SliceFrame(crop, shape)
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from armscan.envs.vector_env import VectorStep
 from armscan.envs.wrappers import MOST_KEPT, checked_env, with_memory, with_memory_box
 
 
-class _VectorRemembering(VectorWrapper):
+class _VectorRemembering(VectorWrapper, ABC):
     """A wrapper whose observations depend on those before them in the episodes."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
@@ -24,9 +25,10 @@ class _VectorRemembering(VectorWrapper):
         self._has_ended = np.zeros(env.num_envs, dtype=np.bool_)
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
         """Starts episodes."""
+        # Gymnasium's types leave out the lists of seeds that its own vector environments take.
         observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         is_first = infos["_reward"]
         self._has_ended &= ~is_first
@@ -42,14 +44,17 @@ class _VectorRemembering(VectorWrapper):
         self._has_ended = terminated | truncated
         return self._remembering(observations), rewards, terminated, truncated, infos
 
+    @abstractmethod
     def _refill(self, observations: Observed, infos: dict[str, Any], is_first: Mask) -> None:
-        raise NotImplementedError
+        """Begins anew what is remembered of some environments."""
 
+    @abstractmethod
     def _push(self, observations: Observed, infos: dict[str, Any]) -> None:
-        raise NotImplementedError
+        """Takes a step of every environment into what is remembered."""
 
+    @abstractmethod
     def _remembering(self, observations: Observed) -> Observed:
-        raise NotImplementedError
+        """Returns the observations with what is remembered."""
 
 
 class VectorFrameStack(_VectorRemembering):

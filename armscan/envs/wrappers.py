@@ -6,6 +6,7 @@ full size it takes 107 microseconds where this one takes 43. Where both can be u
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection
 from typing import Any
 
@@ -30,12 +31,10 @@ from armscan.volumes.plane import FloatArray
 
 Env = gym.Env[Any, FloatArray]
 MEMORY = "memory"
-# Of the one environment that is wrapped.
-ALL = np.array([True])
-
-
 # Observations of a stack, and pairs of a memory.
 MOST_KEPT = 1000
+# Of the one environment that is wrapped.
+ALL = np.array([True])
 
 
 def checked_env(env: Any, kind: type[Any]) -> Any:
@@ -45,7 +44,7 @@ def checked_env(env: Any, kind: type[Any]) -> Any:
     return env
 
 
-class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs):
+class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs, ABC):
     """A wrapper whose observation depends on those before it in the episode."""
 
     def reset(
@@ -60,8 +59,9 @@ class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstruc
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._remembering(observation, info, is_first=False), float(reward), terminated, truncated, info
 
+    @abstractmethod
     def _remembering(self, observation: Observed, info: dict[str, Any], *, is_first: bool) -> Observed:
-        raise NotImplementedError
+        """Takes an observation into what is remembered, and returns it with that."""
 
 
 class FrameStack(_Remembering):
