@@ -1,6 +1,6 @@
 """The command `python -m armscan.run`: one run, or with -m several side by side.
 
-This is the one place that reads the configuration: everything is built from it here, and no part of it goes further.
+The configuration is read here and in `building.py`: everything is built from it there, and no part of it goes further.
 """
 
 from __future__ import annotations
@@ -26,11 +26,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.checks import check_int, check_seed
-from armscan.errors import InvalidValueError, is_interruption
+from armscan.errors import is_interruption
 from armscan.files import LAST_CHECKPOINT
 from armscan.mistakes import mistake_in_one_line, quieten_libraries
 from armscan.multirun import INTERRUPTED, NO_OUTCOME, Job, end_multirun, remove_run_folder
@@ -40,7 +38,6 @@ if TYPE_CHECKING:
     from armscan.training import Split
 
 MAX_TAG_CHARS = 5000
-SECTIONS = ("data", "obs", "reward", "agent", "network", "tracking", "env", "training", "evaluation")
 CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
 # What a job's process runs; it may be interrupted while it is still importing.
@@ -84,7 +81,7 @@ class Invocation:
 
 
 def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict[str, float]]:
-    """Trains, evaluates and tracks one agent.
+    """Trains an agent, if it is one that learns, evaluates and tracks it.
 
     Args:
         config: the composed configuration.
@@ -96,56 +93,41 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     # Deferred: a mistake on the command line should be answered before these are loaded.
     import torch
 
-    from armscan.agents import LearningSetup, checked_device
+    from armscan.agents import Learner
+    from armscan.building import build
     from armscan.console import print_results, print_where_to_look, progress_reporter
     from armscan.training import TEST, TRAINING, evaluate, film_episode, train
 
     quieten_libraries()
     torch.set_num_threads(1)
     folder, job = invocation.folder, invocation.job
-    check_sections(config)
-    seed = check_seed("seed", config.seed)
-    n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
-
     # Everything is built, and so checked, before anything is tracked.
-    split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
-    maker = instantiate(config.env, _convert_="object").fitted_to(split.training)
+    experiment = build(config)
+    split, maker, agent, seed = experiment.split, experiment.maker, experiment.agent, experiment.seed
     training_env, validation_env, test_env = map(maker.one, (split.training, split.validation, split.test))
     film_env = maker.one(split.test, render_mode="rgb_array")
-    setup = LearningSetup(
-        make_envs=partial(maker.many, volumes=split.training, autoreset_mode="Disabled"),
-        observation_space=training_env.observation_space,
-        total_env_steps=budget.env_steps,
-        seed=seed,
-        device=checked_device(config.device),
-    )
-    learner = instantiate(config.agent, _convert_="object").learner(setup)
-    validate = partial(
-        evaluate, learner, validation_env, n_episodes=budget.validation_episodes, seed=VALIDATION_SEED + seed
-    )
 
     with tracked_run(config, invocation, split) as tracked:
-        progress = progress_reporter(job.label if job else None)
-        result = train(learner, budget, validate, folder, callbacks=[progress, tracked])
+        result = None
+        if isinstance(agent, Learner):
+            n_episodes, budget = experiment.budget.validation_episodes, experiment.budget
+            validate = partial(evaluate, agent, validation_env, n_episodes=n_episodes, seed=VALIDATION_SEED + seed)
+            progress = progress_reporter(job.label if job else None)
+            result = train(agent, budget, validate, folder, callbacks=[progress, tracked])
         evaluations = {
-            TRAINING: evaluate(learner, training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),
-            TEST: evaluate(learner, test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED + seed),
+            TRAINING: evaluate(
+                agent, training_env, n_episodes=experiment.n_episodes, seed=TRAINING_VOLUMES_SEED + seed
+            ),
+            TEST: evaluate(agent, test_env, n_episodes=experiment.n_episodes, seed=TEST_VOLUMES_SEED + seed),
         }
-        film_episode(learner, film_env, folder / "episode.gif", seed=FILM_SEED + seed)
+        film_episode(agent, film_env, folder / "episode.gif", seed=FILM_SEED + seed)
         tracked.keep_results(result, evaluations, folder)
     if job is None:
-        print_results(f"results (deterministic policy, as it was after {result.best.n_env_steps} steps)", evaluations)
-        print_where_to_look(folder, config.tracking.uri, files=("learning_curve.png", "episode.gif"))
+        how = f"deterministic policy, as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
+        print_results(f"results ({how})", evaluations)
+        files = ("learning_curve.png", "episode.gif") if result else ("episode.gif",)
+        print_where_to_look(folder, config.tracking.uri, files=files)
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
-
-
-def check_sections(config: DictConfig) -> None:
-    """Raises `InvalidValueError` where a whole section of the configuration was replaced by a value."""
-    for section in SECTIONS:
-        if not isinstance(config.get(section), DictConfig):
-            raise InvalidValueError(
-                f"{section} is {config.get(section)!r}, but it must be a section of the configuration"
-            )
 
 
 def tracked_run(config: DictConfig, invocation: Invocation, split: Split) -> TrackedRun:

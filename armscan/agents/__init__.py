@@ -1,18 +1,23 @@
 """Who acts: learning algorithms through Tianshou, and their networks."""
 
-from armscan.agents.device import checked_device
-from armscan.agents.networks import MLP, Network
-from armscan.agents.protocols import Agent, Learner, LearningAlgorithm, LearningSetup, VectorEnvMaker
+from armscan.agents.compute import Compute
+from armscan.agents.multimodal import Multimodal
+from armscan.agents.networks import MLP, Network, NetworkByObservation
+from armscan.agents.ppo import PPO
+from armscan.agents.protocols import Agent, AgentSetup, Algorithm, Learner, VectorEnvMaker
 from armscan.agents.sac import SAC
 
 __all__ = [
     "MLP",
+    "PPO",
     "SAC",
     "Agent",
+    "AgentSetup",
+    "Algorithm",
+    "Compute",
     "Learner",
-    "LearningAlgorithm",
-    "LearningSetup",
+    "Multimodal",
     "Network",
+    "NetworkByObservation",
     "VectorEnvMaker",
-    "checked_device",
 ]

@@ -1,12 +1,15 @@
-"""Networks for actors and critics, as factories that Tianshou's builders take."""
+"""Kinds of networks for actors and critics, as factories that Tianshou's builders take."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from gymnasium import spaces
-from tianshou.highlevel.module.actor import ActorFactory, ActorFactoryDefault, ContinuousActorType
+from tianshou.highlevel.env import Environments
+from tianshou.highlevel.module.actor import ActorFactory, ActorFactoryContinuousGaussianNet
 from tianshou.highlevel.module.critic import CriticFactory, CriticFactoryDefault
 from torch import nn
 
@@ -16,17 +19,40 @@ from armscan.errors import InvalidValueError
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "gelu": nn.GELU}
 
 
+@dataclass(frozen=True)
+class Spread:
+    """What the standard deviation of a Gaussian policy is made of.
+
+    Args:
+        conditioned: whether it depends on the observation; otherwise it is the same for all of them.
+        initial_log: its logarithm at first, where it does not depend on the observation.
+    """
+
+    conditioned: bool = True
+    initial_log: float = -0.5
+
+    def initialise(self, actor: nn.Module) -> nn.Module:
+        """Sets the actor's standard deviation to what it is at first; returns the actor."""
+        if not self.conditioned:
+            nn.init.constant_(actor.sigma_param, self.initial_log)  # type: ignore[arg-type]
+        return actor
+
+
 class Network(Protocol):
     """A kind of network that can be an actor's and a critic's."""
 
-    def check(self, observation_space: spaces.Space[Any]) -> None:
-        """Raises `InvalidValueError` if the network cannot take such observations."""
+    def chosen_for(self, observation_space: spaces.Space[Any]) -> Network:
+        """Returns the network for such observations: itself, if it can take them.
 
-    def actor_factory(self) -> ActorFactory:
-        """Returns the factory of a Gaussian actor whose spread depends on the observation."""
+        Raises:
+            InvalidValueError: if it cannot; the reason is said.
+        """
+
+    def actor_factory(self, spread: Spread) -> ActorFactory:
+        """Returns the factory of a Gaussian actor."""
 
     def critic_factory(self) -> CriticFactory:
-        """Returns the factory of a critic."""
+        """Returns the factory of a critic, of observations alone or of observations with actions."""
 
 
 class MLP:
@@ -41,28 +67,83 @@ class MLP:
     """
 
     def __init__(self, hidden_sizes: Sequence[int] = (64, 64), activation: str = "relu") -> None:
-        self.hidden_sizes = list(check_ints("hidden_sizes", hidden_sizes, None, "", at_least=1, at_most=65536))
-        self.activation = ACTIVATIONS[check_choice("activation", activation, list(ACTIVATIONS))]
+        self.hidden_sizes = list(check_ints("network.hidden_sizes", hidden_sizes, None, "", at_least=1, at_most=65536))
+        self.activation = ACTIVATIONS[check_choice("network.activation", activation, list(ACTIVATIONS))]
 
-    def check(self, observation_space: spaces.Space[Any]) -> None:
-        """See `Network.check`."""
-        if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
+    def chosen_for(self, observation_space: spaces.Space[Any]) -> MLP:
+        """See `Network.chosen_for`."""
+        if not is_vector(observation_space):
             raise InvalidValueError(
                 "network is mlp, which takes one vector, but the observation has the parts "
                 f"{', '.join(observation_space) if isinstance(observation_space, spaces.Dict) else observation_space}; "
-                "take obs=cluster, or env.flat=true to put images and all into one vector"
+                "take network=multimodal, or obs=cluster, or env.flat=true to put images and all into one vector"
             )
+        return self
 
-    def actor_factory(self) -> ActorFactory:
+    def actor_factory(self, spread: Spread) -> ActorFactory:
         """See `Network.actor_factory`."""
-        return ActorFactoryDefault(
-            ContinuousActorType.GAUSSIAN,
-            hidden_sizes=self.hidden_sizes,
-            hidden_activation=self.activation,
-            continuous_unbounded=True,
-            continuous_conditioned_sigma=True,
-        )
+        return _MLPActorFactory(self.hidden_sizes, self.activation, spread)
 
     def critic_factory(self) -> CriticFactory:
         """See `Network.critic_factory`."""
         return CriticFactoryDefault(hidden_sizes=self.hidden_sizes, hidden_activation=self.activation)
+
+
+class NetworkByObservation:
+    """The network that fits the observation: one for vectors, one for those with images.
+
+    Args:
+        vector: for one vector.
+        images: for parts among which there are images.
+    """
+
+    def __init__(self, vector: Network, images: Network) -> None:
+        self.vector, self.images = checked_network(vector), checked_network(images)
+
+    def chosen_for(self, observation_space: spaces.Space[Any]) -> Network:
+        """See `Network.chosen_for`."""
+        chosen = self.vector if is_vector(observation_space) else self.images
+        return chosen.chosen_for(observation_space)
+
+    def actor_factory(self, spread: Spread) -> ActorFactory:
+        """Cannot be made before the observation is known."""
+        raise NotImplementedError("chosen_for() comes first")
+
+    def critic_factory(self) -> CriticFactory:
+        """Cannot be made before the observation is known."""
+        raise NotImplementedError("chosen_for() comes first")
+
+
+def is_vector(space: spaces.Space[Any]) -> bool:
+    """Whether observations are one vector."""
+    return isinstance(space, spaces.Box) and len(space.shape) == 1
+
+
+def checked_network(network: Network) -> Network:
+    """Returns the network, if it is one.
+
+    Raises:
+        InvalidValueError: if it lacks a method of `Network`.
+    """
+    methods = ("chosen_for", "actor_factory", "critic_factory")
+    if isinstance(network, type) or not all(callable(getattr(network, name, None)) for name in methods):
+        raise InvalidValueError(
+            f"network is {network!r}, but it must have the methods of Network: {', '.join(methods)}"
+        )
+    return network
+
+
+class _MLPActorFactory(ActorFactory):
+    """Tianshou's, with the standard deviation that is wanted at first."""
+
+    def __init__(self, hidden_sizes: Sequence[int], activation: type[nn.Module], spread: Spread) -> None:
+        self._factory = ActorFactoryContinuousGaussianNet(
+            hidden_sizes, unbounded=True, conditioned_sigma=spread.conditioned, activation=activation
+        )
+        self._spread = spread
+
+    def create_module(self, envs: Environments, device: str | torch.device) -> nn.Module:
+        return self._spread.initialise(self._factory.create_module(envs, device))
+
+    def create_dist_fn(self, envs: Environments) -> Any:
+        return self._factory.create_dist_fn(envs)

@@ -6,15 +6,16 @@ import math
 from dataclasses import dataclass, fields
 
 from tianshou.highlevel.config import OffPolicyTrainingConfig
-from tianshou.highlevel.experiment import ExperimentConfig, SACExperimentBuilder
+from tianshou.highlevel.experiment import SACExperimentBuilder
 from tianshou.highlevel.params.algorithm_params import SACParams
 from tianshou.highlevel.params.alpha import AutoAlphaFactoryDefault
 
-from armscan.agents.networks import Network
-from armscan.agents.protocols import LearningSetup
+from armscan.agents.networks import Network, Spread, checked_network
+from armscan.agents.protocols import AgentSetup
+from armscan.agents.replay import Replay
 from armscan.agents.tianshou_envs import SideBySideFactory
-from armscan.agents.tianshou_learner import TianshouLearner
-from armscan.checks import check_float, check_int
+from armscan.agents.tianshou_learner import TianshouLearner, experiment_config, rounded_up
+from armscan.checks import check_bool, check_float, check_int
 from armscan.errors import InvalidValueError
 
 
@@ -61,10 +62,12 @@ class SAC:
     updates_per_env_step: float = 0.25
     """Gradient steps for each environment step; they are what training costs."""
 
+    judged_by_sampling: bool = False
+    """Whether the policy is judged as it explores, by sampling, instead of by its mode."""
+
     def __post_init__(self) -> None:
-        is_network = all(callable(getattr(self.network, name, None)) for name in ("actor_factory", "critic_factory"))
-        if isinstance(self.network, type) or not is_network:
-            raise InvalidValueError(f"agent.network is {self.network!r}, but it must have the methods of Network")
+        checked_network(self.network)
+        check_bool("agent.judged_by_sampling", self.judged_by_sampling)
         for name in ("lr", "entropy_lr"):
             check_float(f"agent.{name}", getattr(self, name), above=0.0, at_most=1.0)
         for name in ("initial_entropy_coefficient", "updates_per_env_step"):
@@ -80,15 +83,15 @@ class SAC:
                 f"agent.batch_size is {self.batch_size}, but it must be at most agent.buffer_size = {self.buffer_size}"
             )
 
-    def learner(self, setup: LearningSetup) -> TianshouLearner:
+    def agent(self, setup: AgentSetup) -> TianshouLearner:
         """Makes an agent that has learned nothing yet.
 
         Raises:
             InvalidValueError: if the training takes no more steps than the random ones, or the network cannot take the
                 observations.
         """
-        self.network.check(setup.observation_space)
-        n_random = self._rounded_up(self.random_env_steps)
+        network = self.network.chosen_for(setup.observation_space)
+        n_random = rounded_up(self.random_env_steps, self.num_envs)
         if n_random >= setup.total_env_steps:
             raise InvalidValueError(
                 f"agent.random_env_steps is {self.random_env_steps}, {n_random} for {self.num_envs} environments, but "
@@ -96,19 +99,20 @@ class SAC:
             )
         builder = SACExperimentBuilder(
             SideBySideFactory(setup.make_envs),
-            ExperimentConfig(seed=setup.seed, device=setup.device, watch=False, persistence_enabled=False),
+            experiment_config(setup),
             OffPolicyTrainingConfig(
                 num_training_envs=self.num_envs,
                 num_test_envs=1,
-                buffer_size=min(self.buffer_size, setup.total_env_steps + self.num_envs),
-                collection_step_num_env_steps=self._rounded_up(self.env_steps_per_collection),
+                # Tianshou's own, which ours takes the place of.
+                buffer_size=self.num_envs,
+                collection_step_num_env_steps=rounded_up(self.env_steps_per_collection, self.num_envs),
                 update_step_num_gradient_steps_per_sample=self.updates_per_env_step,
                 batch_size=self.batch_size,
             ),
         )
         builder.with_sac_params(
             SACParams(
-                deterministic_eval=True,
+                deterministic_eval=not self.judged_by_sampling,
                 gamma=self.gamma,
                 tau=self.tau,
                 actor_lr=self.lr,
@@ -121,10 +125,12 @@ class SAC:
                 ),
             )
         )
-        builder.with_actor_factory(self.network.actor_factory())
-        builder.with_common_critic_factory(self.network.critic_factory())
-        return TianshouLearner(builder.build(), random_env_steps=n_random)
-
-    def _rounded_up(self, n_env_steps: int) -> int:
-        """The next multiple of the number of environments, which Tianshou takes in any case."""
-        return -(-n_env_steps // self.num_envs) * self.num_envs
+        builder.with_actor_factory(network.actor_factory(Spread(conditioned=True)))
+        builder.with_common_critic_factory(network.critic_factory())
+        return TianshouLearner(
+            builder.build(),
+            replay=Replay(min(self.buffer_size, setup.total_env_steps + self.num_envs), self.num_envs),
+            random_env_steps=n_random,
+            seed=setup.seed,
+            compute=setup.compute,
+        )

@@ -10,12 +10,16 @@ from typing import Any
 import numpy as np
 import torch
 from tianshou.data import Batch
-from tianshou.highlevel.experiment import Experiment
+from tianshou.highlevel.experiment import Experiment, ExperimentConfig
 from tianshou.highlevel.persistence import PolicyPersistence
 from tianshou.utils.logger.logger_base import BaseLogger
 
+from armscan.agents.compute import Compute
+from armscan.agents.protocols import AgentSetup
+from armscan.agents.replay import Replay
+from armscan.envs.actions import ActionBounds
 from armscan.envs.task import Observed
-from armscan.errors import DivergedError
+from armscan.errors import CheckpointError, DivergedError
 from armscan.volumes.plane import FloatArray
 
 
@@ -25,12 +29,15 @@ class EpochMetrics(BaseLogger):
     UPDATE_NAMES = (
         ("actor_loss", "update/actor_loss"),
         ("critic1_loss", "update/critic_loss"),
+        ("vf_loss", "update/critic_loss"),
+        ("ent_loss", "update/entropy"),
         ("alpha", "update/entropy_coefficient"),
     )
 
     def __init__(self) -> None:
         super().__init__()
         self._values: defaultdict[str, list[float]] = defaultdict(list)
+        self._n_updates = 0
 
     def log_training_data(self, log_data: dict[str, Any], step: int) -> None:
         """Gathers returns and lengths of the episodes that have ended."""
@@ -38,7 +45,8 @@ class EpochMetrics(BaseLogger):
         self._values["train/length"].extend(log_data["lens"])
 
     def log_update_data(self, log_data: dict[str, Any], step: int) -> None:
-        """Gathers losses."""
+        """Gathers losses, and counts gradient steps, of which PPO reports many at once."""
+        self._n_updates += log_data.get("gradient_steps", 1)
         for theirs, ours in self.UPDATE_NAMES:
             value = log_data.get(theirs)
             if isinstance(value, dict):
@@ -47,10 +55,12 @@ class EpochMetrics(BaseLogger):
                 self._values[ours].append(float(value))
 
     def take(self) -> dict[str, float]:
-        """Returns the means since the last call, and how many episodes have ended."""
+        """Returns the means since the last call, how many episodes have ended, and how many updates were made."""
         metrics = {name: float(np.mean(values)) for name, values in self._values.items() if values}
         metrics["train/episodes"] = float(len(self._values["train/length"]))
+        metrics["updates"] = float(self._n_updates)
         self._values.clear()
+        self._n_updates = 0
         return metrics
 
     def write(self, step_type: str, step: int, data: dict[str, Any]) -> None:
@@ -88,27 +98,38 @@ class TianshouLearner:
     The experiment's own test collector, persistence and progress bars are left out: evaluation, checkpoints and
     progress are the same for every agent, and belong to training.
 
+    Every epoch begins with new episodes, and draws whatever it draws from `seed` and its own number. So nothing of an
+    episode has to be kept for a training to go on later exactly as it would have gone on at once.
+
     Args:
         experiment: as its builder gives it.
+        replay: what the experiment's transitions are kept in.
         random_env_steps: steps with random actions before the first update.
+        seed: of everything that is drawn.
+        compute: how the networks are computed.
     """
 
-    def __init__(self, experiment: Experiment, *, random_env_steps: int) -> None:
+    def __init__(
+        self, experiment: Experiment, *, replay: Replay, random_env_steps: int, seed: int, compute: Compute
+    ) -> None:
         world = experiment.create_experiment_world()
         self._metrics = EpochMetrics()
         world.logger = self._metrics
         world.test_collector = None
+        assert world.training_collector is not None
+        self._collector = world.training_collector
+        self._collector.buffer = replay
         trainer = experiment.algorithm_factory.create_trainer(world, _NoPersistence())
         trainer.params.show_progress = False
         trainer.reset(reset_collectors=False)
-        assert world.training_collector is not None
-        self._collector = world.training_collector
-        # Tianshou searches the whole replay buffer for NaNs at every collection, which costs more the fuller it is; the
-        # environment's observations are clipped counts and finite by construction.
-        vars(self._collector.buffer)["hasnull"] = lambda: False
         self._algorithm = world.algorithm
         self._trainer = trainer
+        self._replay = replay
         self._random_env_steps = random_env_steps
+        self._seed = seed
+        self._n_epochs = 0
+        for network in networks_of(self._algorithm):
+            compute.apply_to(network)
 
     @property
     def n_env_steps(self) -> int:
@@ -117,7 +138,9 @@ class TianshouLearner:
 
     def warm_up(self) -> None:
         """Fills the replay buffer with random steps."""
-        self._collector.collect(n_step=self._random_env_steps, random=True)
+        self._begin_epoch()
+        if self._random_env_steps:
+            self._collector.collect(n_step=self._random_env_steps, random=True)
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
         """Learns for one epoch of at least `n_env_steps`; returns its training metrics by name.
@@ -125,6 +148,8 @@ class TianshouLearner:
         Raises:
             DivergedError: if the weights are not finite afterwards.
         """
+        self._n_epochs += 1
+        self._begin_epoch()
         self._trainer.params.epoch_num_steps = n_env_steps
         n_before, start_s = self.n_env_steps, time.perf_counter()
         try:
@@ -135,8 +160,22 @@ class TianshouLearner:
             raise
         self._check_weights()
         metrics = self._metrics.take()
-        metrics["speed/env_steps_per_s"] = (self.n_env_steps - n_before) / (time.perf_counter() - start_s)
+        seconds = time.perf_counter() - start_s
+        metrics["speed/env_steps_per_s"] = (self.n_env_steps - n_before) / seconds
+        metrics["speed/updates_per_s"] = metrics.pop("updates") / seconds
+        metrics["replay_size"] = float(len(self._replay))
         return metrics
+
+    def _begin_epoch(self) -> None:
+        """Begins episodes anew, and everything that is drawn."""
+        self._replay.cut_off()
+        for_torch, for_numpy, for_replay, for_envs = np.random.SeedSequence([self._seed, self._n_epochs]).spawn(4)
+        torch.manual_seed(int(for_torch.generate_state(1)[0]))
+        # Tianshou shuffles with NumPy's global generator.
+        np.random.seed(for_numpy.generate_state(1))  # noqa: NPY002
+        self._replay.seed(int(for_replay.generate_state(1)[0]))
+        self._collector.env.seed([int(word) for word in for_envs.generate_state(self._collector.env_num)])
+        self._collector.reset_env()
 
     def _check_weights(self, cause: ValueError | None = None) -> None:
         if not all(torch.isfinite(weights).all() for weights in self._algorithm.parameters()):
@@ -145,20 +184,81 @@ class TianshouLearner:
                 "finite any more; a smaller agent.lr or agent.entropy_lr may help"
             ) from cause
 
-    def act(self, observation: Observed) -> FloatArray:
-        """Returns the deterministic policy's action, shape (n_free,)."""
+    def begin(self, *, seed: int, bounds: ActionBounds) -> None:
+        """Learns that an episode begins; only a policy that is judged by sampling draws anything in it."""
+        torch.manual_seed(seed)
+
+    def act(self, observation: Observed, reward: float) -> FloatArray:
+        """Returns the policy's action, shape (n_free,)."""
         policy = self._algorithm.policy
         with torch.no_grad():
             result = policy(Batch(obs=_batch_of_one(observation), info=Batch()))
         return np.asarray(policy.map_action(result.act.cpu().numpy())[0])
 
+    def weights(self) -> dict[str, Any]:
+        """Returns the policy's weights."""
+        return dict(self._algorithm.policy.state_dict())
+
+    def load_weights(self, weights: dict[str, Any]) -> None:
+        """Takes over a policy's weights.
+
+        Raises:
+            CheckpointError: if they are those of another network.
+        """
+        _load(self._algorithm.policy, weights)
+
     def state(self) -> dict[str, Any]:
-        """Returns the weights and the optimisers' state."""
-        return dict(self._algorithm.state_dict())  # type: ignore[no-untyped-call]
+        """Returns networks, optimisers, replay buffer and counters."""
+        self._replay.cut_off()
+        return {
+            "algorithm": dict(self._algorithm.state_dict()),  # type: ignore[no-untyped-call]
+            "entropy_optimiser": {key: optim.state_dict() for key, optim in _entropy_optimisers(self._algorithm)},
+            "replay": self._replay.state(),
+            "n_env_steps": self.n_env_steps,
+            "n_epochs": self._n_epochs,
+        }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Takes over weights and optimisers' state."""
-        self._algorithm.load_state_dict(dict(state))
+        """Takes over what `state` returned.
+
+        Raises:
+            CheckpointError: if it is that of another agent.
+        """
+        _load(self._algorithm, dict(state["algorithm"]))
+        for key, optim in _entropy_optimisers(self._algorithm):
+            optim.load_state_dict(state["entropy_optimiser"][key])
+        self._replay.load_state(state["replay"])
+        self._collector.collect_step = state["n_env_steps"]
+        self._n_epochs = state["n_epochs"]
+
+
+def experiment_config(setup: AgentSetup) -> ExperimentConfig:
+    """Returns what Tianshou has to know of a setup."""
+    return ExperimentConfig(seed=setup.seed, device=setup.compute.torch_device, watch=False, persistence_enabled=False)
+
+
+def rounded_up(n_env_steps: int, num_envs: int) -> int:
+    """Returns the next multiple of the number of environments, which Tianshou takes in any case."""
+    return -(-n_env_steps // num_envs) * num_envs
+
+
+def networks_of(algorithm: torch.nn.Module) -> list[torch.nn.Module]:
+    """Returns the networks of an algorithm: its actor, its critics, and their lagging copies."""
+    critics = [module for name, module in algorithm.named_children() if name.startswith("critic")]
+    return [algorithm.get_submodule("policy.actor"), *critics]
+
+
+def _load(module: torch.nn.Module, weights: dict[str, Any]) -> None:
+    try:
+        module.load_state_dict(weights)
+    except (RuntimeError, KeyError, ValueError) as error:
+        raise CheckpointError(f"the checkpoint is another agent's or network's: {error}") from error
+
+
+def _entropy_optimisers(algorithm: Any) -> list[tuple[str, torch.optim.Optimizer]]:
+    """The optimiser of a learned entropy coefficient, which Tianshou leaves out of an algorithm's state."""
+    optimiser = getattr(getattr(algorithm, "alpha", None), "_optim", None)
+    return [] if optimiser is None else [("entropy", optimiser)]
 
 
 def _batch_of_one(observation: Observed) -> Any:

@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from armscan.checks import check_choice, check_int
+from armscan.envs.actions import COMPONENTS
 from armscan.envs.episode import Episode, begin, checked_actions, info_of, look, wanted_volume
 from armscan.envs.scene import Scene
 from armscan.envs.task import Observed, Task, Volumes
@@ -109,6 +110,11 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     def volumes(self) -> dict[str, LabelVolume]:
         """The volumes by name."""
         return self.task.volumes
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """The free components of an action, in its order, such as `("rz", "ty")`."""
+        return tuple(COMPONENTS[component] for component in self.task.free)
 
     @property
     def episode(self) -> Episode:

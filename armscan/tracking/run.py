@@ -79,23 +79,25 @@ class TrackedRun:
         for file in files:
             self._client.log_artifact(self.run_id, str(file))
 
-    def keep_results(self, result: TrainingResult, evaluations: Mapping[str, Evaluation], folder: Path) -> None:
+    def keep_results(self, result: TrainingResult | None, evaluations: Mapping[str, Evaluation], folder: Path) -> None:
         """Logs the final evaluations, and keeps what the run has made in its folder.
 
         Args:
             result: of the training; the evaluations are logged at the step of its best epoch, whose weights they judge.
+                None where there was nothing to learn.
             evaluations: by the name of their volumes.
             folder: of the run; the learning curve's picture and the evaluations' figures are added to it.
         """
         for name, evaluation in evaluations.items():
             prefix = name.replace(" ", "_").replace("-", "_")
             figures = {f"{prefix}/{figure}": value for figure, value in evaluation.metrics().items()}
-            self.log_figures(figures, n_env_steps=result.best.n_env_steps)
-        self.log_figures({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
+            self.log_figures(figures, n_env_steps=result.best.n_env_steps if result else 0)
+        if result:
+            self.log_figures({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
+            draw_learning_curve(result.reports, folder / CURVE_FILE, title=self.name)
         contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
         (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
         (folder / CONFIG_FILE).write_text(yaml.safe_dump(self._config, sort_keys=False))
-        draw_learning_curve(result.reports, folder / CURVE_FILE, title=self.name)
         self.log_files(*sorted(file for file in folder.iterdir() if file.is_file()))
 
     def __enter__(self) -> Self:

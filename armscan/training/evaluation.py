@@ -111,11 +111,13 @@ def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluatio
 
 def _play(agent: Agent, env: Env, volume_name: str, seed: int) -> Episode:
     observation, info = env.reset(seed=seed, options={"volume": volume_name})
-    n_steps, episode_return, ended = 0, 0.0, False
+    agent.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
+    n_steps, episode_return, reward, ended = 0, 0.0, float(info["reward"]), False
     while not ended:
-        observation, reward, terminated, truncated, info = env.step(agent.act(observation))
+        observation, received, terminated, truncated, info = env.step(agent.act(observation, reward))
+        reward = float(received)
         n_steps += 1
-        episode_return += float(reward)
+        episode_return += reward
         ended = terminated or truncated
     return Episode(
         volume=volume_name,

@@ -31,9 +31,10 @@ def film_episode(agent: Agent, env: Env, path: Path, *, seed: int) -> None:
         if not info["starts_solved"]:
             break
     frames = [_picture(env)]
-    ended = False
+    agent.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
+    reward, ended = info["reward"], False
     while not ended:
-        observation, _, terminated, truncated, _ = env.step(agent.act(observation))
+        observation, reward, terminated, truncated, _ = env.step(agent.act(observation, float(reward)))
         frames.append(_picture(env))
         ended = terminated or truncated
     durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]

@@ -132,14 +132,13 @@ def train(
     finally:
         for callback in callbacks:
             callback.on_end()
-    learner.load_state(load_checkpoint(folder / BEST_CHECKPOINT)[0])
+    learner.load_weights(load_checkpoint(folder / BEST_CHECKPOINT)[0])
     return TrainingResult(tuple(reports), is_solved, time.perf_counter() - start_s)
 
 
 def _keep(learner: Learner, report: EpochReport, folder: Path) -> None:
     """Writes the last checkpoint, and the best one where it is better than all before."""
     facts = {"n_env_steps": report.n_env_steps, "epoch": report.epoch, **report.evaluation.metrics()}
-    state = learner.state()
-    save_checkpoint(folder / LAST_CHECKPOINT, state, facts)
+    save_checkpoint(folder / LAST_CHECKPOINT, learner.state(), facts)
     if report.is_best:
-        save_checkpoint(folder / BEST_CHECKPOINT, state, facts)
+        save_checkpoint(folder / BEST_CHECKPOINT, learner.weights(), facts)

@@ -8,6 +8,8 @@ from tianshou.env import BaseVectorEnv
 from armscan.agents.tianshou_envs import SideBySide
 from armscan.envs import ArmscanEnv, EnvMaker
 
+from .conftest import setup_for
+
 
 @pytest.fixture
 def make(phantom):
@@ -56,18 +58,12 @@ def test_side_by_side_gives_images_as_batches(make):
 
 def test_collector_steps_the_vector_environment(make, phantom, monkeypatch):
     """Tianshou's own collector, on environments of our factory: all planes of a step are looked at together."""
-    from armscan.agents import MLP, SAC, LearningSetup
+    from armscan.agents import MLP, SAC
     from armscan.anatomy import Scanner
 
     maker = EnvMaker(projection="zy", max_steps=4)
-    setup = LearningSetup(
-        make_envs=lambda n: maker.many(n, [phantom], autoreset_mode="Disabled"),
-        observation_space=maker.one([phantom]).observation_space,
-        total_env_steps=60,
-        seed=0,
-        device="cpu",
-    )
-    learner = SAC(network=MLP((8,)), num_envs=4, random_env_steps=20, batch_size=8).learner(setup)
+    algorithm = SAC(network=MLP((8,)), num_envs=4, random_env_steps=20, batch_size=8)
+    learner = algorithm.agent(setup_for(maker, phantom))
     looked_at = []
     look_all = Scanner.look_all
     monkeypatch.setattr(Scanner, "look_all", lambda *a: looked_at.append(len(a[1])) or look_all(*a))

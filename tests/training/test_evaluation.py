@@ -15,7 +15,10 @@ from .test_train import evaluation_of
 class Still:
     """Stays in the middle."""
 
-    def act(self, observation):
+    def begin(self, *, seed, bounds):
+        pass
+
+    def act(self, observation, reward):
         return np.zeros(1)
 
 
@@ -25,7 +28,10 @@ class Oracle:
     def __init__(self, env):
         self._env = env.unwrapped
 
-    def act(self, observation):
+    def begin(self, *, seed, bounds):
+        pass
+
+    def act(self, observation, reward):
         return self._env.scene.optimum_normalised[3:]
 
 

@@ -8,7 +8,10 @@ from armscan.training import film_episode
 
 
 class Still:
-    def act(self, observation):
+    def begin(self, *, seed, bounds):
+        pass
+
+    def act(self, observation, reward):
         return np.array([-1.0])
 
 

@@ -38,7 +38,7 @@ class ScriptedLearner:
     def __init__(self):
         self.n_env_steps = 0
         self.asked = []
-        self.weights = 0
+        self.n_epochs = 0
 
     def warm_up(self):
         self.n_env_steps += 10
@@ -46,16 +46,25 @@ class ScriptedLearner:
     def learn(self, n_env_steps):
         self.asked.append(n_env_steps)
         self.n_env_steps += n_env_steps
-        self.weights += 1
+        self.n_epochs += 1
         return {"train/length": 3.0}
 
+    def weights(self):
+        return {"weights": self.n_epochs}
+
+    def load_weights(self, weights):
+        self.n_epochs = weights["weights"]
+
     def state(self):
-        return {"weights": self.weights}
+        return {"state": self.n_epochs}
 
     def load_state(self, state):
-        self.weights = state["weights"]
+        self.n_epochs = state["state"]
 
-    def act(self, observation):
+    def begin(self, *, seed, bounds):
+        pass
+
+    def act(self, observation, reward):
         raise AssertionError("nobody acts here")
 
 
@@ -91,17 +100,17 @@ def test_train_spends_the_budget_and_not_more(tmp_path):
 
 def test_train_keeps_the_best_and_the_last_and_ends_with_the_best(tmp_path):
     learner, recorder, result = run(tmp_path, [evaluation_of(9), evaluation_of(3), evaluation_of(5)])
-    assert learner.weights == 2
+    assert learner.n_epochs == 2
     assert result.best.n_env_steps == 90
     assert load_checkpoint(tmp_path / BEST_CHECKPOINT)[0] == {"weights": 2}
     state, facts = load_checkpoint(tmp_path / LAST_CHECKPOINT)
-    assert (state, facts["n_env_steps"], facts["mean_steps"]) == ({"weights": 3}, 100, 5.0)
+    assert (state, facts["n_env_steps"], facts["mean_steps"]) == ({"state": 3}, 100, 5.0)
     assert [call[2] for call in recorder.calls if call[0] == "epoch"] == [True, True, False]
 
 
 def test_train_prefers_success_to_few_steps(tmp_path):
     learner, *_ = run(tmp_path, [evaluation_of(50), evaluation_of(1, success=False), evaluation_of(60)])
-    assert learner.weights == 1
+    assert learner.n_epochs == 1
 
 
 def test_train_stops_when_solved_often_enough_in_a_row(tmp_path):

@@ -1,0 +1,65 @@
+"""Where and how tensors are computed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+
+from armscan.checks import check_bool, check_choice
+from armscan.errors import InvalidValueError
+
+DEVICES = ("auto", "cpu", "cuda")
+PRECISIONS = ("float32", "bfloat16")
+
+
+@dataclass(frozen=True)
+class Compute:
+    """Where and how tensors are computed.
+
+    Args:
+        device: `cpu`, `cuda`, or `auto` for `cuda` where there is one.
+        precision: `float32`, or `bfloat16` for mixed precision: products in 16 bits, sums and weights in 32.
+        compile: whether networks go through `torch.compile`, which takes a minute and a C++ compiler.
+
+    Raises:
+        InvalidValueError: if a value is unknown, or there is no such device here.
+    """
+
+    device: str = "auto"
+    precision: str = "float32"
+    compile: bool = False
+
+    def __post_init__(self) -> None:
+        check_choice("device", self.device, DEVICES)
+        check_choice("precision", self.precision, PRECISIONS)
+        check_bool("compile", self.compile)
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise InvalidValueError("device is 'cuda', but torch finds no CUDA device here; it must be 'cpu' or 'auto'")
+
+    @property
+    def torch_device(self) -> str:
+        """The device that tensors are on: `cpu` or `cuda`."""
+        return "cuda" if self.device == "cuda" or (self.device == "auto" and torch.cuda.is_available()) else "cpu"
+
+    def apply_to(self, network: nn.Module) -> None:
+        """Makes a network compute in this way from now on; its inputs and outputs stay of 32 bits."""
+        if self.precision == "bfloat16":
+            forward = network.forward
+            device = self.torch_device
+
+            def precise(*args: Any, **kwargs: Any) -> Any:
+                with torch.autocast(device, dtype=torch.bfloat16):
+                    return _in_32_bits(forward(*args, **kwargs))
+
+            network.forward = precise
+        if self.compile:
+            network.compile()
+
+
+def _in_32_bits(output: Any) -> Any:
+    if isinstance(output, tuple):
+        return tuple(map(_in_32_bits, output))
+    return output.float() if isinstance(output, torch.Tensor) else output

@@ -1,0 +1,221 @@
+"""The network for observations with images: convolutions for these, linear layers for the vectors beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from tianshou.highlevel.env import Environments
+from tianshou.highlevel.module.actor import ActorFactory
+from tianshou.highlevel.module.core import init_linear_orthogonal
+from tianshou.highlevel.module.critic import CriticFactory
+from tianshou.highlevel.params.dist_fn import DistributionFunctionFactoryIndependentGaussians
+from tianshou.utils.net.common import ModuleWithVectorOutput
+from tianshou.utils.net.continuous import ContinuousActorProbabilistic
+from tianshou.utils.torch_utils import torch_device
+from torch import nn
+
+from armscan.agents.networks import Spread
+from armscan.checks import check_ints
+from armscan.errors import InvalidValueError
+
+# Kernel and stride of each convolution.
+CONVOLUTIONS = ((8, 4), (4, 2), (3, 1))
+
+
+class Multimodal:
+    """Convolutions for the images, linear layers for the vectors beside them, and a head for both together.
+
+    Images: three convolutions (8 x 8 stride 4, 4 x 4 stride 2, 3 x 3 stride 1), ReLU after each, flattened; stacked
+    frames are channels. Vectors (action, reward, memory, clusters, and for a critic the action it judges): two linear
+    layers. Head: two more linear layers, and the output. As in the published work, with 32, 64 and 64 filters and 512
+    units, after the network of Mnih et al. 2015 (doi:10.1038/nature14236).
+
+    Args:
+        filters: of each convolution.
+        vector_sizes: units of each layer for the vectors.
+        head_sizes: units of each layer of the head but the output.
+
+    Raises:
+        InvalidValueError: if a size is not a whole number of at least 1.
+    """
+
+    def __init__(
+        self,
+        filters: Sequence[int] = (32, 64, 64),
+        vector_sizes: Sequence[int] = (512, 512),
+        head_sizes: Sequence[int] = (512, 512),
+    ) -> None:
+        self.filters = list(check_ints("network.filters", filters, 3, "for the convolutions", at_least=1, at_most=4096))
+        self.vector_sizes, self.head_sizes = (
+            list(check_ints(f"network.{name}", sizes, None, "", at_least=1, at_most=65536))
+            for name, sizes in (("vector_sizes", vector_sizes), ("head_sizes", head_sizes))
+        )
+
+    def chosen_for(self, observation_space: spaces.Space[Any]) -> Multimodal:
+        """See `Network.chosen_for`."""
+        images = images_of(observation_space)
+        if not images:
+            raise InvalidValueError(
+                "network is multimodal, which takes images, but the observation has none; take network=mlp, or an "
+                "observation with images, such as obs=slice, and env.flat=null or false"
+            )
+        smallest = smallest_side_px()
+        for name, box in images.items():
+            if min(box.shape[-2:]) < smallest:
+                raise InvalidValueError(
+                    f"the observation's {name} is {' x '.join(map(str, box.shape[-2:]))} pixels, but the convolutions "
+                    f"of network=multimodal need at least {smallest} x {smallest}: change obs.shape or obs.crop"
+                )
+        return self
+
+    def actor_factory(self, spread: Spread) -> ActorFactory:
+        """See `Network.actor_factory`."""
+        return _MultimodalActorFactory(self, spread)
+
+    def critic_factory(self) -> CriticFactory:
+        """See `Network.critic_factory`."""
+        return _MultimodalCriticFactory(self)
+
+
+def smallest_side_px() -> int:
+    """Returns the smallest side of an image that the convolutions leave a pixel of."""
+    side = 1
+    for kernel, stride in reversed(CONVOLUTIONS):
+        side = (side - 1) * stride + kernel
+    return side
+
+
+def images_of(space: spaces.Space[Any]) -> dict[str, spaces.Box]:
+    """Returns the images among the parts of an observation, by name: those of bytes, with two axes or more."""
+    parts = space.spaces if isinstance(space, spaces.Dict) else {}
+    return {
+        name: box
+        for name, box in parts.items()
+        if isinstance(box, spaces.Box) and box.dtype == np.uint8 and len(box.shape) >= 2
+    }
+
+
+class MultimodalBody(ModuleWithVectorOutput):
+    """All of the network but its output.
+
+    Args:
+        network: its sizes.
+        space: of the observations.
+        n_action: components of the action that a critic judges, 0 for none.
+    """
+
+    def __init__(self, network: Multimodal, space: spaces.Dict, n_action: int = 0) -> None:
+        super().__init__(network.head_sizes[-1])
+        images = images_of(space)
+        self._vectors = [name for name in space if name not in images]
+        self._scales = {name: 1.0 / float(box.high.max()) for name, box in images.items()}
+        self.convolutions = nn.ModuleDict({name: _convolutions(box, network.filters) for name, box in images.items()})
+        n_features = sum(_n_features(self.convolutions[name], box) for name, box in images.items())
+        n_vector = sum(int(np.prod(space[name].shape or ())) for name in self._vectors) + n_action
+        self.vector = _linear_layers(n_vector, network.vector_sizes)
+        self.head = _linear_layers(n_features + network.vector_sizes[-1], network.head_sizes)
+
+    def forward(self, obs: Any, state: Any = None, info: Any = None, act: Any = None) -> tuple[torch.Tensor, Any]:
+        """Returns the features of a batch of observations, shape (n, head_sizes[-1]), and the state as it came.
+
+        Args:
+            obs: the parts by name, each shape (n, ...).
+            state: of recurrent networks, unused.
+            info: unused.
+            act: the actions to be judged, shape (n, n_action).
+        """
+        device = torch_device(self)
+        vectors = [obs[name] for name in self._vectors] + ([] if act is None else [act])
+        flat = [torch.as_tensor(vector, dtype=torch.float32, device=device).flatten(1) for vector in vectors]
+        features = [self.vector(torch.cat(flat, dim=1))]
+        for name, convolutions in self.convolutions.items():
+            image = torch.as_tensor(obs[name], device=device)
+            # Frames, and a channel for each tissue, side by side as channels.
+            frames = image.reshape(len(image), -1, *image.shape[-2:]).float() * self._scales[name]
+            features.append(convolutions(frames))
+        return self.head(torch.cat(features, dim=1)), state
+
+
+class MultimodalCritic(nn.Module):
+    """A critic of observations, or of observations with actions.
+
+    Args:
+        body: all but its output.
+    """
+
+    def __init__(self, body: MultimodalBody) -> None:
+        super().__init__()
+        self.body = body
+        self.last = nn.Linear(body.get_output_dim(), 1)
+
+    def forward(self, obs: Any, act: Any = None, info: Any = None) -> torch.Tensor:
+        """Returns the values, shape (n, 1)."""
+        features, _ = self.body(obs, act=act)
+        return torch.as_tensor(self.last(features))
+
+
+class _MultimodalActorFactory(ActorFactory):
+    def __init__(self, network: Multimodal, spread: Spread) -> None:
+        self._network, self._spread = network, spread
+
+    def create_module(self, envs: Environments, device: str | torch.device) -> nn.Module:
+        actor = ContinuousActorProbabilistic(
+            preprocess_net=MultimodalBody(self._network, _space_of(envs)),
+            action_shape=envs.get_action_shape(),
+            unbounded=True,
+            conditioned_sigma=self._spread.conditioned,
+        )
+        self._init_linear(actor)
+        return self._spread.initialise(actor).to(device)
+
+    def create_dist_fn(self, envs: Environments) -> Any:
+        return DistributionFunctionFactoryIndependentGaussians().create_dist_fn(envs)
+
+
+class _MultimodalCriticFactory(CriticFactory):
+    def __init__(self, network: Multimodal) -> None:
+        self._network = network
+
+    def create_module(
+        self,
+        envs: Environments,
+        device: str | torch.device,
+        use_action: bool,
+        discrete_last_size_use_action_shape: bool = False,
+    ) -> nn.Module:
+        n_action = int(np.prod(envs.get_action_shape())) if use_action else 0
+        critic = MultimodalCritic(MultimodalBody(self._network, _space_of(envs), n_action))
+        init_linear_orthogonal(critic)
+        return critic.to(device)
+
+
+def _space_of(envs: Environments) -> spaces.Dict:
+    space = envs.get_observation_space()
+    assert isinstance(space, spaces.Dict)
+    return space
+
+
+def _convolutions(box: spaces.Box, filters: Sequence[int]) -> nn.Sequential:
+    n_channels = int(np.prod(box.shape[:-2]))
+    layers: list[nn.Module] = []
+    for n_filters, (kernel, stride) in zip(filters, CONVOLUTIONS, strict=True):
+        layers += [nn.Conv2d(n_channels, n_filters, kernel, stride), nn.ReLU()]
+        n_channels = n_filters
+    return nn.Sequential(*layers, nn.Flatten())
+
+
+def _n_features(convolutions: nn.Module, box: spaces.Box) -> int:
+    with torch.no_grad():
+        frames = torch.zeros(1, int(np.prod(box.shape[:-2])), *box.shape[-2:])
+        return int(convolutions(frames).shape[1])
+
+
+def _linear_layers(n_inputs: int, sizes: Sequence[int]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for n_before, n in zip([n_inputs, *sizes], sizes, strict=False):
+        layers += [nn.Linear(n_before, n), nn.ReLU()]
+    return nn.Sequential(*layers)

@@ -1,0 +1,74 @@
+"""The replay buffer: Tianshou's, seeded, cut off at the end of an epoch, and kept in a checkpoint."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from tianshou.data import Batch, VectorReplayBuffer
+
+Tree = dict[str, Any]
+"""Tensors by name, and such dicts."""
+
+
+class Replay(VectorReplayBuffer):
+    """Transitions of several environments, each in a ring of its own.
+
+    Args:
+        size: transitions in all.
+        n_envs: environments.
+    """
+
+    def __init__(self, size: int, n_envs: int) -> None:
+        super().__init__(size, n_envs)
+
+    def hasnull(self) -> bool:
+        """Says that nothing is NaN.
+
+        Tianshou's collectors ask at every collection, and searching all that is kept costs more the fuller it is; the
+        environment's observations are clipped counts and finite by construction.
+        """
+        return False
+
+    def seed(self, seed: int) -> None:
+        """Seeds the drawing of samples; every ring has a generator of its own, all with the same seed as they come."""
+        children = np.random.SeedSequence(seed).spawn(1 + len(self.buffers))
+        for ring, child in zip((self, *self.buffers), children, strict=True):
+            ring._random_state.seed(child.generate_state(1))
+
+    def cut_off(self) -> None:
+        """Marks episodes that have not ended as truncated, because their environments are reset."""
+        if len(self):
+            unfinished = self.unfinished_index()
+            self.truncated[unfinished] = self.done[unfinished] = True
+        for ring in self.buffers:
+            ring._ep_return, ring._ep_len, ring._ep_start_idx = 0.0, 0, ring._insertion_idx
+
+    def state(self) -> Tree:
+        """Returns all transitions and where each ring goes on, for after `cut_off`."""
+        rings = [(ring._insertion_idx, len(ring), int(ring.last_index[0])) for ring in self.buffers]
+        return {"transitions": _tensors(self._meta) if len(self) else {}, "rings": rings}
+
+    def load_state(self, state: Tree) -> None:
+        """Takes over what `state` returned."""
+        self.reset()
+        if state["transitions"]:
+            self.set_batch(_batch(state["transitions"]))
+        for i, (ring, (insertion, length, last)) in enumerate(zip(self.buffers, state["rings"], strict=True)):
+            ring._insertion_idx, ring._size, ring.last_index = insertion, length, np.array([last])
+            ring._ep_start_idx = insertion
+            self._lengths[i], self.last_index[i] = length, self._offset[i] + last
+
+
+def _tensors(batch: Any) -> Tree:
+    """Returns the arrays of a batch as tensors; empty parts are left out."""
+    return {
+        name: _tensors(part) if isinstance(part, Batch) else torch.from_numpy(part)
+        for name, part in batch.items()
+        if not (isinstance(part, Batch) and len(part.get_keys()) == 0)
+    }
+
+
+def _batch(tree: Tree) -> Batch:
+    return Batch({name: _batch(part) if isinstance(part, dict) else part.numpy() for name, part in tree.items()})

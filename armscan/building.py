@@ -1,0 +1,82 @@
+"""What a configuration describes, built and checked, before anything is trained or tracked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from armscan.agents import Agent, AgentSetup
+from armscan.checks import check_int, check_seed
+from armscan.envs import EnvMaker
+from armscan.errors import InvalidValueError
+from armscan.training import Budget, Split
+
+SECTIONS = (
+    "data",
+    "obs",
+    "reward",
+    "agent",
+    "network",
+    "tracking",
+    "env",
+    "training",
+    "evaluation",
+    "compute",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """What a configuration describes.
+
+    Args:
+        split: the volumes.
+        maker: of environments, its reward fitted to the training volumes.
+        agent: which may be a learner.
+        budget: of the training.
+        n_episodes: of each final evaluation.
+        seed: of everything that is drawn.
+    """
+
+    split: Split
+    maker: EnvMaker
+    agent: Agent
+    budget: Budget
+    n_episodes: int
+    seed: int
+
+
+def build(config: DictConfig) -> Experiment:
+    """Builds an experiment from its composed configuration.
+
+    Raises:
+        InvalidValueError: if something in it is not allowed.
+    """
+    check_sections(config)
+    seed = check_seed("seed", config.seed)
+    n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
+    split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
+    maker = instantiate(config.env, _convert_="object").fitted_to(split.training)
+    env = maker.one(split.training)
+    setup = AgentSetup(
+        make_envs=partial(maker.many, volumes=split.training, autoreset_mode="Disabled"),
+        observation_space=env.observation_space,
+        action_names=env.get_wrapper_attr("action_names"),
+        total_env_steps=budget.env_steps,
+        seed=seed,
+        compute=instantiate(config.compute, _convert_="object"),
+    )
+    agent = instantiate(config.agent, _convert_="object").agent(setup)
+    return Experiment(split=split, maker=maker, agent=agent, budget=budget, n_episodes=n_episodes, seed=seed)
+
+
+def check_sections(config: DictConfig) -> None:
+    """Raises `InvalidValueError` where a whole section of the configuration was replaced by a value."""
+    for section in SECTIONS:
+        if not isinstance(config.get(section), DictConfig):
+            raise InvalidValueError(
+                f"{section} is {config.get(section)!r}, but it must be a section of the configuration"
+            )

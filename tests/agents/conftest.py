@@ -1,0 +1,57 @@
+"""What agents are given, and every algorithm with every network that fits."""
+
+from functools import partial
+
+import pytest
+
+from armscan.agents import MLP, PPO, SAC, AgentSetup, Compute, Multimodal
+from armscan.envs import EnvMaker, SliceChannelsObservation
+
+SMALL_MULTIMODAL = Multimodal(filters=(2, 2, 2), vector_sizes=(8,), head_sizes=(8,))
+SMALL_SAC = {"num_envs": 2, "random_env_steps": 20, "batch_size": 16, "env_steps_per_collection": 4}
+SMALL_PPO = {"num_envs": 2, "env_steps_per_collection": 20, "batch_size": 10, "passes_per_collection": 2}
+ALGORITHMS = {"sac": (SAC, SMALL_SAC), "ppo": (PPO, SMALL_PPO)}
+MAKERS = {
+    "vector": (EnvMaker(projection="zy"), MLP((8,))),
+    "images": (
+        EnvMaker(projection="zy", observation=SliceChannelsObservation(shape=(36, 36)), stack=2, memory=2),
+        SMALL_MULTIMODAL,
+    ),
+}
+
+
+def setup_for(maker, phantom, **changes):
+    arguments = {
+        "make_envs": partial(maker.many, volumes=[phantom], autoreset_mode="Disabled"),
+        "observation_space": maker.one([phantom]).observation_space,
+        "action_names": ("rz", "ty"),
+        "total_env_steps": 100,
+        "seed": 3,
+        "compute": Compute("cpu"),
+    }
+    return AgentSetup(**arguments | changes)
+
+
+@pytest.fixture(params=list(ALGORITHMS))
+def algorithm(request):
+    """Makes the algorithm with a network and changed parameters."""
+    kind, small = ALGORITHMS[request.param]
+    return lambda network=None, **changes: kind(network=network or MLP((8,)), **small | changes)
+
+
+@pytest.fixture(params=list(MAKERS))
+def maker_and_network(request):
+    return MAKERS[request.param]
+
+
+@pytest.fixture
+def make_learner(algorithm, maker_and_network, phantom):
+    """Makes a learner of every algorithm, for vectors and for images."""
+    maker, network = maker_and_network
+    return lambda **changes: algorithm(network, **changes).agent(setup_for(maker, phantom))
+
+
+@pytest.fixture
+def env(maker_and_network, phantom):
+    """An environment that `make_learner`'s learners can act in."""
+    return maker_and_network[0].one([phantom])

@@ -1,0 +1,170 @@
+"""What holds for every learner: SAC and PPO, with vectors and with images."""
+
+import numpy as np
+import pytest
+import torch
+
+from armscan.agents import PPO, SAC, Learner
+from armscan.errors import CheckpointError, DivergedError, InvalidValueError
+from armscan.training import load_checkpoint, save_checkpoint
+
+from .conftest import MAKERS, SMALL_SAC, setup_for
+
+
+def tensors(tree):
+    """Every tensor of nested dicts and lists, in order."""
+    if isinstance(tree, torch.Tensor):
+        return [tree]
+    parts = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list | tuple) else []
+    return [tensor for part in parts for tensor in tensors(part)]
+
+
+def begun(learner, env, seed=0):
+    observation, info = env.reset(seed=seed)
+    learner.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
+    return observation, float(info["reward"])
+
+
+def test_learner_has_all_that_training_needs(make_learner):
+    assert isinstance(make_learner(), Learner)
+
+
+def test_learner_counts_every_environment_step(make_learner):
+    learner = make_learner()
+    learner.warm_up()
+    first = learner.n_env_steps
+    assert first in (0, 20)
+    learner.learn(40)
+    assert first + 40 <= learner.n_env_steps <= first + 60
+    assert learner.learn(7)["speed/env_steps_per_s"] > 0
+
+
+def test_learner_reports_episodes_losses_and_speed(make_learner):
+    learner = make_learner()
+    learner.warm_up()
+    metrics = learner.learn(60)
+    assert {"update/actor_loss", "update/critic_loss", "speed/env_steps_per_s", "replay_size"} <= metrics.keys()
+    assert metrics["speed/updates_per_s"] > 0
+    assert all(np.isfinite(value) for value in metrics.values())
+    if metrics["train/episodes"]:
+        assert 1 <= metrics["train/length"] <= 50
+        assert -50 <= metrics["train/return"] <= 0
+
+
+def test_learner_acts_without_exploration(make_learner, env):
+    learner = make_learner()
+    observation, reward = begun(learner, env)
+    action = learner.act(observation, reward)
+    assert env.action_space.contains(action)
+    np.testing.assert_array_equal(action, learner.act(observation, reward))
+
+
+def test_learner_judged_by_sampling_draws_from_the_episodes_seed(make_learner, env):
+    learner = make_learner(judged_by_sampling=True)
+    observation, reward = begun(learner, env)
+    first, second = learner.act(observation, reward), learner.act(observation, reward)
+    assert not np.array_equal(first, second)
+    begun(learner, env)
+    np.testing.assert_array_equal(learner.act(observation, reward), first)
+
+
+def test_learner_of_the_same_seed_learns_the_same(make_learner):
+    learned = []
+    for _ in range(2):
+        learner = make_learner()
+        learner.warm_up()
+        learner.learn(20)
+        learned.append(tensors(learner.state()))
+    assert all(torch.equal(a, b) for a, b in zip(*learned, strict=True))
+
+
+def test_learner_goes_on_from_a_checkpoint_bit_for_bit(make_learner, tmp_path):
+    learner = make_learner()
+    learner.warm_up()
+    learner.learn(20)
+    save_checkpoint(tmp_path / "last.pt", learner.state(), {})
+    other = make_learner()
+    other.load_state(load_checkpoint(tmp_path / "last.pt")[0])
+    # What is drawn elsewhere in between must change nothing.
+    torch.rand(7), np.random.rand(7)  # noqa: NPY002
+    for each in (learner, other):
+        each.learn(20)
+        each.learn(20)
+    assert learner.n_env_steps == other.n_env_steps
+    pairs = list(zip(tensors(learner.state()), tensors(other.state()), strict=True))
+    assert len(pairs) > 20
+    assert all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_weights_bring_back_what_the_policy_did(make_learner, env):
+    learner = make_learner()
+    observation, reward = begun(learner, env)
+    weights = {name: tensor.clone() for name, tensor in learner.weights().items()}
+    before = learner.act(observation, reward)
+    learner.warm_up()
+    learner.learn(60)
+    assert not np.array_equal(learner.act(observation, reward), before)
+    learner.load_weights(weights)
+    np.testing.assert_array_equal(learner.act(observation, reward), before)
+
+
+def test_load_refuses_what_belongs_to_another_network(make_learner):
+    learner = make_learner()
+    with pytest.raises(CheckpointError, match="another agent's or network's"):
+        learner.load_weights({"layer": torch.zeros(3)})
+    with pytest.raises(CheckpointError, match="another agent's or network's"):
+        learner.load_state(learner.state() | {"algorithm": {"layer": torch.zeros(3)}})
+
+
+def test_sac_keeps_no_more_transitions_than_the_training_takes(phantom):
+    maker, network = MAKERS["vector"]
+    learner = SAC(network=network, **SMALL_SAC, buffer_size=10**9).agent(setup_for(maker, phantom))
+    assert learner._replay.maxsize <= 110
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lr": 0}, r"agent\.lr is 0"),
+        ({"lr": 1e300}, r"agent\.lr is 1e\+300"),
+        ({"lr": "fast"}, r"agent\.lr is 'fast'"),
+        ({"gamma": 1.5}, r"agent\.gamma is 1\.5"),
+        ({"batch_size": 0}, r"agent\.batch_size is 0"),
+        ({"num_envs": 2.5}, r"agent\.num_envs is 2\.5"),
+        ({"judged_by_sampling": "yes"}, r"agent\.judged_by_sampling is 'yes'"),
+        ({"network": 64}, r"network is 64, but it must have the methods of Network"),
+    ],
+)
+def test_algorithm_refuses_impossible_parameters(algorithm, changes, message):
+    with pytest.raises(InvalidValueError, match=message):
+        algorithm(**changes)
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "message"),
+    [
+        (SAC, {"updates_per_env_step": -1}, r"agent\.updates_per_env_step is -1"),
+        (SAC, {"random_env_steps": 100}, r"agent\.random_env_steps is 100, .* must be below"),
+        (SAC, {"random_env_steps": 1, "num_envs": 100}, r"agent\.random_env_steps is 1, 100 for 100 environments"),
+        (SAC, {"buffer_size": 10}, r"agent\.batch_size is 16, but it must be at most agent\.buffer_size = 10"),
+        (PPO, {"clip_range": -0.1}, r"agent\.clip_range is -0\.1"),
+        (PPO, {"initial_log_sigma": 5}, r"agent\.initial_log_sigma is 5"),
+        (PPO, {"passes_per_collection": 0}, r"agent\.passes_per_collection is 0"),
+        (PPO, {"conditioned_sigma": 1}, r"agent\.conditioned_sigma is 1"),
+    ],
+)
+def test_algorithm_refuses_its_own_impossible_parameters(phantom, kind, changes, message):
+    maker, network = MAKERS["vector"]
+    small = SMALL_SAC if kind is SAC else {}
+    with pytest.raises(InvalidValueError, match=message):
+        kind(network=network, **small | changes).agent(setup_for(maker, phantom))
+
+
+@pytest.mark.parametrize("part", ["policy.actor", "critic"])
+def test_learner_says_that_it_has_diverged(make_learner, part):
+    learner = make_learner()
+    learner.warm_up()
+    for weights in learner._algorithm.get_submodule(part).parameters():
+        weights.data.fill_(float("nan"))
+    with pytest.raises(DivergedError, match=r"learning has diverged: after \d+ environment steps"):
+        learner.learn(60)
