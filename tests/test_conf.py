@@ -1,5 +1,6 @@
 """Every choice of every configuration group can be composed, and makes an environment."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
 import armscan.conf
+from armscan.agents import AgentSetup, Compute
 
 FOLDER = Path(armscan.conf.__file__).parent
 
@@ -34,6 +36,25 @@ def test_conf_composes_every_observation_and_reward(phantom, obs, reward):
     env = one_env(phantom, f"obs={obs}", f"reward={reward}", "env.delta=0.5")
     observed, _ = env.reset(seed=0)
     assert env.observation_space.contains(observed)
+
+
+@pytest.mark.parametrize("experiment", choices("experiment"))
+def test_conf_composes_every_experiment_with_an_agent_that_takes_its_observations(phantom, experiment):
+    config = compose("config", overrides=[f"experiment={experiment}"])
+    maker = instantiate(config.env, _convert_="object").fitted_to({phantom.name: phantom})
+    env = maker.one([phantom])
+    setup = AgentSetup(
+        make_envs=partial(maker.many, volumes=[phantom], autoreset_mode="Disabled"),
+        observation_space=env.observation_space,
+        action_names=env.get_wrapper_attr("action_names"),
+        total_env_steps=config.training.env_steps,
+        seed=0,
+        compute=Compute("cpu"),
+    )
+    agent = instantiate(config.agent, _convert_="object").agent(setup)
+    observation, info = env.reset(seed=0)
+    agent.begin(seed=0, bounds=env.get_wrapper_attr("scene").bounds)
+    assert env.action_space.contains(np.float32(agent.act(observation, info["reward"])))
 
 
 @pytest.mark.parametrize("clustering", ["pixels", "metric"])

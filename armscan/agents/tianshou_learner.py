@@ -55,8 +55,11 @@ class EpochMetrics(BaseLogger):
                 self._values[ours].append(float(value))
 
     def take(self) -> dict[str, float]:
-        """Returns the means since the last call, how many episodes have ended, and how many updates were made."""
+        """Returns what was gathered since the last call: means, the worst episode, numbers of episodes and updates."""
         metrics = {name: float(np.mean(values)) for name, values in self._values.items() if values}
+        if self._values["train/length"]:
+            metrics["train/length_max"] = float(np.max(self._values["train/length"]))
+            metrics["train/return_min"] = float(np.min(self._values["train/return"]))
         metrics["train/episodes"] = float(len(self._values["train/length"]))
         metrics["updates"] = float(self._n_updates)
         self._values.clear()

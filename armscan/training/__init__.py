@@ -3,7 +3,7 @@
 from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
-from armscan.training.data import Split, nifti_data, phantom_data
+from armscan.training.data import Split, mixed_data, nifti_data, phantom_data
 from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Evaluation, evaluate
 from armscan.training.film import film_episode
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
@@ -25,6 +25,7 @@ __all__ = [
     "evaluate",
     "film_episode",
     "load_checkpoint",
+    "mixed_data",
     "nifti_data",
     "phantom_data",
     "save_checkpoint",

@@ -112,6 +112,39 @@ def nifti_data(
     return Split(*({n: v for n, v in dataset.volumes.items() if parts[n] == part} for part in SPLITS))
 
 
+def mixed_data(
+    path: str,
+    n_volumes: int | None = None,
+    n_training: int = 16,
+    n_validation: int = 4,
+    n_test: int = 8,
+    first_seed: int = 0,
+    cache_dir: str | None = None,
+) -> Split:
+    """Volumes of a folder to train on, and phantom wrists beside them; validation and test are on phantoms alone.
+
+    Args:
+        path: the folder.
+        n_volumes: how many of its volumes, the first by name; None for all.
+        n_training: phantoms to train on beside them, which may be 0.
+        n_validation: as in `phantom_data`, like what follows.
+        n_test: likewise.
+        first_seed: likewise.
+        cache_dir: likewise.
+
+    Raises:
+        InvalidValueError: if a number is out of range.
+    """
+    n_beside = check_int("data.n_training", n_training, at_least=0)
+    phantoms = phantom_data(max(n_beside, 1), n_validation, n_test, first_seed, cache_dir)
+    volumes = open_dataset(check_path("data.path", path)).volumes
+    count = len(volumes) if n_volumes is None else check_int("data.n_volumes", n_volumes, at_least=1)
+    if count > len(volumes):
+        raise InvalidValueError(f"data.n_volumes is {n_volumes}, but {path} has {len(volumes)} volumes")
+    chosen = {name: volumes[name] for name in sorted(volumes)[:count]}
+    return Split({**chosen, **(phantoms.training if n_beside else {})}, phantoms.validation, phantoms.test)
+
+
 def _drawn(
     dataset: Dataset, wanted: dict[str, float | str | Sequence[str] | None], path: str, split_seed: int
 ) -> dict[str, str]:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 
 from armscan.errors import InvalidValueError
-from armscan.training import Split, nifti_data, phantom_data
+from armscan.training import Split, mixed_data, nifti_data, phantom_data
 
 from ..volumes.test_damaged import SETTINGS, anything, refuses
 
@@ -110,6 +110,26 @@ def test_nifti_data_takes_names_of_subjects_and_volumes(folder, validation, test
 def test_nifti_data_refuses_a_manifest_without_a_split_for_everything(folder):
     with pytest.raises(InvalidValueError, match="of 6 volumes for training, 0 for validation and 0 for the test"):
         nifti_data(folder(splits={"train": ["S", "T", "U", "V"]}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "training"),
+    [
+        ({}, ["a.nrrd", "b.nrrd", "c.nrrd", "d.nrrd", "e.nrrd", "f.nrrd", "phantom-0"]),
+        ({"n_volumes": 2}, ["a.nrrd", "b.nrrd", "phantom-0"]),
+        ({"n_volumes": 1, "n_training": 0}, ["a.nrrd"]),
+    ],
+)
+def test_mixed_data_trains_on_the_folder_and_judges_on_phantoms(folder, changes, training):
+    split = mixed_data(folder(), **{"n_training": 1, "n_validation": 1, "n_test": 1} | changes)
+    assert list(split.training) == training
+    assert [*split.validation, *split.test] == ["phantom-1000000", "phantom-2000000"]
+
+
+@pytest.mark.parametrize("changes", [{"n_volumes": 7}, {"n_volumes": 0}, {"n_training": -1}, {"n_training": None}])
+def test_mixed_data_refuses_impossible_numbers(folder, changes):
+    with pytest.raises(InvalidValueError, match=r"data\.n_"):
+        mixed_data(folder(), **{"n_training": 1, "n_validation": 1, "n_test": 1} | changes)
 
 
 def test_nifti_data_reads_the_shared_manifest_as_it_is(data_folder):
