@@ -1,5 +1,6 @@
-"""Who acts: learning algorithms through Tianshou, and their networks."""
+"""Who acts: learning algorithms, their networks, and what to compare them with."""
 
+from armscan.agents.baselines import Exhaustive, Random
 from armscan.agents.compute import Compute
 from armscan.agents.multimodal import Multimodal
 from armscan.agents.networks import MLP, Network, NetworkByObservation
@@ -15,9 +16,11 @@ __all__ = [
     "AgentSetup",
     "Algorithm",
     "Compute",
+    "Exhaustive",
     "Learner",
     "Multimodal",
     "Network",
     "NetworkByObservation",
+    "Random",
     "VectorEnvMaker",
 ]
