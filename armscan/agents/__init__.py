@@ -4,6 +4,7 @@ from armscan.agents.baselines import Exhaustive, Random
 from armscan.agents.compute import Compute
 from armscan.agents.multimodal import Multimodal
 from armscan.agents.networks import MLP, Network, NetworkByObservation
+from armscan.agents.optuna_search import OptunaSearch
 from armscan.agents.ppo import PPO
 from armscan.agents.protocols import Agent, AgentSetup, Algorithm, Learner, VectorEnvMaker
 from armscan.agents.sac import SAC
@@ -21,6 +22,7 @@ __all__ = [
     "Multimodal",
     "Network",
     "NetworkByObservation",
+    "OptunaSearch",
     "Random",
     "VectorEnvMaker",
 ]
