@@ -7,6 +7,7 @@ from armscan.agents.networks import MLP, Network, NetworkByObservation
 from armscan.agents.optuna_search import OptunaSearch
 from armscan.agents.ppo import PPO
 from armscan.agents.protocols import Agent, AgentSetup, Algorithm, Learner, VectorEnvMaker
+from armscan.agents.regression import Regression
 from armscan.agents.sac import SAC
 
 __all__ = [
@@ -24,5 +25,6 @@ __all__ = [
     "NetworkByObservation",
     "OptunaSearch",
     "Random",
+    "Regression",
     "VectorEnvMaker",
 ]
