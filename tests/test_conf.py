@@ -8,6 +8,7 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
 import armscan.conf
+from armscan.building import build
 
 FOLDER = Path(armscan.conf.__file__).parent
 
@@ -34,6 +35,18 @@ def test_conf_composes_every_observation_and_reward(phantom, obs, reward):
     env = one_env(phantom, f"obs={obs}", f"reward={reward}", "env.delta=0.5")
     observed, _ = env.reset(seed=0)
     assert env.observation_space.contains(observed)
+
+
+@pytest.mark.parametrize("agent", choices("agent"))
+def test_conf_composes_every_agent(agent):
+    few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
+    experiment = build(compose("config", overrides=[f"agent={agent}", "projection=zy", *few]))
+    env = experiment.maker.one(experiment.split.test)
+    observation, info = env.reset(seed=0)
+    experiment.agent.begin(seed=0, bounds=env.get_wrapper_attr("scene").bounds)
+    action = experiment.agent.act(observation, info["reward"])
+    assert action.shape == (2,)
+    assert np.abs(action).max() <= 1.0
 
 
 @pytest.mark.parametrize("clustering", ["pixels", "metric"])
