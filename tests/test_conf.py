@@ -1,6 +1,5 @@
 """Every choice of every configuration group can be composed, and makes an environment."""
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
 import armscan.conf
-from armscan.agents import AgentSetup, Compute
+from armscan.building import build
 
 FOLDER = Path(armscan.conf.__file__).parent
 
@@ -38,23 +37,20 @@ def test_conf_composes_every_observation_and_reward(phantom, obs, reward):
     assert env.observation_space.contains(observed)
 
 
-@pytest.mark.parametrize("experiment", choices("experiment"))
-def test_conf_composes_every_experiment_with_an_agent_that_takes_its_observations(phantom, experiment):
-    config = compose("config", overrides=[f"experiment={experiment}"])
-    maker = instantiate(config.env, _convert_="object").fitted_to({phantom.name: phantom})
-    env = maker.one([phantom])
-    setup = AgentSetup(
-        make_envs=partial(maker.many, volumes=[phantom], autoreset_mode="Disabled"),
-        observation_space=env.observation_space,
-        action_names=env.get_wrapper_attr("action_names"),
-        total_env_steps=config.training.env_steps,
-        seed=0,
-        compute=Compute("cpu"),
-    )
-    agent = instantiate(config.agent, _convert_="object").agent(setup)
+WHOLE = [f"agent={agent}" for agent in choices("agent")] + [f"experiment={name}" for name in choices("experiment")]
+
+
+@pytest.mark.parametrize("override", WHOLE)
+def test_conf_composes_every_agent_and_experiment(override):
+    # The phantoms are few, so that this is quick; what an experiment says of them is said before.
+    few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
+    experiment = build(compose("config", overrides=[override, *few]))
+    env = experiment.maker.one(experiment.split.test)
     observation, info = env.reset(seed=0)
-    agent.begin(seed=0, bounds=env.get_wrapper_attr("scene").bounds)
-    assert env.action_space.contains(np.float32(agent.act(observation, info["reward"])))
+    experiment.agent.begin(seed=0, bounds=env.get_wrapper_attr("scene").bounds)
+    action = experiment.agent.act(observation, info["reward"])
+    assert action.shape == env.action_space.shape
+    assert np.abs(action).max() <= 1.0
 
 
 @pytest.mark.parametrize("clustering", ["pixels", "metric"])

@@ -126,6 +126,22 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     assert len(list((tmp_path / "multirun").glob("*/*/*/best.pt"))) == 2
 
 
+def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_path):
+    few = [word for word in SMALL if not word.startswith(("agent.", "network"))]
+    ended = armscan_run("-m", "agent=exhaustive,optuna", "projection=zy", *few, cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    assert "Traceback" not in ended.stderr
+    client, tracked = runs_in(tmp_path)
+    children = [each for each in tracked if "choice.agent" in each.data.tags]
+    assert len(children) == 2
+    for child in children:
+        assert child.info.status == "FINISHED"
+        assert child.info.run_name == f"{child.data.tags['choice.agent']}-cluster-zy-phantom-seed0"
+        assert {"training_volumes/success_rate", "test_volumes/mean_distance_deg"} <= child.data.metrics.keys()
+        artifacts = {file.path for file in client.list_artifacts(child.info.run_id)}
+        assert artifacts == {"config.yaml", "episode.gif", "evaluation.json"}
+
+
 def test_run_on_labelmap_files(tmp_path, data_folder):
     arguments = ["data=nifti", f"data.path={data_folder}", *(word for word in SMALL if not word.startswith("data."))]
     ended = armscan_run(*arguments, cwd=tmp_path)
@@ -139,6 +155,8 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["obs=foo"], "obs is 'foo', but it must be action_reward, cluster"),
         (["agent=foo"], "agent is 'foo', but it must be "),
         (["agent.lrr=1"], "there is no key 'lrr' in agent, but only network, lr, "),
+        (["agent=exhaustive", "projection=x"], "agent.swept is ['ty'], but ty is not free; projection leaves only tx"),
+        (["agent=optuna", "agent.sampler=x"], "agent.sampler is 'x', but it must be tpe, cmaes or gp"),
         (["agnet=sac"], "there is no key 'agnet' at the top, but only data, obs, reward, agent, "),
         (["+agent.foo=1"], "there is no key 'foo' in agent, but only "),
         (["data=nifti", "data.pth=x"], "there is no key 'pth' in data, but only path, validation, test or split_seed"),

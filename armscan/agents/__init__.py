@@ -1,10 +1,13 @@
-"""Who acts: learning algorithms through Tianshou, and their networks."""
+"""Who acts: learning algorithms, their networks, and what to compare them with."""
 
+from armscan.agents.baselines import Exhaustive, Random
 from armscan.agents.compute import Compute
 from armscan.agents.multimodal import Multimodal
 from armscan.agents.networks import MLP, Network, NetworkByObservation
+from armscan.agents.optuna_search import OptunaSearch
 from armscan.agents.ppo import PPO
 from armscan.agents.protocols import Agent, AgentSetup, Algorithm, Learner, VectorEnvMaker
+from armscan.agents.regression import Regression
 from armscan.agents.sac import SAC
 
 __all__ = [
@@ -15,9 +18,13 @@ __all__ = [
     "AgentSetup",
     "Algorithm",
     "Compute",
+    "Exhaustive",
     "Learner",
     "Multimodal",
     "Network",
     "NetworkByObservation",
+    "OptunaSearch",
+    "Random",
+    "Regression",
     "VectorEnvMaker",
 ]

@@ -208,7 +208,7 @@ class TianshouLearner:
         Raises:
             CheckpointError: if they are those of another network.
         """
-        _load(self._algorithm.policy, weights)
+        load_into(self._algorithm.policy, weights)
 
     def state(self) -> dict[str, Any]:
         """Returns networks, optimisers, replay buffer and counters."""
@@ -227,7 +227,7 @@ class TianshouLearner:
         Raises:
             CheckpointError: if it is that of another agent.
         """
-        _load(self._algorithm, dict(state["algorithm"]))
+        load_into(self._algorithm, dict(state["algorithm"]))
         for key, optim in _entropy_optimisers(self._algorithm):
             optim.load_state_dict(state["entropy_optimiser"][key])
         self._replay.load_state(state["replay"])
@@ -251,7 +251,12 @@ def networks_of(algorithm: torch.nn.Module) -> list[torch.nn.Module]:
     return [algorithm.get_submodule("policy.actor"), *critics]
 
 
-def _load(module: torch.nn.Module, weights: dict[str, Any]) -> None:
+def load_into(module: torch.nn.Module, weights: dict[str, Any]) -> None:
+    """Gives a network its weights.
+
+    Raises:
+        CheckpointError: if they are those of another network.
+    """
     try:
         module.load_state_dict(weights)
     except (RuntimeError, KeyError, ValueError) as error:

@@ -107,6 +107,16 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         return self._observed(), rewards, terminated, truncated, self._infos(np.arange(self.num_envs))
 
     @property
+    def optimal_actions(self) -> FloatArray:
+        """The optimal plane of each current episode: its free components, normalised, shape (num_envs, n_free).
+
+        Privileged: neither observations nor `info` give it, and an agent that looked it up would have nothing to find.
+        It is for learning from the labelled planes of training volumes.
+        """
+        free = list(self.task.free)
+        return np.array([self._episode(i).scene.optimum_normalised[free] for i in range(self.num_envs)])
+
+    @property
     def _action_shape(self) -> tuple[int, ...]:
         return (self.num_envs, *self.task.action_space.shape)
 

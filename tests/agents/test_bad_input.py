@@ -5,7 +5,7 @@ from dataclasses import fields
 import pytest
 from hypothesis import given
 
-from armscan.agents import MLP, SAC
+from armscan.agents import MLP, SAC, Exhaustive, OptunaSearch, Regression
 
 from ..junk import SETTINGS, junk, refuses
 
@@ -16,6 +16,17 @@ from ..junk import SETTINGS, junk, refuses
 def test_sac_with_junk(changed, value):
     refuses(lambda: SAC(**{"network": MLP()} | {changed: value}))
     assert changed != "network" or refuses(lambda: SAC(network=value)) is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "changed"),
+    [(kind, field.name) for kind in (Exhaustive, OptunaSearch, Regression) for field in fields(kind)],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+@SETTINGS
+@given(value=junk)
+def test_agents_to_compare_with_with_junk(kind, changed, value):
+    refuses(lambda: kind(**({"network": MLP()} if kind is Regression else {}) | {changed: value}))
 
 
 @SETTINGS

@@ -1,4 +1,4 @@
-"""What holds for every learner: SAC and PPO, with vectors and with images."""
+"""What holds for every learner: SAC, PPO and the regression, with vectors and with images."""
 
 import numpy as np
 import pytest
@@ -9,6 +9,8 @@ from armscan.errors import CheckpointError, DivergedError, InvalidValueError
 from armscan.training import load_checkpoint, save_checkpoint
 
 from .conftest import MAKERS, SMALL_SAC, setup_for
+
+by_reinforcement = pytest.mark.parametrize("algorithm", ["sac", "ppo"], indirect=True)
 
 
 def tensors(tree):
@@ -39,6 +41,7 @@ def test_learner_counts_every_environment_step(make_learner):
     assert learner.learn(7)["speed/env_steps_per_s"] > 0
 
 
+@by_reinforcement
 def test_learner_reports_episodes_losses_and_speed(make_learner):
     learner = make_learner()
     learner.warm_up()
@@ -59,6 +62,7 @@ def test_learner_acts_without_exploration(make_learner, env):
     np.testing.assert_array_equal(action, learner.act(observation, reward))
 
 
+@by_reinforcement
 def test_learner_judged_by_sampling_draws_from_the_episodes_seed(make_learner, env):
     learner = make_learner(judged_by_sampling=True)
     observation, reward = begun(learner, env)
@@ -92,7 +96,7 @@ def test_learner_goes_on_from_a_checkpoint_bit_for_bit(make_learner, tmp_path):
         each.learn(20)
     assert learner.n_env_steps == other.n_env_steps
     pairs = list(zip(tensors(learner.state()), tensors(other.state()), strict=True))
-    assert len(pairs) > 20
+    assert len(pairs) > 15
     assert all(torch.equal(a, b) for a, b in pairs)
 
 
@@ -110,10 +114,11 @@ def test_weights_bring_back_what_the_policy_did(make_learner, env):
 
 def test_load_refuses_what_belongs_to_another_network(make_learner):
     learner = make_learner()
+    where_weights_are = next(iter(learner.state()))
     with pytest.raises(CheckpointError, match="another agent's or network's"):
         learner.load_weights({"layer": torch.zeros(3)})
     with pytest.raises(CheckpointError, match="another agent's or network's"):
-        learner.load_state(learner.state() | {"algorithm": {"layer": torch.zeros(3)}})
+        learner.load_state(learner.state() | {where_weights_are: {"layer": torch.zeros(3)}})
 
 
 def test_sac_keeps_no_more_transitions_than_the_training_takes(phantom):
@@ -128,10 +133,8 @@ def test_sac_keeps_no_more_transitions_than_the_training_takes(phantom):
         ({"lr": 0}, r"agent\.lr is 0"),
         ({"lr": 1e300}, r"agent\.lr is 1e\+300"),
         ({"lr": "fast"}, r"agent\.lr is 'fast'"),
-        ({"gamma": 1.5}, r"agent\.gamma is 1\.5"),
         ({"batch_size": 0}, r"agent\.batch_size is 0"),
         ({"num_envs": 2.5}, r"agent\.num_envs is 2\.5"),
-        ({"judged_by_sampling": "yes"}, r"agent\.judged_by_sampling is 'yes'"),
         ({"network": 64}, r"network is 64, but it must have the methods of Network"),
     ],
 )
@@ -143,10 +146,14 @@ def test_algorithm_refuses_impossible_parameters(algorithm, changes, message):
 @pytest.mark.parametrize(
     ("kind", "changes", "message"),
     [
+        (SAC, {"gamma": 1.5}, r"agent\.gamma is 1\.5"),
+        (SAC, {"judged_by_sampling": "yes"}, r"agent\.judged_by_sampling is 'yes'"),
         (SAC, {"updates_per_env_step": -1}, r"agent\.updates_per_env_step is -1"),
         (SAC, {"random_env_steps": 100}, r"agent\.random_env_steps is 100, .* must be below"),
         (SAC, {"random_env_steps": 1, "num_envs": 100}, r"agent\.random_env_steps is 1, 100 for 100 environments"),
         (SAC, {"buffer_size": 10}, r"agent\.batch_size is 16, but it must be at most agent\.buffer_size = 10"),
+        (PPO, {"gamma": 1.5}, r"agent\.gamma is 1\.5"),
+        (PPO, {"judged_by_sampling": "yes"}, r"agent\.judged_by_sampling is 'yes'"),
         (PPO, {"clip_range": -0.1}, r"agent\.clip_range is -0\.1"),
         (PPO, {"initial_log_sigma": 5}, r"agent\.initial_log_sigma is 5"),
         (PPO, {"passes_per_collection": 0}, r"agent\.passes_per_collection is 0"),
@@ -160,6 +167,7 @@ def test_algorithm_refuses_its_own_impossible_parameters(phantom, kind, changes,
         kind(network=network, **small | changes).agent(setup_for(maker, phantom))
 
 
+@by_reinforcement
 @pytest.mark.parametrize("part", ["policy.actor", "critic"])
 def test_learner_says_that_it_has_diverged(make_learner, part):
     learner = make_learner()

@@ -1,0 +1,167 @@
+"""Agents that learn nothing and model nothing: random planes, and all planes one after another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.agents.protocols import AgentSetup
+from armscan.checks import check_float
+from armscan.envs.actions import COMPONENTS, ActionBounds
+from armscan.envs.task import Observed
+from armscan.errors import InvalidValueError, listed
+from armscan.volumes.plane import FloatArray
+
+ROTATIONS = ("rz", "rx")
+MOST_SWEPT = 2
+MOST_PLANES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Random:
+    """Planes drawn uniformly over the free components, whatever was seen."""
+
+    def agent(self, setup: AgentSetup) -> RandomAgent:
+        """Makes an agent."""
+        return RandomAgent(len(setup.action_names))
+
+
+class RandomAgent:
+    """Draws planes.
+
+    Args:
+        n_free: components of an action.
+    """
+
+    def __init__(self, n_free: int) -> None:
+        self._n_free = n_free
+
+    def begin(self, *, seed: int, bounds: ActionBounds) -> None:
+        """Begins an episode; its planes are drawn from the seed."""
+        # A child of it: the environment is often reset with the seed itself, and its volume's motion drawn from that.
+        (child,) = np.random.SeedSequence(seed).spawn(1)
+        self._rng = np.random.default_rng(child)
+
+    def act(self, observation: Observed, reward: float) -> FloatArray:
+        """Returns the next action, shape (n_free,)."""
+        return self._rng.uniform(-1.0, 1.0, self._n_free)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exhaustive:
+    """All planes in fixed steps, from the middle of the swept components' ranges outward.
+
+    The middle is a rotation of 0 and half the bound of a translation. Each plane is looked at once, the nearest to the
+    middle, counted in steps, first; of two equally near ones that with the smaller component. No plane lies between the
+    last step within the range and its end. Where all were seen and none ended the episode, the agent stays at the one
+    with the best reward.
+
+    Components that are free but not swept are held at 0 degrees or 0 mm: the plane straight across the arm with the
+    whole hand in the picture. (The middle of tx, normalised 0, would push half of the hand out of it.)
+
+    Raises:
+        InvalidValueError: if a value is impossible.
+    """
+
+    swept: Sequence[str] | None = ("ty",)
+    """One or two components, None for all free ones; more would take thousands of planes even in wide steps."""
+
+    step_mm: float = 5.0
+    """Between planes along swept translations."""
+
+    step_deg: float = 10.0
+    """Between planes about swept rotations."""
+
+    def __post_init__(self) -> None:
+        check_float("agent.step_mm", self.step_mm, at_least=0.01, at_most=1e6)
+        check_float("agent.step_deg", self.step_deg, at_least=0.01, at_most=360.0)
+        if self.swept is None:
+            return
+        is_list = isinstance(self.swept, list | tuple) and all(isinstance(name, str) for name in self.swept)
+        names = list(self.swept) if is_list else []
+        if not 1 <= len(names) <= MOST_SWEPT or len(set(names)) < len(names) or not set(names) <= set(COMPONENTS):
+            raise InvalidValueError(
+                f"agent.swept is {self.swept!r}, but it must be a list of one or two different ones of "
+                f"{listed(COMPONENTS)}, or null for all free components"
+            )
+
+    def agent(self, setup: AgentSetup) -> ExhaustiveAgent:
+        """Makes an agent.
+
+        Raises:
+            InvalidValueError: if a component to be swept is not free, or more than two are.
+        """
+        free = setup.action_names
+        swept = free if self.swept is None else tuple(name for name in COMPONENTS if name in self.swept)
+        if fixed := [name for name in swept if name not in free]:
+            raise InvalidValueError(
+                f"agent.swept is {list(swept)}, but {listed(fixed)} is not free; projection leaves only "
+                f"{', '.join(free)} free"
+            )
+        if len(swept) > MOST_SWEPT:
+            raise InvalidValueError(
+                f"agent.swept is null, for all free components: {', '.join(free)}; but it must be one or two, because "
+                "a grid over more takes thousands of planes: name them, as in agent.swept=[rz,ty]"
+            )
+        return ExhaustiveAgent(free, swept, step_mm=self.step_mm, step_deg=self.step_deg)
+
+
+class ExhaustiveAgent:
+    """Goes through planes in a fixed order; see `Exhaustive`.
+
+    Args:
+        free: names of the action's components.
+        swept: those of them that are swept.
+        step_mm: between planes along translations.
+        step_deg: between planes about rotations.
+    """
+
+    def __init__(self, free: Sequence[str], swept: Sequence[str], *, step_mm: float, step_deg: float) -> None:
+        self._free, self._swept = tuple(free), tuple(swept)
+        self._step_mm, self._step_deg = step_mm, step_deg
+
+    def begin(self, *, seed: int, bounds: ActionBounds) -> None:
+        """Begins an episode with the middle plane."""
+        self._planes = self.planes(bounds)
+        self._rewards: list[float] = []
+        self._n_looked_at = 0
+
+    def act(self, observation: Observed, reward: float) -> FloatArray:
+        """Returns the next plane, or the best one when all were seen, shape (n_free,)."""
+        # The first reward is the start's, which is none of these planes.
+        if 0 < self._n_looked_at <= len(self._planes):
+            self._rewards.append(reward)
+        self._n_looked_at += 1
+        are_left = self._n_looked_at <= len(self._planes)
+        chosen = self._n_looked_at - 1 if are_left else int(np.argmax(self._rewards))
+        return np.array(self._planes[chosen])
+
+    def planes(self, bounds: ActionBounds) -> FloatArray:
+        """Returns all planes in their order, normalised, shape (n_planes, n_free).
+
+        Raises:
+            InvalidValueError: if the steps are so small that there are more than a million.
+        """
+        # Half a component's range, counted in steps. The normalised middle is 0 for rotations and translations alike.
+        halves = [self._half_range_steps(name, bounds) for name in self._swept]
+        # A step that ends on the range's end is within it, however the quotient was rounded.
+        n_each_side = [math.floor(half + 1e-9) for half in halves]
+        if math.prod(2 * n + 1 for n in n_each_side) > MOST_PLANES:
+            raise InvalidValueError(
+                f"agent.step_mm is {self._step_mm:g} and agent.step_deg is {self._step_deg:g}, but together they must "
+                f"give at most {MOST_PLANES} planes within {bounds}"
+            )
+        counts = np.meshgrid(*(np.arange(-n, n + 1) for n in n_each_side), indexing="ij")
+        steps = np.stack(counts, axis=-1).reshape(-1, len(self._swept))
+        steps = steps[np.argsort((steps**2).sum(axis=1), kind="stable")]
+        planes = np.tile([0.0 if name in ROTATIONS else -1.0 for name in self._free], (len(steps), 1))
+        for name, half, column in zip(self._swept, halves, steps.T, strict=True):
+            planes[:, self._free.index(name)] = np.clip(column / half, -1.0, 1.0) if half else 0.0
+        return planes
+
+    def _half_range_steps(self, name: str, bounds: ActionBounds) -> float:
+        bound = (bounds.rotation_deg + bounds.translation_mm)[COMPONENTS.index(name)]
+        return bound / self._step_deg if name in ROTATIONS else bound / 2.0 / self._step_mm

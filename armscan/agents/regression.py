@@ -1,0 +1,230 @@
+"""A supervised agent: the optimal plane, fitted to random slices whose optimal planes are known."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from torch import nn
+
+from armscan.agents.compute import Compute
+from armscan.agents.examples import Examples
+from armscan.agents.networks import Network, Spread, checked_network
+from armscan.agents.protocols import AgentSetup
+from armscan.agents.tianshou_envs import SideBySideFactory
+from armscan.agents.tianshou_learner import load_into
+from armscan.checks import check_float, check_int
+from armscan.envs.actions import ActionBounds
+from armscan.envs.history import observation_of, parts_of
+from armscan.envs.task import Observed
+from armscan.errors import DivergedError, InvalidValueError
+from armscan.volumes.plane import FloatArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Regression:
+    """A network that says from one observation where the optimal plane lies, fitted by squared error.
+
+    It is taught with the optimal planes of the training volumes themselves, which no other agent is shown: what it
+    reaches says how much of the task needs no search. The network is that of an actor, of the same size.
+
+    Raises:
+        InvalidValueError: if a value is impossible.
+    """
+
+    network: Network
+    """An actor's; only the mean of its actions is used."""
+
+    lr: float = 1e-3
+    """Learning rate."""
+
+    batch_size: int = 256
+    """Slices of one update."""
+
+    buffer_size: int = 100_000
+    """Slices that are kept, the latest; never more than the whole training takes."""
+
+    num_envs: int = 16
+    """Training environments that are stepped side by side."""
+
+    updates_per_env_step: float = 0.25
+    """Gradient steps for each environment step."""
+
+    def __post_init__(self) -> None:
+        checked_network(self.network)
+        check_float("agent.lr", self.lr, above=0.0, at_most=1.0)
+        check_float("agent.updates_per_env_step", self.updates_per_env_step, above=0.0, at_most=1000.0)
+        for field in fields(self):
+            if field.type == "int":
+                check_int(f"agent.{field.name}", getattr(self, field.name), at_least=1)
+        if self.num_envs > self.buffer_size:
+            raise InvalidValueError(
+                f"agent.num_envs is {self.num_envs}, but it must be at most agent.buffer_size = {self.buffer_size}"
+            )
+
+    def agent(self, setup: AgentSetup) -> RegressionLearner:
+        """Makes an agent that has learned nothing yet.
+
+        Raises:
+            InvalidValueError: if the network cannot take the observations.
+        """
+        chosen = self.network.chosen_for(setup.observation_space)
+        envs = setup.make_envs(self.num_envs)
+        shapes = SideBySideFactory(lambda _: envs).create_envs(self.num_envs, 1, seed=setup.seed)
+        torch.manual_seed(setup.seed)
+        network = chosen.actor_factory(Spread(conditioned=False)).create_module(shapes, setup.compute.torch_device)
+        size = min(self.buffer_size, setup.total_env_steps + self.num_envs)
+        examples = Examples(size, setup.observation_space, len(setup.action_names))
+        return RegressionLearner(self, envs, network, examples, seed=setup.seed, compute=setup.compute)
+
+
+class RegressionLearner:
+    """Looks at random planes and fits a network to where the optimal ones lie.
+
+    As in `TianshouLearner`, every epoch begins with new episodes and draws whatever it draws from `seed` and its own
+    number, so that it goes on from its state bit for bit.
+
+    Args:
+        regression: its parameters.
+        envs: the training environments, without autoreset.
+        network: gives mean and spread of actions, of which the mean is fitted.
+        examples: what was seen.
+        seed: of everything that is drawn.
+        compute: how the network is computed.
+    """
+
+    def __init__(
+        self,
+        regression: Regression,
+        envs: VectorEnv[Any, Any, Any],
+        network: nn.Module,
+        examples: Examples,
+        *,
+        seed: int,
+        compute: Compute,
+    ) -> None:
+        self._regression = regression
+        self._envs = envs
+        self._network = network
+        self._examples = examples
+        self._seed = seed
+        self._device = compute.torch_device
+        self._optimiser = torch.optim.Adam(network.parameters(), lr=regression.lr)
+        self._n_env_steps = self._n_epochs = 0
+        compute.apply_to(network)
+
+    @property
+    def n_env_steps(self) -> int:
+        """Environment steps taken so far."""
+        return self._n_env_steps
+
+    def warm_up(self) -> None:
+        """Does nothing: every step is random, and the first slices can be learned from."""
+
+    def learn(self, n_env_steps: int) -> dict[str, float]:
+        """Learns for one epoch of at least `n_env_steps`; returns its training metrics by name.
+
+        Raises:
+            DivergedError: if the weights are not finite afterwards.
+        """
+        self._n_epochs += 1
+        for_torch, for_draws, for_envs = np.random.SeedSequence([self._seed, self._n_epochs]).spawn(3)
+        torch.manual_seed(int(for_torch.generate_state(1)[0]))
+        rng = np.random.default_rng(for_draws)
+        seeds = [int(word) for word in for_envs.generate_state(self._envs.num_envs)]
+        # Gymnasium's types leave out the lists of seeds that its own vector environments take.
+        observations, _ = self._envs.reset(seed=seeds)  # type: ignore[arg-type]
+        n_before, losses, start_s = self._n_env_steps, [], time.perf_counter()
+        while self._n_env_steps - n_before < n_env_steps:
+            n_updates_before = self._n_updates
+            observations = self._step(observations, rng)
+            losses += [self._update(rng) for _ in range(self._n_updates - n_updates_before)]
+        self._check_weights()
+        seconds = time.perf_counter() - start_s
+        return {
+            **({"update/loss": float(torch.stack(losses).mean())} if losses else {}),
+            "speed/env_steps_per_s": (self._n_env_steps - n_before) / seconds,
+            "speed/updates_per_s": len(losses) / seconds,
+            "replay_size": float(len(self._examples)),
+        }
+
+    @property
+    def _n_updates(self) -> int:
+        """Updates that are due after the steps taken so far."""
+        return int(self._n_env_steps * self._regression.updates_per_env_step)
+
+    def _step(self, observations: Observed, rng: np.random.Generator) -> Observed:
+        """Keeps what is seen, starts of episodes included; returns what is seen from random planes, the next."""
+        self._examples.add(observations, self._envs.unwrapped.optimal_actions)  # type: ignore[attr-defined]
+        actions = rng.uniform(-1.0, 1.0, self._envs.action_space.shape or ())
+        observations, _, terminated, truncated, _ = self._envs.step(actions)
+        self._n_env_steps += self._envs.num_envs
+        if (has_ended := terminated | truncated).any():
+            observations, _ = self._envs.reset(options={"reset_mask": has_ended})
+        return observations
+
+    def _update(self, rng: np.random.Generator) -> torch.Tensor:
+        observations, optima = self._examples.draw(self._regression.batch_size, rng)
+        loss = nn.functional.mse_loss(self._predicted(observations), torch.as_tensor(optima, device=self._device))
+        self._optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self._optimiser.step()
+        return loss.detach()
+
+    def _predicted(self, observations: Observed) -> torch.Tensor:
+        """The predicted optimal actions of a batch, shape (n, n_free), not yet clipped."""
+        (mean, _), _ = self._network(observations)
+        return torch.as_tensor(mean)
+
+    def _check_weights(self) -> None:
+        if not all(torch.isfinite(weights).all() for weights in self._network.parameters()):
+            raise DivergedError(
+                f"learning has diverged: after {self.n_env_steps} environment steps the network's weights are not "
+                "finite any more; a smaller agent.lr may help"
+            )
+
+    def begin(self, *, seed: int, bounds: ActionBounds) -> None:
+        """Learns that an episode begins, in which nothing is drawn."""
+
+    def act(self, observation: Observed, reward: float) -> FloatArray:
+        """Returns the optimal action as predicted from this observation alone, shape (n_free,)."""
+        one = observation_of({name: part[None] for name, part in parts_of(observation).items()})
+        with torch.no_grad():
+            return self._predicted(one)[0].clamp(-1.0, 1.0).cpu().numpy()
+
+    def weights(self) -> dict[str, Any]:
+        """Returns the network's weights."""
+        return dict(self._network.state_dict())
+
+    def load_weights(self, weights: dict[str, Any]) -> None:
+        """Takes over a network's weights.
+
+        Raises:
+            CheckpointError: if they are those of another network.
+        """
+        load_into(self._network, weights)
+
+    def state(self) -> dict[str, Any]:
+        """Returns network, optimiser, examples and counters."""
+        return {
+            "network": self.weights(),
+            "optimiser": self._optimiser.state_dict(),
+            "examples": self._examples.state(),
+            "n_env_steps": self._n_env_steps,
+            "n_epochs": self._n_epochs,
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Takes over what `state` returned.
+
+        Raises:
+            CheckpointError: if it is that of another agent.
+        """
+        load_into(self._network, state["network"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._examples.load_state(state["examples"])
+        self._n_env_steps, self._n_epochs = state["n_env_steps"], state["n_epochs"]
