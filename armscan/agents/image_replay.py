@@ -88,7 +88,7 @@ class ImageReplay(Replay):
     def cut_off(self) -> None:
         """See `Replay.cut_off`."""
         super().cut_off()
-        # The frames of episodes that begin now are looked for nowhere, whether or not this is a resumed training.
+        # Episodes begin anew; and what a resumed training does not know must not be used by one that just goes on.
         for images in self._images.values():
             images.forget_last()
 
