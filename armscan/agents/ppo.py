@@ -8,9 +8,9 @@ from tianshou.highlevel.config import OnPolicyTrainingConfig
 from tianshou.highlevel.experiment import PPOExperimentBuilder
 from tianshou.highlevel.params.algorithm_params import PPOParams
 
+from armscan.agents.image_replay import replay_for
 from armscan.agents.networks import Network, Spread, checked_network
 from armscan.agents.protocols import AgentSetup
-from armscan.agents.replay import Replay
 from armscan.agents.tianshou_envs import SideBySideFactory
 from armscan.agents.tianshou_learner import TianshouLearner, experiment_config, rounded_up
 from armscan.checks import check_bool, check_float, check_int
@@ -125,7 +125,7 @@ class PPO:
         builder.with_critic_factory(network.critic_factory())
         return TianshouLearner(
             builder.build(),
-            replay=Replay(n_collected, self.num_envs),
+            replay=replay_for(setup.observation_space, n_collected, self.num_envs),
             random_env_steps=0,
             seed=setup.seed,
             compute=setup.compute,

@@ -10,9 +10,9 @@ from tianshou.highlevel.experiment import SACExperimentBuilder
 from tianshou.highlevel.params.algorithm_params import SACParams
 from tianshou.highlevel.params.alpha import AutoAlphaFactoryDefault
 
+from armscan.agents.image_replay import replay_for
 from armscan.agents.networks import Network, Spread, checked_network
 from armscan.agents.protocols import AgentSetup
-from armscan.agents.replay import Replay
 from armscan.agents.tianshou_envs import SideBySideFactory
 from armscan.agents.tianshou_learner import TianshouLearner, experiment_config, rounded_up
 from armscan.checks import check_bool, check_float, check_int
@@ -129,7 +129,9 @@ class SAC:
         builder.with_common_critic_factory(network.critic_factory())
         return TianshouLearner(
             builder.build(),
-            replay=Replay(min(self.buffer_size, setup.total_env_steps + self.num_envs), self.num_envs),
+            replay=replay_for(
+                setup.observation_space, min(self.buffer_size, setup.total_env_steps + self.num_envs), self.num_envs
+            ),
             random_env_steps=n_random,
             seed=setup.seed,
             compute=setup.compute,

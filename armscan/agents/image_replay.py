@@ -1,0 +1,156 @@
+"""The replay buffer of observations with images: their frames are kept compressed, and each of them once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from tianshou.data import Batch
+
+from armscan.agents.frames import FrameStore, Pixels
+from armscan.agents.multimodal import images_of
+from armscan.agents.replay import Replay, Tree
+
+OBSERVATIONS = ("obs", "obs_next")
+Seen = list[tuple[bytes, int]]
+"""Pixels of frames with their ids."""
+
+
+def replay_for(observation_space: spaces.Space[Any], size: int, n_envs: int) -> Replay:
+    """Returns the replay buffer that suits the observations: a plain one where there are no images among them."""
+    images = images_of(observation_space)
+    return ImageReplay(size, n_envs, images) if images else Replay(size, n_envs)
+
+
+class ImageReplay(Replay):
+    """A `Replay` that has ids of frames in the place of images, and gives the images back as they were.
+
+    An image of three axes or more is a row of frames along its first one, such as a stack; one of two axes is a single
+    frame. Most frames have been seen a moment ago: in the stack before, or as the next observation of the last step.
+    A frame is kept once for all of these, which is found by comparing pixels, so that nothing depends on how the
+    environment stacks. It is forgotten once the last transition that shows it is overwritten.
+
+    Two batches of the same transitions, asked for one after the other, share the memory of their images.
+
+    Args:
+        size: transitions in all.
+        n_envs: environments.
+        images: the parts of an observation that are images, by name.
+    """
+
+    def __init__(self, size: int, n_envs: int, images: Mapping[str, spaces.Box]) -> None:
+        super().__init__(size, n_envs)
+        self._images = {name: _ImageStore(box.shape, n_envs) for name, box in images.items()}
+        # What was asked for last, by key and name, with the ids it was: an update asks for one batch twice.
+        self._last: dict[tuple[str, str], tuple[NDArray[np.int32], Pixels]] = {}
+
+    def add(self, batch: Any, buffer_ids: Any = None) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+        """Adds a transition of each of these environments, which are all where none are named."""
+        envs = range(self.buffer_num) if buffer_ids is None else [int(i) for i in buffer_ids]
+        slots = [self._offset[i] + self.buffers[i]._insertion_idx for i in envs]
+        self._last.clear()
+        ids: dict[str, Any] = {key: dict(batch[key].items()) for key in OBSERVATIONS}
+        overwritten = {}
+        for name, images in self._images.items():
+            overwritten[name] = self._ids(name, slots) if len(self._meta.get_keys()) else []
+            taken = [
+                images.take_in(env, obs, obs_next)
+                for env, obs, obs_next in zip(envs, batch.obs[name], batch.obs_next[name], strict=True)
+            ]
+            for k, key in enumerate(OBSERVATIONS):
+                ids[key][name] = np.array([of_transition[k] for of_transition in taken], dtype=np.int32)
+        added = super().add(Batch({**dict(batch.items()), **ids}), buffer_ids)
+        # Only now: what was overwritten may be what has just been referred to anew.
+        for name, images in self._images.items():
+            images.frames.release(overwritten[name])
+        return added
+
+    def get(self, index: Any, key: str, default_value: Any = None, stack_num: int | None = None) -> Any:
+        """Returns one part of transitions, its images as they were."""
+        found: Any = super().get(index, key, default_value, stack_num)
+        if key not in OBSERVATIONS:
+            return found
+        return Batch(dict(found.items()) | {name: self._decoded(key, name, found[name]) for name in self._images})
+
+    def reset(self, keep_statistics: bool = False) -> None:
+        """Forgets every transition."""
+        super().reset(keep_statistics)
+        self._last.clear()
+        for name, images in self._images.items():
+            images.frames.clear()
+            images.forget_last()
+            for key in OBSERVATIONS if len(self._meta.get_keys()) else ():
+                self._meta[key][name][:] = 0
+
+    def cut_off(self) -> None:
+        """See `Replay.cut_off`."""
+        super().cut_off()
+        # Episodes begin anew; and what a resumed training does not know must not be used by one that just goes on.
+        for images in self._images.values():
+            images.forget_last()
+
+    def state(self) -> Tree:
+        """See `Replay.state`."""
+        return super().state() | {"frames": {name: images.frames.state() for name, images in self._images.items()}}
+
+    def load_state(self, state: Tree) -> None:
+        """See `Replay.load_state`."""
+        super().load_state(state)
+        for name, images in self._images.items():
+            images.frames.load_state(state["frames"][name])
+
+    def _ids(self, name: str, slots: list[int]) -> list[int]:
+        """Returns the ids of all frames that transitions refer to, one for each reference."""
+        return [frame_id for key in OBSERVATIONS for frame_id in self._meta[key][name][slots].ravel().tolist()]
+
+    def _decoded(self, key: str, name: str, ids: NDArray[np.int32]) -> Pixels:
+        last = self._last.get((key, name))
+        if last is not None and np.array_equal(last[0], ids):
+            return last[1]
+        images = self._images[name].decoded(ids)
+        self._last[key, name] = ids.copy(), images
+        return images
+
+
+class _ImageStore:
+    """The frames of one image part of the observations.
+
+    Args:
+        shape: of one image.
+        n_envs: environments.
+    """
+
+    def __init__(self, shape: tuple[int, ...], n_envs: int) -> None:
+        self._shape = shape
+        self._n_frames = shape[0] if len(shape) > 2 else 1
+        self._n_envs = n_envs
+        self.frames = FrameStore(int(np.prod(shape)) // self._n_frames)
+        self.forget_last()
+
+    def forget_last(self) -> None:
+        """Forgets which frames every environment has shown last."""
+        self._last: list[Seen] = [[] for _ in range(self._n_envs)]
+
+    def take_in(self, env: int, image: Pixels, image_next: Pixels) -> tuple[list[int], list[int]]:
+        """Takes in the images of a transition, and refers to their frames; returns the ids of these."""
+        seen = list(self._last[env])
+        ids, ids_next = (self._ids(part.reshape(self._n_frames, -1), seen) for part in (image, image_next))
+        self.frames.hold(ids + ids_next)
+        self._last[env] = seen[-self._n_frames :]
+        return ids, ids_next
+
+    def decoded(self, ids: NDArray[np.int32]) -> Pixels:
+        """Returns images; `ids` has the frames of each along its last axis."""
+        return self.frames.decoded(ids).reshape(*ids.shape[:-1], *self._shape)
+
+    def _ids(self, frames: Pixels, seen: Seen) -> list[int]:
+        """Returns the ids of the frames of an image, shape (n_frames, n_pixels), and adds them to what was seen."""
+        first = len(seen)
+        for frame in frames:
+            pixels = frame.tobytes()
+            found = (frame_id for known, frame_id in seen if known == pixels)
+            seen.append((pixels, next(found, None) or self.frames.add(frame)))
+        return [frame_id for _, frame_id in seen[first:]]
