@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,87 +10,15 @@ import torch
 from tianshou.data import Batch
 from tianshou.highlevel.experiment import Experiment, ExperimentConfig
 from tianshou.highlevel.persistence import PolicyPersistence
-from tianshou.utils.logger.logger_base import BaseLogger
 
 from armscan.agents.compute import Compute
+from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
 from armscan.envs.actions import ActionBounds
 from armscan.envs.task import Observed
 from armscan.errors import CheckpointError, DivergedError
 from armscan.volumes.plane import FloatArray
-
-
-class EpochMetrics(BaseLogger):
-    """Gathers what Tianshou's trainer reports during an epoch, to be taken at its end as means."""
-
-    UPDATE_NAMES = (
-        ("actor_loss", "update/actor_loss"),
-        ("critic1_loss", "update/critic_loss"),
-        ("vf_loss", "update/critic_loss"),
-        ("ent_loss", "update/entropy"),
-        ("alpha", "update/entropy_coefficient"),
-    )
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._values: defaultdict[str, list[float]] = defaultdict(list)
-        self._n_updates = 0
-
-    def log_training_data(self, log_data: dict[str, Any], step: int) -> None:
-        """Gathers returns and lengths of the episodes that have ended."""
-        self._values["train/return"].extend(log_data["returns"])
-        self._values["train/length"].extend(log_data["lens"])
-
-    def log_update_data(self, log_data: dict[str, Any], step: int) -> None:
-        """Gathers losses, and counts gradient steps, of which PPO reports many at once."""
-        self._n_updates += log_data.get("gradient_steps", 1)
-        for theirs, ours in self.UPDATE_NAMES:
-            value = log_data.get(theirs)
-            if isinstance(value, dict):
-                value = value["mean"]
-            if value is not None:
-                self._values[ours].append(float(value))
-
-    def take(self) -> dict[str, float]:
-        """Returns what was gathered since the last call: means, the worst episode, numbers of episodes and updates."""
-        metrics = {name: float(np.mean(values)) for name, values in self._values.items() if values}
-        if self._values["train/length"]:
-            metrics["train/length_max"] = float(np.max(self._values["train/length"]))
-            metrics["train/return_min"] = float(np.min(self._values["train/return"]))
-        metrics["train/episodes"] = float(len(self._values["train/length"]))
-        metrics["updates"] = float(self._n_updates)
-        self._values.clear()
-        self._n_updates = 0
-        return metrics
-
-    def write(self, step_type: str, step: int, data: dict[str, Any]) -> None:
-        """Unused: nothing is written anywhere from here."""
-
-    def prepare_dict_for_logging(self, log_data: dict[str, Any]) -> dict[str, Any]:
-        """Returns the data as it is."""
-        return log_data
-
-    def finalize(self) -> None:
-        """Has nothing open."""
-
-    def save_data(
-        self,
-        epoch: int,
-        env_step: int,
-        update_step: int,
-        save_checkpoint_fn: Callable[[int, int, int], str] | None = None,
-    ) -> None:
-        """Unused: training keeps its own checkpoints."""
-
-    def restore_data(self) -> tuple[int, int, int]:
-        """Begins at the beginning."""
-        return 0, 0, 0
-
-    @staticmethod
-    def restore_logged_data(log_path: str) -> dict[str, Any]:
-        """Has nothing to restore."""
-        return {}
 
 
 class TianshouLearner:
