@@ -144,6 +144,7 @@ def evaluate(request: Request) -> Path:
         notes += judging.known_volumes(subject.run.tags, groups)
     for note in notes:
         print(f"note: {note}")
+    _check_out(request.out or FOLDER / "evaluation.json")
     judgement, file = _tracked(request, subject, trial, notes, store)
     for table in judging.judgement_tables(judgement):
         Console().print(table)
@@ -190,7 +191,8 @@ def _tracked(
             named = {f"{group}/{name}": value for name, value in figures.items()}
             tracked.log_figures(named, n_env_steps=subject.n_env_steps)
         file = request.out or FOLDER / f"{_file_name(f'{subject.name}-{data}')}-{tracked.run_id[:8]}.json"
-        _write(file, judgement.to_dict())
+        text = json.dumps(judgement.to_dict(), indent=1, allow_nan=False)
+        write_whole(file, lambda opened: opened.write(text.encode()))
         tracked.log_files(file)
     return judgement, file
 
@@ -203,13 +205,14 @@ def _store(request: Request) -> dict[str, str]:
     return usual | {name: value for name, value in said.items() if value is not None}
 
 
-def _write(file: Path, contents: Mapping[str, Any]) -> None:
-    text = json.dumps(contents, indent=1, allow_nan=False)
+def _check_out(file: Path) -> None:
+    """Makes the folder of the JSON file, before an evaluation that may take hours is played for it."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(file, lambda opened: opened.write(text.encode()))
     except OSError as error:
         raise InvalidValueError(f"out is {str(file)!r}, but no file can be written there: {error.strerror}") from error
+    if file.is_dir() or not os.access(file.parent, os.W_OK):
+        raise InvalidValueError(f"out is {str(file)!r}, but no file can be written there")
 
 
 def _file_name(text: str) -> str:

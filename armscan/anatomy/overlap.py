@@ -22,5 +22,5 @@ def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) ->
 
 
 def _dice(mask: NDArray[np.bool_], reference: NDArray[np.bool_]) -> float:
-    total = np.count_nonzero(mask) + np.count_nonzero(reference)
-    return 2.0 * np.count_nonzero(mask & reference) / total if total else 1.0
+    total = int(np.count_nonzero(mask)) + int(np.count_nonzero(reference))
+    return 2.0 * int(np.count_nonzero(mask & reference)) / total if total else 1.0

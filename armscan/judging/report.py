@@ -21,7 +21,7 @@ TOTAL = "all volumes"
 REFUSED_BY_MLFLOW = re.compile(r"[^A-Za-z0-9_\-. /:]")
 SUMMARY_ROWS = (
     ("success rate", "success_rate", "{:.1%}"),
-    ("  Wilson's interval", "success_rate_wilson", "{:.1%}"),
+    ("  by Wilson", "success_rate_wilson", "{:.1%}"),
     ("mean steps", "mean_steps", "{:.2f}"),
     ("median steps", "median_steps", "{:.1f}"),
     ("95th percentile", "p95_steps", "{:.1f}"),
@@ -42,7 +42,7 @@ ROWS_OF_THE_OTHERS = (
     ("median steps", f"median_steps{NOT_STARTED_SOLVED}", "{:.1f}"),
 )
 VOLUME_COLUMNS = (
-    ("success rate", "success_rate", "{:.0%}"),
+    ("success", "success_rate", "{:.0%}"),
     ("steps", "mean_steps", "{:.1f}"),
     ("mm", "mean_distance_mm", "{:.1f}"),
     ("°", "mean_distance_deg", "{:.1f}"),
@@ -142,8 +142,8 @@ def _summary(figures: Mapping[str, Figures]) -> Table:
 
 def _by_volume(label: str, volumes: Mapping[str, Figures]) -> Table:
     table = Table(title=f"{label}, each", title_justify="left")
-    table.add_column("volume", overflow="fold", min_width=20)
-    table.add_column("episodes", justify="right")
+    table.add_column("volume", overflow="fold")
+    table.add_column("n", justify="right")
     for heading, _, _ in VOLUME_COLUMNS:
         table.add_column(heading, justify="right")
     for name, figures in volumes.items():

@@ -9,7 +9,8 @@ from pathlib import Path
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from armscan.errors import ArmscanError, InvalidValueError
+from armscan.errors import InvalidValueError
+from armscan.mistakes import mistake_in_one_line
 from armscan.training import TEST, TRAINING, VALIDATION, Split
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
@@ -82,9 +83,13 @@ class TrainingVolumes(Mapping[str, LabelVolume]):
     def _volumes(self) -> Volumes:
         try:
             return self._load().training
-        except ArmscanError as error:
+        # Hydra wraps whatever is raised while it builds.
+        except Exception as error:
+            line = mistake_in_one_line(error)
+            if line is None:
+                raise
             raise InvalidValueError(
-                f"the reward is fitted to the volumes that the agent was trained on, but they cannot be read: {error}"
+                f"the reward is fitted to the volumes that the agent was trained on, but they cannot be read: {line}"
             ) from error
 
     def __getitem__(self, name: str) -> LabelVolume:

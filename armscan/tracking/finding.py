@@ -93,14 +93,17 @@ def find_run(uri: str, run_id: str) -> FoundRun:
             f"run is {run_id!r}, but it must be the id of a run, or at least its first {SHORTEST_PREFIX} characters "
             "(of 0 to 9 and a to f), as the UI shows it"
         )
-    if uri.startswith(SQLITE_PREFIX) and not Path(uri.removeprefix(SQLITE_PREFIX)).is_file():
+    is_file = uri.startswith(SQLITE_PREFIX)
+    database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
+    if is_file and not database.is_file():
         raise TrackingError(
             f"tracking is {uri!r}, but there is no such file: go to the folder that the runs were started in, or give "
             "tracking=URI"
         )
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     with usable_store(uri):
-        client = MlflowClient(tracking_uri=uri)
+        # MLflow remembers stores by these, wherever a relative one leads by then.
+        client = MlflowClient(tracking_uri=f"{SQLITE_PREFIX}{database}" if is_file else uri)
         experiments = [experiment.experiment_id for experiment in client.search_experiments()]
         found = client.search_runs(experiments, f"attributes.run_id LIKE '{run_id}%'", max_results=MOST_RUNS_NAMED)
         if len(found) == 1:
