@@ -173,12 +173,19 @@ def test_agent_is_applied_to_volumes_of_other_sizes_and_spacing(answer, tmp_path
     assert contents["notes"]
 
 
-def test_labelled_planes_that_pixel_clusters_do_not_see_are_refused_with_the_way_out(answer, tmp_path, coarse_folder):
+def test_labelled_planes_that_score_too_little_are_refused_with_what_may_be_the_reason(answer, tmp_path, coarse_folder):
     run_id = tracked(tmp_path)
-    code, _, errors = answer(f"run={run_id}", f"data={coarse_folder}", "episodes=2")
-    assert code == 2
-    assert errors.endswith("here a pixel has 0.4 x 0.5 mm: clustering=metric finds them by millimetres")
-    assert answer(f"run={run_id}", f"data={coarse_folder}", "episodes=2", "clustering=metric")[0] == 0
+    manifest = yaml.safe_load((coarse_folder / "manifest.yaml").read_text())
+    manifest["volumes"]["b.nii.gz"]["translation"][1] -= 60
+    (coarse_folder / "manifest.yaml").write_text(yaml.safe_dump(manifest))
+    for word, ending in (
+        ("seed=0", "here a pixel has 0.45 x 0.5 mm: unless the plane is wrong, clustering=metric may see them"),
+        ("clustering=metric", "but it must score above -delta = -0.05"),
+    ):
+        code, _, errors = answer(f"run={run_id}", f"data={coarse_folder}", "episodes=2", word)
+        assert code == 2
+        assert errors.startswith("error: b.nii.gz: the labelled optimal plane scores")
+        assert errors.endswith(ending)
 
 
 def test_images_of_another_shape_are_refused_with_the_reason(answer, tmp_path, coarse_folder):

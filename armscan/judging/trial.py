@@ -105,7 +105,7 @@ def _env(maker: EnvMaker, volumes: Volumes, clustering: object) -> Env:
         shown = listed(f"{across:.3g} x {depth:.3g}" for across, depth in sorted(sizes))
         raise InvalidValueError(
             f"{error}; clusters are found by pixels, as suits about 0.27 x 0.55 mm, and here a pixel has {shown} mm: "
-            "clustering=metric finds them by millimetres"
+            "unless the plane is wrong, clustering=metric may see them"
         ) from error
 
 
