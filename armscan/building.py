@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,6 +14,7 @@ from armscan.checks import check_int, check_seed
 from armscan.envs import EnvMaker
 from armscan.errors import InvalidValueError
 from armscan.training import Budget, Split
+from armscan.volumes import LabelVolume
 
 SECTIONS = (
     "data",
@@ -59,18 +61,32 @@ def build(config: DictConfig) -> Experiment:
     seed = check_seed("seed", config.seed)
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
     split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
-    maker = instantiate(config.env, _convert_="object").fitted_to(split.training)
-    env = maker.one(split.training)
+    maker = make_maker(config, split.training)
+    agent = make_agent(config, maker, split.training, total_env_steps=budget.env_steps, seed=seed)
+    return Experiment(split=split, maker=maker, agent=agent, budget=budget, n_episodes=n_episodes, seed=seed)
+
+
+def make_maker(config: DictConfig, training: Mapping[str, LabelVolume]) -> EnvMaker:
+    """Returns the maker of environments, its reward fitted to the training volumes."""
+    maker: EnvMaker = instantiate(config.env, _convert_="object")
+    return maker.fitted_to(training)
+
+
+def make_agent(
+    config: DictConfig, maker: EnvMaker, volumes: Mapping[str, LabelVolume], *, total_env_steps: int, seed: int
+) -> Agent:
+    """Returns the agent, which has learned nothing yet, for environments on these volumes."""
+    env = maker.one(dict(volumes))
     setup = AgentSetup(
-        make_envs=partial(maker.many, volumes=split.training, autoreset_mode="Disabled"),
+        make_envs=partial(maker.many, volumes=dict(volumes), autoreset_mode="Disabled"),
         observation_space=env.observation_space,
         action_names=env.get_wrapper_attr("action_names"),
-        total_env_steps=budget.env_steps,
+        total_env_steps=total_env_steps,
         seed=seed,
         compute=instantiate(config.compute, _convert_="object"),
     )
-    agent = instantiate(config.agent, _convert_="object").agent(setup)
-    return Experiment(split=split, maker=maker, agent=agent, budget=budget, n_episodes=n_episodes, seed=seed)
+    agent: Agent = instantiate(config.agent, _convert_="object").agent(setup)
+    return agent
 
 
 def check_sections(config: DictConfig) -> None:

@@ -20,6 +20,7 @@ RESULT_ROWS = (
     ("mean final reward", "mean_final_reward", "{:.3f}"),
     ("mean distance to the plane", "mean_distance_mm", "{:.1f} mm"),
     ("mean angle to the plane", "mean_distance_deg", "{:.1f}°"),
+    ("mean Dice with its slice", "mean_dice", "{:.2f}"),
     ("episodes", "episodes", "{:.0f}"),
     ("... of which started solved", "episodes_started_solved", "{:.0f}"),
     ("success rate of the others", "success_rate_not_started_solved", "{:.1%}"),

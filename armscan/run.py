@@ -35,7 +35,7 @@ from armscan.multirun import INTERRUPTED, NO_OUTCOME, Job, end_multirun, remove_
 
 if TYPE_CHECKING:
     from armscan.tracking import TrackedRun
-    from armscan.training import Split
+    from armscan.training import Familiar, Split
 
 MAX_TAG_CHARS = 5000
 CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")
@@ -96,7 +96,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     from armscan.agents import Learner
     from armscan.building import build
     from armscan.console import print_results, print_where_to_look, progress_reporter
-    from armscan.training import TEST, TRAINING, evaluate, film_episode, train
+    from armscan.training import TEST, TRAINING, Familiar, evaluate, film_episode, train
 
     quieten_libraries()
     torch.set_num_threads(1)
@@ -107,7 +107,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     training_env, validation_env, test_env = map(maker.one, (split.training, split.validation, split.test))
     film_env = maker.one(split.test, render_mode="rgb_array")
 
-    with tracked_run(config, invocation, split) as tracked:
+    with tracked_run(config, invocation, split, Familiar.of(training_env)) as tracked:
         result = None
         if isinstance(agent, Learner):
             n_episodes, budget = experiment.budget.validation_episodes, experiment.budget
@@ -130,9 +130,9 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
 
 
-def tracked_run(config: DictConfig, invocation: Invocation, split: Split) -> TrackedRun:
+def tracked_run(config: DictConfig, invocation: Invocation, split: Split, familiar: Familiar) -> TrackedRun:
     """Opens the tracking store and starts a run in it."""
-    from armscan.tracking import TrackedRun, open_store
+    from armscan.tracking import FAMILIAR_TAG, TrackedRun, open_store
 
     resolved: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
     client, experiment_id = open_store(**resolved["tracking"])
@@ -148,6 +148,8 @@ def tracked_run(config: DictConfig, invocation: Invocation, split: Split) -> Tra
             "volumes.training": " ".join(split.training)[:MAX_TAG_CHARS],
             "volumes.validation": " ".join(split.validation)[:MAX_TAG_CHARS],
             "volumes.test": " ".join(split.test)[:MAX_TAG_CHARS],
+            # Where it is applied to other volumes, later, the agent must see what it has learned to see.
+            FAMILIAR_TAG: familiar.to_json(),
         },
         parent_id=invocation.job.parent_run_id if invocation.job else None,
     )

@@ -2,6 +2,7 @@
 
 from armscan.anatomy.landmarks import Clusters, Landmarks, TissueClusters
 from armscan.anatomy.optimum import FoundPlane, Judge, find_optimal_plane
+from armscan.anatomy.overlap import tissue_dice
 from armscan.anatomy.rewards import (
     OTHER_PUBLISHED_TARGETS,
     PUBLISHED_TARGETS,
@@ -52,4 +53,5 @@ __all__ = [
     "checked_tissues",
     "find_optimal_plane",
     "landmark_reward",
+    "tissue_dice",
 ]

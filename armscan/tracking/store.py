@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import FileLock
@@ -38,6 +40,13 @@ def open_store(uri: str, *, experiment: str, artifacts: str) -> tuple[MlflowClie
     for name, value in (("uri", uri), ("experiment", experiment), ("artifacts", artifacts)):
         if not isinstance(value, str) or not value.strip() or value == SQLITE_PREFIX:
             raise TrackingError(f"tracking.{name} is {value!r}, but it must be a text such as {EXAMPLES[name]!r}")
+    with usable_store(uri):
+        return _open_locked(uri, experiment, artifacts)
+
+
+@contextmanager
+def usable_store(uri: str) -> Iterator[None]:
+    """What a store is used in: it answers in time and quietly, and what goes wrong is a `TrackingError` of one line."""
     for name, value in HTTP_DEFAULTS.items():
         os.environ.setdefault(name, value)
     # The making of a new database is told table by table.
@@ -47,7 +56,7 @@ def open_store(uri: str, *, experiment: str, artifacts: str) -> tuple[MlflowClie
         with warnings.catch_warnings():
             # SQLAlchemy tells MLflow's users of MLflow's own deprecated calls.
             warnings.simplefilter("ignore")
-            return _open_locked(uri, experiment, artifacts)
+            yield
     except (MlflowException, SQLAlchemyError, OSError, ModuleNotFoundError) as error:
         reason = " ".join(str(error).split())[:300]
         raise TrackingError(f"tracking.uri is {uri!r}, but this store cannot be used: {reason}") from error

@@ -5,6 +5,8 @@ from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
 from armscan.training.data import Split, mixed_data, nifti_data, phantom_data
 from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Evaluation, evaluate
+from armscan.training.familiar import Familiar
+from armscan.training.figures import Figures
 from armscan.training.film import film_episode
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
 
@@ -19,6 +21,8 @@ __all__ = [
     "Episode",
     "EpochReport",
     "Evaluation",
+    "Familiar",
+    "Figures",
     "SolvedCriterion",
     "Split",
     "TrainingResult",

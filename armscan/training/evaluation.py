@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import statistics
+import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import gymnasium as gym
 
 from armscan.agents.protocols import Agent
+from armscan.anatomy import tissue_dice
 from armscan.checks import check_int
 from armscan.envs.task import Observed
 from armscan.volumes.plane import FloatArray
@@ -32,8 +34,14 @@ class Episode:
         starts_solved: whether it also began on one.
         episode_return: sum of the rewards.
         final_reward: of the last plane.
+        best_reward: of the planes that were chosen; the start is not among them.
         distance_mm: of the last plane from the optimal one.
         distance_deg: likewise.
+        dice_bones: how far the last slice shows the bones where the optimal plane's slice does, as `tissue_dice` says.
+        dice_tendons: likewise.
+        dice_artery: likewise.
+        seconds_per_plane: mean wall time of choosing a plane and looking at it; two episodes that differ in nothing
+            else are equal.
     """
 
     volume: str
@@ -43,8 +51,18 @@ class Episode:
     starts_solved: bool
     episode_return: float
     final_reward: float
+    best_reward: float
     distance_mm: float
     distance_deg: float
+    dice_bones: float
+    dice_tendons: float
+    dice_artery: float
+    seconds_per_plane: float = field(compare=False)
+
+    @property
+    def mean_dice(self) -> float:
+        """Mean over the three tissues."""
+        return statistics.fmean((self.dice_bones, self.dice_tendons, self.dice_artery))
 
 
 @dataclass(frozen=True)
@@ -76,8 +94,10 @@ class Evaluation:
             "mean_steps": self.mean_steps,
             "mean_return": self._mean(lambda episode: episode.episode_return),
             "mean_final_reward": self._mean(lambda episode: episode.final_reward),
+            "mean_best_reward": self._mean(lambda episode: episode.best_reward),
             "mean_distance_mm": self._mean(lambda episode: episode.distance_mm),
             "mean_distance_deg": self._mean(lambda episode: episode.distance_deg),
+            "mean_dice": self._mean(lambda episode: episode.mean_dice),
             "episodes": len(self.episodes),
             "episodes_started_solved": len(self.episodes) - len(unsolved.episodes),
             "success_rate_not_started_solved": unsolved.success_rate,
@@ -112,21 +132,33 @@ def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluatio
 def _play(agent: Agent, env: Env, volume_name: str, seed: int) -> Episode:
     observation, info = env.reset(seed=seed, options={"volume": volume_name})
     agent.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
-    n_steps, episode_return, reward, ended = 0, 0.0, float(info["reward"]), False
+    reward, rewards, ended = float(info["reward"]), [], False
+    start_s = time.perf_counter()
     while not ended:
         observation, received, terminated, truncated, info = env.step(agent.act(observation, reward))
         reward = float(received)
-        n_steps += 1
-        episode_return += reward
+        rewards.append(reward)
         ended = terminated or truncated
+    seconds = time.perf_counter() - start_s
     return Episode(
         volume=volume_name,
         seed=seed,
-        n_steps=n_steps,
+        n_steps=len(rewards),
         is_success=bool(info["is_success"]),
         starts_solved=bool(info["starts_solved"]),
-        episode_return=episode_return,
-        final_reward=float(info["reward"]),
+        episode_return=sum(rewards),
+        final_reward=reward,
+        best_reward=max(rewards),
         distance_mm=float(info["distance_mm"]),
         distance_deg=float(info["distance_deg"]),
+        seconds_per_plane=seconds / len(rewards),
+        **_final_dice(env),
     )
+
+
+def _final_dice(env: Env) -> dict[str, float]:
+    """Compares the current slice with that of the optimal plane; another look, which an episode's steps outweigh."""
+    scene = env.get_wrapper_attr("scene")
+    (optimal,) = env.get_wrapper_attr("task").look([scene], [scene.optimum])
+    dice = tissue_dice(env.get_wrapper_attr("slice_xz"), optimal.slice_xz)
+    return {f"dice_{tissue}": value for tissue, value in dice.items()}

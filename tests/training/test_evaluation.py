@@ -66,6 +66,36 @@ def test_evaluate_counts_episodes_that_start_solved_apart(dataset):
     assert metrics["mean_steps"] == (n_solved + 3 * (40 - n_solved)) / 40
 
 
+def test_episode_of_the_optimal_plane_shows_its_slice(dataset):
+    env = make_armscan_env(dataset, max_steps=2)
+    for episode in evaluate(Oracle(env), env, n_episodes=4, seed=5).episodes:
+        assert episode.mean_dice == pytest.approx(1.0, abs=0.01)
+        assert episode.seconds_per_plane > 0
+
+
+class Thrice:
+    """Tries three places, the middle one the best."""
+
+    def begin(self, *, seed, bounds):
+        self._places = iter((-1.0, 0.0, 1.0))
+
+    def act(self, observation, reward):
+        return np.array([next(self._places)])
+
+
+def test_best_reward_is_that_of_the_planes_that_were_chosen(dataset):
+    env = make_armscan_env(dataset, max_steps=3, delta=0.001)
+    episodes = [each for each in evaluate(Thrice(), env, n_episodes=8, seed=0).episodes if not each.is_success]
+    assert all(episode.best_reward >= episode.final_reward for episode in episodes)
+    assert any(episode.best_reward > episode.final_reward for episode in episodes)
+    assert all(type(episode.dice_bones) is float and 0.0 <= episode.mean_dice < 0.9 for episode in episodes)
+
+
+def test_episodes_are_equal_however_long_they_took(dataset):
+    env = make_armscan_env(dataset, max_steps=3)
+    assert evaluate(Still(), env, n_episodes=4, seed=0) == evaluate(Still(), env, n_episodes=4, seed=0)
+
+
 def test_evaluation_without_episodes_has_no_means():
     assert math.isnan(Evaluation(()).mean_steps)
 

@@ -26,8 +26,13 @@ def evaluation_of(*lengths, success=True):
                 starts_solved=False,
                 episode_return=-0.5 * length,
                 final_reward=0.0,
+                best_reward=0.0,
                 distance_mm=1.0,
                 distance_deg=2.0,
+                dice_bones=0.9,
+                dice_tendons=0.8,
+                dice_artery=0.7,
+                seconds_per_plane=0.01,
             )
             for length in lengths
         )

@@ -1,0 +1,173 @@
+"""What came of an evaluation: figures for every volume and split, as JSON, as metrics, as tables."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+from armscan.training import Evaluation, Figures
+from armscan.training.bootstrap import LEVEL, N_RESAMPLES, Estimate
+from armscan.training.figures import NOT_STARTED_SOLVED
+
+TOTAL = "all volumes"
+# What MLflow takes in the name of a metric.
+REFUSED_BY_MLFLOW = re.compile(r"[^A-Za-z0-9_\-. /:]")
+SUMMARY_ROWS = (
+    ("success rate", "success_rate", "{:.1%}"),
+    ("  by Wilson", "success_rate_wilson", "{:.1%}"),
+    ("mean steps", "mean_steps", "{:.2f}"),
+    ("median steps", "median_steps", "{:.1f}"),
+    ("95th percentile", "p95_steps", "{:.1f}"),
+    ("mean final reward", "mean_final_reward", "{:.3f}"),
+    ("mean best reward", "mean_best_reward", "{:.3f}"),
+    ("mean distance (mm)", "mean_distance_mm", "{:.1f}"),
+    ("median distance (mm)", "median_distance_mm", "{:.1f}"),
+    ("mean angle (°)", "mean_distance_deg", "{:.1f}"),
+    ("median angle (°)", "median_distance_deg", "{:.1f}"),
+    ("mean Dice, bones", "mean_dice_bones", "{:.2f}"),
+    ("mean Dice, tendons", "mean_dice_tendons", "{:.2f}"),
+    ("mean Dice, artery", "mean_dice_artery", "{:.2f}"),
+    ("time per plane (ms)", "mean_seconds_per_plane", "{:.2f}"),
+)
+ROWS_OF_THE_OTHERS = (
+    ("success rate", f"success_rate{NOT_STARTED_SOLVED}", "{:.1%}"),
+    ("mean steps", f"mean_steps{NOT_STARTED_SOLVED}", "{:.2f}"),
+    ("median steps", f"median_steps{NOT_STARTED_SOLVED}", "{:.1f}"),
+)
+VOLUME_COLUMNS = (
+    ("success", "success_rate", "{:.0%}"),
+    ("steps", "mean_steps", "{:.1f}"),
+    ("mm", "mean_distance_mm", "{:.1f}"),
+    ("°", "mean_distance_deg", "{:.1f}"),
+    ("Dice", "mean_dice", "{:.2f}"),
+)
+# Figures that are shown in another unit than they are kept in.
+SHOWN_TIMES = {"mean_seconds_per_plane": 1000.0}
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """An evaluation that has been played.
+
+    Args:
+        evaluations: by what their volumes are called.
+        has_total: whether all of them are put together too; not where some volumes were trained on and others not.
+        facts: what was evaluated, and how; plain values for the JSON file.
+    """
+
+    evaluations: Mapping[str, Evaluation]
+    has_total: bool
+    facts: Mapping[str, Any]
+
+    @cached_property
+    def figures(self) -> dict[str, Figures]:
+        """By what the volumes are called, and of all together under `all volumes`."""
+        figures = {label: Figures.of(evaluation) for label, evaluation in self.evaluations.items()}
+        if self.has_total and len(figures) > 1:
+            everything = tuple(episode for each in self.evaluations.values() for episode in each.episodes)
+            figures[TOTAL] = Figures.of(Evaluation(everything))
+        return figures
+
+    @cached_property
+    def volume_figures(self) -> dict[str, dict[str, Figures]]:
+        """By what the volumes are called, then by the volume's name."""
+        by_label: dict[str, dict[str, Figures]] = {}
+        for label, evaluation in self.evaluations.items():
+            names = dict.fromkeys(episode.volume for episode in evaluation.episodes)
+            by_label[label] = {
+                name: Figures.of(Evaluation(tuple(each for each in evaluation.episodes if each.volume == name)))
+                for name in names
+            }
+        return by_label
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns everything, ready for JSON; what was not measured is None."""
+        return {
+            **self.facts,
+            "intervals": {
+                "level": LEVEL,
+                "resamples": N_RESAMPLES,
+                "method": "percentile bootstrap of volumes, then episodes",
+            },
+            "splits": {label: _plain(figures) for label, figures in self.figures.items()},
+            "volumes": {
+                label: {name: _plain(figures) for name, figures in volumes.items()}
+                for label, volumes in self.volume_figures.items()
+            },
+            "episodes": {
+                label: [asdict(episode) for episode in evaluation.episodes]
+                for label, evaluation in self.evaluations.items()
+            },
+        }
+
+    def metrics(self) -> dict[str, dict[str, float]]:
+        """Returns the numbers by what they are of: `test_volumes`, `volume/NAME`."""
+        groups = {label.replace(" ", "_"): figures.metrics() for label, figures in self.figures.items()}
+        for volumes in self.volume_figures.values():
+            for name, figures in volumes.items():
+                groups[f"volume/{REFUSED_BY_MLFLOW.sub('_', name)}"] = figures.metrics()
+        return groups
+
+
+def judgement_tables(judgement: Judgement) -> list[Table]:
+    """Returns the table of the splits, and for each of them that of its volumes."""
+    return [_summary(judgement.figures), *(_by_volume(*each) for each in judgement.volume_figures.items())]
+
+
+def _summary(figures: Mapping[str, Figures]) -> Table:
+    table = Table(title="figures, with 95 % intervals", title_justify="left")
+    table.add_column("")
+    for label in figures:
+        table.add_column(label, justify="right")
+    apart = "\n" if len(figures) > 1 else "  "
+    for text, key, form in SUMMARY_ROWS:
+        times = SHOWN_TIMES.get(key, 1.0)
+        table.add_row(text, *(_cell(each.estimates[key], form, times=times, apart=apart) for each in figures.values()))
+    table.add_section()
+    for text, count in (("volumes", "n_volumes"), ("episodes", "n_episodes"), ("started solved", "n_started_solved")):
+        table.add_row(text, *(str(getattr(each, count)) for each in figures.values()))
+    table.add_section()
+    table.add_row("others than these:")
+    for text, key, form in ROWS_OF_THE_OTHERS:
+        table.add_row(f"  {text}", *(_cell(each.estimates[key], form, apart=apart) for each in figures.values()))
+    return table
+
+
+def _by_volume(label: str, volumes: Mapping[str, Figures]) -> Table:
+    table = Table(title=f"{label}, each", title_justify="left")
+    table.add_column("volume", overflow="fold")
+    table.add_column("n", justify="right")
+    for heading, _, _ in VOLUME_COLUMNS:
+        table.add_column(heading, justify="right")
+    for name, figures in volumes.items():
+        cells = (_cell(figures.estimates[key], form, apart="\n") for _, key, form in VOLUME_COLUMNS)
+        table.add_row(Text(name), str(figures.n_episodes), *cells)
+    return table
+
+
+def _cell(estimate: Estimate, form: str, *, times: float = 1.0, apart: str) -> str:
+    if math.isnan(estimate.value):
+        return "-"
+    value, low, high = (form.format(number * times) for number in estimate)
+    # Of two percentages, one sign is enough; a dash between numbers below zero would be read as another minus.
+    between = " to " if estimate.low < 0 else "–"
+    return f"{value}{apart}{low.removesuffix('%')}{between}{high}"
+
+
+def _plain(figures: Figures) -> dict[str, Any]:
+    return {
+        "volumes": figures.n_volumes,
+        "episodes": figures.n_episodes,
+        "episodes_started_solved": figures.n_started_solved,
+        "figures": {
+            name: {key: None if math.isnan(number) else number for key, number in estimate._asdict().items()}
+            for name, estimate in figures.estimates.items()
+        },
+    }

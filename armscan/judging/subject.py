@@ -1,0 +1,113 @@
+"""What is evaluated: the agent of a tracked run, or one that a configuration describes."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+
+from armscan.building import check_sections
+from armscan.errors import CheckpointError, InvalidValueError
+from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
+from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, find_run
+from armscan.training import Familiar, load_checkpoint
+
+# Where a change of the rules goes in the configuration.
+CHANGES = {
+    "delta": "env.delta",
+    "max_steps": "env.max_steps",
+    "start": "env.start",
+    "clustering": "env.clustering",
+    "judged_by_sampling": "agent.judged_by_sampling",
+    "device": "compute.device",
+}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is evaluated.
+
+    Args:
+        name: what tables and files call it.
+        config: resolved, with the changes that were asked for.
+        run: that it was trained in, None for an agent that no run is of.
+        weights: of a learner, None where it has kept none.
+        n_env_steps: that it was trained for.
+        familiar: what it was trained on, None where that was not kept.
+    """
+
+    name: str
+    config: DictConfig
+    run: FoundRun | None = None
+    weights: dict[str, Any] | None = field(default=None, repr=False)
+    n_env_steps: int = 0
+    familiar: Familiar | None = None
+
+
+def subject_of_run(tracking: str, run_id: str, changes: Mapping[str, Any]) -> Subject:
+    """Returns the agent of a tracked run.
+
+    Raises:
+        ArmscanError: if there is no such run, it has kept too little, or what it has kept is damaged.
+    """
+    run = find_run(tracking, run_id)
+    if EVALUATED_TAG in run.tags:
+        raise InvalidValueError(f"run is {run_id!r}, but that is an evaluation, of {run.tags[EVALUATED_TAG]}")
+    with tempfile.TemporaryDirectory() as folder:
+        config = changed(OmegaConf.create(run.config(Path(folder))), changes)
+        weights, facts = _weights(run, Path(folder))
+    familiar = Familiar.from_json(run.tags[FAMILIAR_TAG]) if FAMILIAR_TAG in run.tags else None
+    return Subject(run.name, config, run, weights, int(facts.get("n_env_steps", 0)), familiar)
+
+
+def subject_of_words(words: Sequence[str], folder: str | None, changes: Mapping[str, Any]) -> Subject:
+    """Returns the agent of a configuration, composed as `python -m armscan.run` composes it.
+
+    Args:
+        words: `key=value`, `agent=NAME` among them.
+        folder: of the volumes that it is evaluated on, which are its own then; None for those of the configuration.
+        changes: of the rules.
+    """
+    GlobalHydra.instance().clear()
+    with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
+        config = compose(CONFIG_NAME, [*words, *(["data=nifti"] if folder else [])])
+    if folder:
+        config.data.path = folder
+    OmegaConf.resolve(config)
+    agents = [word.partition("=")[2] for word in words if word.startswith("agent=")]
+    return Subject(agents[-1], changed(config, changes))
+
+
+def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
+    """Returns the configuration with changed rules, by the names in `CHANGES`.
+
+    Raises:
+        InvalidValueError: if the configuration has no place for one, or lacks a section.
+    """
+    check_sections(config)
+    for name, value in changes.items():
+        section, _, key = CHANGES[name].partition(".")
+        if key not in config[section]:
+            raise InvalidValueError(f"{name} is {value!r}, but this agent has no such value")
+        config[section][key] = value
+    return config
+
+
+def _weights(run: FoundRun, folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
+    path = run.checkpoint(folder)
+    if path is None:
+        return None, {}
+    try:
+        weights, facts = load_checkpoint(path)
+    except CheckpointError as error:
+        # The file lies in a folder that is gone when this is read.
+        raise CheckpointError(f"run {run.run_id}: {str(error).replace(str(path), path.name)}") from error
+    if not isinstance(weights, dict) or not isinstance(facts, dict):
+        raise CheckpointError(f"run {run.run_id}: {path.name} holds no weights")
+    return weights, facts

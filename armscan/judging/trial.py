@@ -1,0 +1,122 @@
+"""An agent is brought together with volumes: checked, told what is different there, and played."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from omegaconf import DictConfig, OmegaConf
+
+from armscan.agents import Agent, Learner
+from armscan.anatomy import USUAL_PIXEL_MM
+from armscan.building import make_agent, make_maker
+from armscan.envs import EnvMaker
+from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed
+from armscan.judging.subject import Subject
+from armscan.judging.volumes import Volumes
+from armscan.training import Evaluation, Familiar, evaluate
+from armscan.training.evaluation import Env
+from armscan.training.familiar import smallest_slice, with_crops
+from armscan.volumes import LabelVolume
+
+# First seed of an evaluation's episodes: none of them is played by a run, whose seeds lie below.
+FIRST_SEED = 5 * 10**6
+PIXEL_TOLERANCE = 0.1
+
+
+@dataclass(frozen=True)
+class Trial:
+    """An agent and the environments that it is to be judged in, all of them made and checked.
+
+    Args:
+        agent: with its weights.
+        envs: by what their volumes are called.
+        notes: what is different for the agent there, in a sentence each.
+    """
+
+    agent: Agent
+    envs: dict[str, Env]
+    notes: tuple[str, ...]
+
+    def played(self, n_episodes: int, seed: int, tell: Callable[[str], None] = lambda _: None) -> dict[str, Evaluation]:
+        """Returns the episodes, `n_episodes` for each environment, in turn on its volumes; `tell` hears how it goes."""
+        evaluations = {}
+        for label, env in self.envs.items():
+            tell(f"playing {n_episodes} episodes on {len(env.get_wrapper_attr('volumes'))} {label}")
+            evaluations[label] = evaluate(self.agent, env, n_episodes=n_episodes, seed=FIRST_SEED + seed)
+        return evaluations
+
+
+def prepare(subject: Subject, groups: Mapping[str, Volumes], training: Mapping[str, LabelVolume]) -> Trial:
+    """Makes the agent and its environments on the volumes that it is judged on.
+
+    Args:
+        subject: the agent's configuration and weights.
+        groups: the volumes, by what they are called.
+        training: the volumes that the agent was trained on; looked at only where its reward is fitted to them.
+
+    Raises:
+        ArmscanError: if the agent cannot be applied to the volumes; the reason is said.
+    """
+    envs: dict[str, Env] = {}
+    notes: list[str] = []
+    trained = subject.familiar
+    agent = None
+    for label, volumes in groups.items():
+        config = subject.config if trained is None else _seen_as_trained(subject.config, trained, volumes)
+        maker = make_maker(config, training)
+        envs[label] = _env(maker, volumes, config.env.clustering)
+        here = Familiar.of(envs[label])
+        if subject.familiar is not None:
+            notes += [f"{label}: {difference}" for difference in subject.familiar.differences(here)]
+        # Of a run that has not kept what its agent was trained on, all volumes must at least look alike.
+        trained = trained or here
+        trained.check_observed(here)
+        if agent is None:
+            budget = int(config.training.env_steps)
+            agent = make_agent(config, maker, volumes, total_env_steps=budget, seed=int(config.seed))
+            _load_weights(agent, subject)
+    assert agent is not None
+    return Trial(agent, envs, tuple(notes))
+
+
+def _seen_as_trained(config: DictConfig, trained: Familiar, volumes: Volumes) -> DictConfig:
+    """Returns the configuration with images cropped as they were in training."""
+    node = config.env.observation
+    rules = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node
+    crops = with_crops(rules, trained.slice_px, smallest_slice(volumes.values()))
+    seen = config.copy()
+    seen.env.observation = crops
+    return seen
+
+
+def _env(maker: EnvMaker, volumes: Volumes, clustering: object) -> Env:
+    try:
+        return maker.one(volumes)
+    except OptimalPlaneError as error:
+        sizes = {volume.pixel_mm for volume in volumes.values()}
+        is_usual = all(
+            abs(mm / usual - 1) <= PIXEL_TOLERANCE
+            for size in sizes
+            for mm, usual in zip(size, USUAL_PIXEL_MM, strict=True)
+        )
+        if clustering != "pixels" or is_usual:
+            raise
+        shown = listed(f"{across:.3g} x {depth:.3g}" for across, depth in sorted(sizes))
+        raise InvalidValueError(
+            f"{error}; clusters are found by pixels, as suits about 0.27 x 0.55 mm, and here a pixel has {shown} mm: "
+            "unless the plane is wrong, clustering=metric may see them"
+        ) from error
+
+
+def _load_weights(agent: Agent, subject: Subject) -> None:
+    if not isinstance(agent, Learner):
+        return
+    if subject.run is None:
+        raise InvalidValueError(f"{subject.name} has to be trained first: give run=ID of a run that has trained one")
+    if subject.weights is None:
+        raise CheckpointError(f"run {subject.run.run_id} has kept no checkpoint, so that there is nothing to evaluate")
+    try:
+        agent.load_weights(subject.weights)
+    except CheckpointError as error:
+        raise CheckpointError(f"run {subject.run.run_id}: {error}") from error

@@ -1,0 +1,125 @@
+"""How sure a figure is: percentile bootstrap intervals of episodes that come from volumes.
+
+Whoever reads a success rate wants to know it for *other* volumes, and episodes on one volume are alike. So volumes are
+drawn with replacement first, and then, in each of them, as many of its episodes as it has, with replacement too. Where
+there is one volume, that leaves a bootstrap of its episodes, which speaks of that volume alone.
+
+With K volumes this is a little too wide where volumes are alike, and too narrow, by about sqrt((K - 1) / K) and more
+for few, where they differ; no resampling can know volumes that it has never seen. Where every episode has the same
+value, as at a success rate of 100 %, it has no width at all; `wilson` has one then, of episodes taken as independent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.errors import InvalidValueError
+from armscan.volumes.plane import FloatArray
+
+LEVEL = 0.95
+N_RESAMPLES = 2000
+# The standard normal's quantile of (1 + LEVEL) / 2.
+NORMAL_QUANTILE = 1.959963984540054
+# Resampled values that are in memory at once.
+MOST_VALUES = 2_000_000
+
+Statistic = Callable[[FloatArray], FloatArray]
+
+
+class Estimate(NamedTuple):
+    """A figure, and the interval that it lies in at 95 % confidence; all NaN where nothing was measured."""
+
+    value: float
+    low: float
+    high: float
+
+
+def mean(samples: FloatArray) -> FloatArray:
+    """Returns the mean over the last axis of what is not NaN; NaN where nothing is left."""
+    counts = (~np.isnan(samples)).sum(axis=-1)
+    return np.where(counts > 0, np.nansum(samples, axis=-1) / np.maximum(counts, 1), np.nan)
+
+
+def quantile(share: float) -> Statistic:
+    """Returns the statistic that gives a quantile over the last axis as `mean` gives the mean, by interpolation."""
+
+    def statistic(samples: FloatArray) -> FloatArray:
+        # NaNs come last.
+        ordered = np.sort(samples, axis=-1)
+        last = (~np.isnan(samples)).sum(axis=-1, keepdims=True) - 1
+        place = np.maximum(last, 0) * share
+        below = np.floor(place).astype(np.intp)
+        above = np.minimum(below + 1, np.maximum(last, 0))
+        low, high = np.take_along_axis(ordered, below, axis=-1), np.take_along_axis(ordered, above, axis=-1)
+        return np.asarray((low + (high - low) * (place - below))[..., 0])
+
+    return statistic
+
+
+def estimates(
+    columns: Mapping[str, tuple[Statistic, Sequence[float]]], volumes: Sequence[Hashable], *, seed: int = 0
+) -> dict[str, Estimate]:
+    """Returns figures with their intervals, by name; all of them from the same resamples.
+
+    Args:
+        columns: by the name of the figure, its statistic and the value of each episode, NaN for those left out.
+        volumes: which volume each episode is on.
+        seed: of the resampling; the same one gives the same intervals.
+
+    Raises:
+        InvalidValueError: if a column has another length than `volumes`, or there is no episode.
+    """
+    if not volumes or any(len(values) != len(volumes) for _, values in columns.values()):
+        raise InvalidValueError("every figure must have one value for each episode, and there must be an episode")
+    arrays = {name: np.asarray(values, dtype=float) for name, (_, values) in columns.items()}
+    resampled: dict[str, list[FloatArray]] = {name: [] for name in columns}
+    for places in _resamples(volumes, np.random.default_rng(seed)):
+        for name, (statistic, _) in columns.items():
+            # The place after the last, which is also that before the first, holds what is nobody's.
+            resampled[name].append(statistic(np.append(arrays[name], np.nan)[places]))
+    return {
+        name: _estimate(float(statistic(arrays[name])), np.concatenate(resampled[name]))
+        for name, (statistic, _) in columns.items()
+    }
+
+
+def wilson(n_successes: int, n_trials: int) -> Estimate:
+    """Returns a rate with Wilson's interval, as if all trials were independent."""
+    if n_trials == 0:
+        return Estimate(math.nan, math.nan, math.nan)
+    rate, z2 = n_successes / n_trials, NORMAL_QUANTILE**2
+    middle = (rate + z2 / (2 * n_trials)) / (1 + z2 / n_trials)
+    half = NORMAL_QUANTILE / (1 + z2 / n_trials) * math.sqrt(rate * (1 - rate) / n_trials + z2 / (4 * n_trials**2))
+    return Estimate(rate, max(0.0, middle - half), min(1.0, middle + half))
+
+
+def _estimate(value: float, resampled: FloatArray) -> Estimate:
+    known = resampled[~np.isnan(resampled)]
+    if not len(known):
+        return Estimate(value, math.nan, math.nan)
+    low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Estimate(value, float(low), float(high))
+
+
+def _resamples(volumes: Sequence[Hashable], rng: np.random.Generator) -> Iterator[NDArray[np.intp]]:
+    """Yields the places of the episodes of all resamples, shape (n_resamples, n_places), -1 for nobody's."""
+    places: dict[Hashable, list[int]] = {}
+    for place, volume in enumerate(volumes):
+        places.setdefault(volume, []).append(place)
+    sizes = np.array([len(each) for each in places.values()])
+    members = np.full((len(sizes), sizes.max()), -1)
+    for row, each in zip(members, places.values(), strict=True):
+        row[: len(each)] = each
+    at_once = max(1, MOST_VALUES // members.size)
+    for first in range(0, N_RESAMPLES, at_once):
+        n_resamples = min(at_once, N_RESAMPLES - first)
+        drawn = rng.integers(len(sizes), size=(n_resamples, len(sizes), 1))
+        within = (rng.random((n_resamples, *members.shape)) * sizes[drawn]).astype(np.intp)
+        # A volume with fewer episodes than another leaves the rest of its row empty.
+        chosen = np.where(np.arange(members.shape[1]) < sizes[drawn], members[drawn, within], -1)
+        yield chosen.reshape(n_resamples, -1)

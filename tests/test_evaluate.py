@@ -1,0 +1,310 @@
+"""The command that evaluates, as a person types it, on real tracked runs."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import SimpleITK
+import yaml
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from mlflow import MlflowClient
+from omegaconf import OmegaConf
+
+from armscan import evaluate
+from armscan.building import build
+from armscan.errors import InvalidValueError
+from armscan.tracking import FAMILIAR_TAG, TrackedRun, find_run, open_store
+from armscan.training import Familiar, save_checkpoint
+from armscan.volumes.resampling import resampled
+
+from .test_run import SMALL, armscan_run, runs_in
+
+FEW = ["data.n_training=1", "data.n_validation=1", "data.n_test=1", "env.max_steps=4"]
+IMAGES = ["network.images.filters=[2,2,2]", "network.images.vector_sizes=[4]", "network.images.head_sizes=[4]"]
+IMAGES += ["agent.buffer_size=500", "agent.num_envs=1", "agent.random_env_steps=1"]
+GUESSER = {"_target_": "tests.test_evaluate.Guesser"}
+
+
+class Guesser:
+    """A baseline: an algorithm and its agent, which draws planes."""
+
+    def agent(self, setup):
+        self._n_free = len(setup.action_names)
+        return self
+
+    def begin(self, *, seed, bounds):
+        self._rng = np.random.default_rng(seed)
+
+    def act(self, observation, reward):
+        return self._rng.uniform(-1, 1, self._n_free)
+
+
+def tracked(folder, *overrides, agent=None, kept=("config.yaml", "best.pt"), has_tag=True):
+    """Tracks a run of an agent that has learned nothing; returns its id."""
+    GlobalHydra.instance().clear()
+    with initialize_config_module("armscan.conf", version_base="1.3"):
+        config = compose("config", [*FEW, *overrides])
+    OmegaConf.resolve(config)
+    if agent:
+        config.agent = agent
+    experiment = build(config)
+    client, experiment_id = open_store(
+        f"sqlite:///{folder}/mlruns.db", experiment="armscan", artifacts=str(folder / "artifacts")
+    )
+    familiar = Familiar.of(experiment.maker.one(experiment.split.training))
+    tags = {"volumes.training": " ".join(experiment.split.training)}
+    tags |= {FAMILIAR_TAG: familiar.to_json()} if has_tag else {}
+    with TrackedRun(client, experiment_id, name="tiny", config={}, tags=tags) as run:
+        (folder / "config.yaml").write_text(yaml.safe_dump(OmegaConf.to_container(config)))
+        if agent is None:
+            save_checkpoint(folder / "best.pt", experiment.agent.weights(), {"n_env_steps": 7})
+        run.log_files(*(folder / name for name in kept if (folder / name).exists()))
+    return run.run_id
+
+
+@pytest.fixture
+def answer(tmp_path, monkeypatch, capsys):
+    """Runs the command in this process, in an empty folder; returns its exit code and what it printed."""
+
+    def command(*words):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("COLUMNS", "200")
+        code = evaluate.main(words)
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err.strip()
+
+    return command
+
+
+@pytest.fixture
+def coarse_folder(tmp_path, phantom):
+    """Phantoms of other sizes and spacing, with a manifest that splits them."""
+    folder = tmp_path / "coarse"
+    folder.mkdir()
+    entries = {}
+    for name, spacing in (("a.nii.gz", (0.4, 0.5, 0.5)), ("b.nii.gz", (0.45, 0.55, 0.5))):
+        volume = resampled(phantom, spacing)
+        image = SimpleITK.GetImageFromArray(np.ascontiguousarray(np.transpose(volume.labels)), isVector=False)
+        image.SetSpacing(volume.spacing)
+        SimpleITK.WriteImage(image, str(folder / name))
+        plane = volume.optimal_action
+        entries[name] = {"rotation": list(plane.rotation), "translation": list(plane.translation)}
+    splits = {"train": ["a.nii.gz"], "test": ["b.nii.gz"]}
+    (folder / "manifest.yaml").write_text(yaml.safe_dump({"volumes": entries, "splits": splits}))
+    return folder
+
+
+def written(folder, pattern="*"):
+    (file,) = (folder / "evaluations").glob(f"{pattern}.json")
+    return json.loads(file.read_text())
+
+
+@pytest.mark.slow
+def test_evaluate_judges_a_run_as_it_was_trained(tmp_path, data_folder):
+    assert armscan_run(*SMALL, cwd=tmp_path).returncode == 0
+    client, (run,) = runs_in(tmp_path)
+    command = [sys.executable, "-m", "armscan.evaluate", f"run={run.info.run_id[:10]}"]
+    for words in (["episodes=3"], ["episodes=4", f"data={data_folder}", "delta=0.1"]):
+        ended = subprocess.run([*command, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (ended.returncode, ended.stderr) == (0, "")
+        assert "success rate" in ended.stdout
+    children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
+    assert len(children) == 2
+    assert {file.path for file in client.list_artifacts(run.info.run_id)} >= {"best.pt", "config.yaml"}
+
+
+def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(answer, tmp_path):
+    run_id = tracked(tmp_path)
+    code, printed, errors = answer(f"run={run_id}", "episodes=5", "max_steps=3", "delta=0.04")
+    assert (code, errors) == (0, "")
+    for word in (
+        "success rate",
+        "by Wilson",
+        "95th percentile",
+        "Dice, artery",
+        "phantom-2000000",
+        "others than these",
+    ):
+        assert word in printed
+    contents = written(tmp_path)
+    assert contents["of"] == run_id
+    assert contents["changes"] == {"max_steps": 3, "delta": 0.04}
+    assert list(contents["splits"]) == ["training volumes", "validation volumes", "test volumes"]
+    assert max(episode["n_steps"] for episode in contents["episodes"]["test volumes"]) <= 3
+    assert list(contents["volumes"]["test volumes"]) == ["phantom-2000000"]
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    child = client.get_run(contents["tracked_as"])
+    assert child.data.tags["mlflow.parentRunId"] == child.data.tags["evaluation.of"] == run_id
+    for figure in ("success_rate", "p95_steps", "mean_best_reward", "median_distance_deg", "mean_dice_bones"):
+        numbers = contents["splits"]["test volumes"]["figures"][figure]
+        assert numbers["low"] <= numbers["value"] <= numbers["high"]
+        for group in ("test_volumes", "volume/phantom-2000000"):
+            assert child.data.metrics[f"{group}/{figure}"] == pytest.approx(numbers["value"])
+            assert child.data.metrics[f"{group}/{figure}_low"] == pytest.approx(numbers["low"])
+    assert child.data.params["env.max_steps"] == "3"
+    assert client.list_artifacts(child.info.run_id)[0].path.endswith(".json")
+    # The run itself stays as it was, and an evaluation is nothing to evaluate.
+    assert not client.get_run(run_id).data.metrics
+    code, _, errors = answer(f"run={contents['tracked_as']}")
+    assert (code, errors) == (2, f"error: run is {contents['tracked_as']!r}, but that is an evaluation, of {run_id}")
+
+
+def test_evaluate_gives_the_same_figures_again(answer, tmp_path):
+    run_id = tracked(tmp_path, "projection=zy")
+    figures = []
+    for name in ("first.json", "second.json"):
+        assert answer(f"run={run_id}", "episodes=4", "seed=3", f"out={name}")[0] == 0
+        contents = json.loads((tmp_path / name).read_text())["splits"]["test volumes"]["figures"]
+        figures.append({key: value for key, value in contents.items() if "seconds" not in key})
+    assert figures[0] == figures[1]
+
+
+def test_agent_is_applied_to_volumes_of_other_sizes_and_spacing(answer, tmp_path, coarse_folder):
+    run_id = tracked(tmp_path, "reward=agreement", "env.clustering=metric")
+    code, printed, errors = answer(f"run={run_id}", f"data={coarse_folder}", "episodes=3")
+    assert (code, errors) == (0, "")
+    assert "note: train split: a pixel is 0.4 mm across (trained on 0.27)" in printed
+    contents = written(tmp_path)
+    assert list(contents["splits"]) == ["train split", "test split", "all volumes"]
+    assert contents["splits"]["all volumes"]["episodes"] == 6
+    assert contents["notes"]
+
+
+def test_labelled_planes_that_score_too_little_are_refused_with_what_may_be_the_reason(answer, tmp_path, coarse_folder):
+    run_id = tracked(tmp_path)
+    manifest = yaml.safe_load((coarse_folder / "manifest.yaml").read_text())
+    manifest["volumes"]["b.nii.gz"]["translation"][1] -= 60
+    (coarse_folder / "manifest.yaml").write_text(yaml.safe_dump(manifest))
+    for word, ending in (
+        ("seed=0", "here a pixel has 0.45 x 0.5 mm: unless the plane is wrong, clustering=metric may see them"),
+        ("clustering=metric", "but it must score above -delta = -0.05"),
+    ):
+        code, _, errors = answer(f"run={run_id}", f"data={coarse_folder}", "episodes=2", word)
+        assert code == 2
+        assert errors.startswith("error: b.nii.gz: the labelled optimal plane scores")
+        assert errors.endswith(ending)
+
+
+def test_images_of_another_shape_are_refused_with_the_reason(answer, tmp_path, coarse_folder):
+    run_id = tracked(tmp_path, "obs=slice", "env.clustering=metric", *IMAGES)
+    code, _, errors = answer(f"run={run_id}", f"data={coarse_folder}", "episodes=2")
+    assert code == 2
+    assert "the agent was trained on images of" in errors
+    assert "it cannot be applied to them" in errors
+    assert answer(f"run={run_id}", "data=phantoms", "phantoms=1", "episodes=1")[0] == 0
+
+
+def test_run_that_has_not_kept_what_it_was_trained_on_is_refused_by_its_network(answer, tmp_path, coarse_folder):
+    run_id = tracked(tmp_path, "obs=slice", "env.clustering=metric", *IMAGES, has_tag=False)
+    code, _, errors = answer(f"run={run_id}", f"data={coarse_folder}", "episodes=2")
+    assert code == 2
+    assert "the checkpoint is another agent's or network's" in errors
+
+
+def test_fitted_rewards_alone_need_the_training_volumes(answer, tmp_path, data_folder):
+    data = ["data=nifti", f"data.path={data_folder}"]
+    for reward, code in (("published", 0), ("agreement", 2)):
+        GlobalHydra.instance().clear()
+        run_id = tracked_on_files(tmp_path, reward, data)
+        ended, _, errors = answer(f"run={run_id}", "data=phantoms", "phantoms=1", "episodes=1")
+        assert ended == code, errors
+    assert errors.startswith(
+        "error: the reward is fitted to the volumes that the agent was trained on, but they cannot"
+    )
+
+
+def tracked_on_files(folder, reward, data):
+    """Tracks a run on files that are gone afterwards."""
+    few, FEW[:] = list(FEW), ["env.max_steps=4"]
+    try:
+        run_id = tracked(folder, f"reward={reward}", *data, kept=("best.pt",))
+        config = yaml.safe_load((folder / "config.yaml").read_text())
+        config["data"]["path"] = str(folder / "gone")
+        (folder / "config.yaml").write_text(yaml.safe_dump(config))
+        client = MlflowClient(f"sqlite:///{folder}/mlruns.db")
+        client.log_artifact(run_id, str(folder / "config.yaml"))
+    finally:
+        FEW[:] = few
+    return run_id
+
+
+def test_baselines_are_evaluated_by_their_run_or_by_name(answer, tmp_path, phantom):
+    run_id = tracked(tmp_path, "projection=zy", agent=GUESSER, kept=("config.yaml",))
+    assert answer(f"run={run_id}", "data=phantoms", "phantoms=2", "episodes=2", "out=run.json")[0] == 0
+    words = ["agent=sac", "~agent.network", "agent._target_=tests.test_evaluate.GuesserOfAnything", "projection=zy"]
+    code, _, errors = answer(*words, "data=phantoms", "phantoms=2", "episodes=2", "max_steps=50", "out=agent.json")
+    assert (code, errors) == (0, "")
+    by_name = json.loads((tmp_path / "agent.json").read_text())
+    assert by_name["of"] == "sac"
+    tags = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db").get_run(by_name["tracked_as"]).data.tags
+    assert "mlflow.parentRunId" not in tags
+
+
+class GuesserOfAnything(Guesser):
+    """The same, whatever else its configuration says."""
+
+    def __init__(self, **_):
+        pass
+
+
+def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
+    run_id = tracked(tmp_path)
+    words_and_lines = [
+        ([], "run is not set, but it must be: give run=ID, or agent=NAME"),
+        ([f"run={run_id}", "agent=sac"], "run and agent are both given"),
+        ([f"run={run_id}", "projection=zy"], "there is no key 'projection', but only run, agent, data"),
+        (["run=xyz"], "run is 'xyz', but it must be the id of a run"),
+        (["run=ffffffff"], "run is 'ffffffff', but sqlite:///mlruns.db holds no run whose id begins so"),
+        ([f"run={run_id}", "tracking=sqlite:///no.db"], "tracking is 'sqlite:///no.db', but there is no such file"),
+        ([f"run={run_id}", "data=/nowhere"], "/nowhere: the folder of volumes does not exist"),
+        ([f"run={run_id}", "episodes=0"], "episodes is 0, but it must be a whole number of at least 1"),
+        ([f"run={run_id}", f"data={data_folder}", "episodes=3"], "episodes, of which each of 4 volumes is to have one"),
+        ([f"run={run_id}", "seed=-1"], "seed is -1, but it must be a whole number of at least 0"),
+        ([f"run={run_id}", "phantoms=3"], "phantoms is 3, but it is for data=phantoms"),
+        ([f"run={run_id}", "experiment=x"], "experiment is for agent=NAME"),
+        ([f"run={run_id}", "delta=7"], "delta is 7, but it must be a finite number above 0 and at most 1"),
+        ([f"run={run_id}", "device=tpu"], "device is 'tpu', but it must be auto, cpu or cuda"),
+        ([f"run={run_id}", "out=/dev/null/x.json"], "out is '/dev/null/x.json', but no file can be written there"),
+        (["agent=nobody"], "agent is 'nobody', but it must be "),
+        (["agent=sac", *FEW], "sac has to be trained first: give run=ID"),
+        (["agent=sac", "projection=q", *FEW], "projection is 'q', but it must be x, y"),
+        (["agent=sac", "nonsense"], "'nonsense' cannot be read"),
+    ]
+    for words, line in words_and_lines:
+        code, _, errors = answer(*words)
+        assert code == 2, words
+        assert errors.startswith(f"error: {line}"), (words, errors)
+        assert len(errors.splitlines()) == 1, errors
+    assert not (tmp_path / "evaluations").exists() or not list((tmp_path / "evaluations").iterdir())
+    assert len(runs_in(tmp_path)[1]) == 1
+
+
+def test_runs_that_have_kept_too_little_or_damage_are_refused(answer, tmp_path):
+    run_id = tracked(tmp_path, kept=())
+    assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id} has kept no config.yaml: it is FINISHED")
+    run_id = tracked(tmp_path, kept=("config.yaml",))
+    assert answer(f"run={run_id}")[2] == (
+        f"error: run {run_id} has kept no checkpoint, so that there is nothing to evaluate"
+    )
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    whole = (tmp_path / "best.pt").read_bytes()
+    (tmp_path / "best.pt").write_bytes(whole[: len(whole) // 2])
+    client.log_artifact(run_id, str(tmp_path / "best.pt"))
+    assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id}: best.pt: is no checkpoint, or damaged")
+    save_checkpoint(tmp_path / "best.pt", {"other": 1}, {})
+    client.log_artifact(run_id, str(tmp_path / "best.pt"))
+    assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id}: the checkpoint is another agent's or network's")
+    (tmp_path / "config.yaml").write_text("a: [")
+    client.log_artifact(run_id, str(tmp_path / "config.yaml"))
+    assert answer(f"run={run_id}")[2] == f"error: run {run_id}: its config.yaml is damaged"
+
+
+def test_several_runs_that_begin_alike_are_named(tmp_path, monkeypatch):
+    tracked(tmp_path)
+    monkeypatch.setattr("armscan.tracking.finding.SHORTEST_PREFIX", 0)
+    tracked(tmp_path)
+    with pytest.raises(InvalidValueError, match="several runs begin so"):
+        find_run(f"sqlite:///{tmp_path}/mlruns.db", "")
