@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import FileLock
@@ -35,9 +37,38 @@ def open_store(uri: str, *, experiment: str, artifacts: str) -> tuple[MlflowClie
     Raises:
         TrackingError: if the store cannot be reached or used.
     """
-    for name, value in (("uri", uri), ("experiment", experiment), ("artifacts", artifacts)):
+    _check_texts(uri=uri, experiment=experiment, artifacts=artifacts)
+    with _usable(uri):
+        return _open_locked(uri, experiment, artifacts)
+
+
+def open_existing_store(uri: str) -> MlflowClient:
+    """Opens a tracking store to look for a run in it, and makes nothing.
+
+    Raises:
+        TrackingError: if there is none, or it cannot be used.
+    """
+    _check_texts(uri=uri)
+    if uri.startswith(SQLITE_PREFIX):
+        database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
+        if not database.is_file():
+            raise TrackingError(f"tracking.uri is {uri!r}, but there is no {database}; give the one that the run is in")
+        uri = f"{SQLITE_PREFIX}{database}"
+    with _usable(uri):
+        client = MlflowClient(tracking_uri=uri)
+        client.search_experiments(max_results=1)
+        return client
+
+
+def _check_texts(**values: object) -> None:
+    for name, value in values.items():
         if not isinstance(value, str) or not value.strip() or value == SQLITE_PREFIX:
             raise TrackingError(f"tracking.{name} is {value!r}, but it must be a text such as {EXAMPLES[name]!r}")
+
+
+@contextmanager
+def _usable(uri: str) -> Iterator[None]:
+    """Says of a store that cannot be reached or used why, in one line."""
     for name, value in HTTP_DEFAULTS.items():
         os.environ.setdefault(name, value)
     # The making of a new database is told table by table.
@@ -47,7 +78,7 @@ def open_store(uri: str, *, experiment: str, artifacts: str) -> tuple[MlflowClie
         with warnings.catch_warnings():
             # SQLAlchemy tells MLflow's users of MLflow's own deprecated calls.
             warnings.simplefilter("ignore")
-            return _open_locked(uri, experiment, artifacts)
+            yield
     except (MlflowException, SQLAlchemyError, OSError, ModuleNotFoundError) as error:
         reason = " ".join(str(error).split())[:300]
         raise TrackingError(f"tracking.uri is {uri!r}, but this store cannot be used: {reason}") from error

@@ -3,6 +3,7 @@
 from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
+from armscan.training.course import Origin, take_up
 from armscan.training.data import Split, nifti_data, phantom_data
 from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Evaluation, evaluate
 from armscan.training.film import film_episode
@@ -19,6 +20,7 @@ __all__ = [
     "Episode",
     "EpochReport",
     "Evaluation",
+    "Origin",
     "SolvedCriterion",
     "Split",
     "TrainingResult",
@@ -28,5 +30,6 @@ __all__ = [
     "nifti_data",
     "phantom_data",
     "save_checkpoint",
+    "take_up",
     "train",
 ]
