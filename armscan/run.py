@@ -38,9 +38,15 @@ def run(config: DictConfig) -> None:
         from armscan.experiment import run_experiment
 
         run_experiment(config, invocation)
-    except BaseException as error:
+    except KeyboardInterrupt as error:
         remove_if_untracked(invocation.folder, error)
         raise
+    # Answered here: on its way out, Hydra would print lines of its own.
+    except Exception as error:
+        remove_if_untracked(invocation.folder, error)
+        if is_interruption(error):
+            raise KeyboardInterrupt from error
+        raise_or_exit(error)
 
 
 def raise_or_exit(error: BaseException) -> NoReturn:
