@@ -47,9 +47,11 @@ class ProgressBar:
             TimeRemainingColumn(),
         )
 
-    def on_start(self, total_env_steps: int) -> None:
-        """Shows the empty bar."""
+    def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
+        """Shows the bar, as far as training has come."""
         self._task = self._progress.add_task("training", total=total_env_steps, figures="")
+        for report in earlier[-1:]:
+            self.on_epoch(report)
         self._progress.start()
 
     def on_epoch(self, report: EpochReport) -> None:
@@ -71,11 +73,12 @@ class ProgressLines:
     def __init__(self, label: str | None) -> None:
         self._label = f"[{label}] " if label else ""
 
-    def on_start(self, total_env_steps: int) -> None:
-        """Says that training begins."""
+    def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
+        """Says that training begins, or goes on."""
         self._total = total_env_steps
-        self._start_s = time.perf_counter()
-        print(f"{self._label}training for at most {total_env_steps} environment steps", flush=True)
+        self._start_s = time.perf_counter() - (earlier[-1].wall_s if earlier else 0.0)
+        after = f", {earlier[-1].n_env_steps} of them taken" if earlier else ""
+        print(f"{self._label}training for at most {total_env_steps} environment steps{after}", flush=True)
 
     def on_epoch(self, report: EpochReport) -> None:
         """Writes the epoch's line."""

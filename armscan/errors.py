@@ -48,6 +48,14 @@ class CheckpointError(ArmscanError, ValueError):
     """A checkpoint cannot be read, or belongs to another agent."""
 
 
+class FolderInUseError(ArmscanError, RuntimeError):
+    """Another process is at work in a run's folder."""
+
+
+class ResumeError(ArmscanError, RuntimeError):
+    """A run cannot be resumed."""
+
+
 class DisplayError(ArmscanError, RuntimeError):
     """There is no screen, notebook or library that could show a window."""
 

@@ -174,7 +174,7 @@ def _tracked(
         "notes": list(notes),
     }
     config: Any = OmegaConf.to_container(subject.config)
-    with TrackedRun(
+    with TrackedRun.start(
         client,
         experiment_id,
         name=f"evaluation: {subject.name} on {data}",

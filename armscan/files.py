@@ -1,19 +1,29 @@
-"""The files of a run's folder, and files that are there whole or not at all."""
+"""The files of a run's folder, files that are there whole or not at all, and folders that one process holds."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-# What training keeps in the folder of its run.
+from filelock import FileLock, Timeout
+
+from armscan.errors import FolderInUseError
+
+# What training keeps in the folder of its run, the configuration it was started with, and who is at work in it.
 BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
+CONFIG_FILE = "config.yaml"
+LOCK_FILE = ".lock"
+UNFINISHED = "unfinished"
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Writes a file beside its place and moves it there: a reader sees the old one or the new one, never half of one.
+
+    Once it has returned, neither a killed process nor a power cut loses the new one.
 
     Args:
         path: the file's place; its folder exists.
@@ -21,7 +31,7 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """
     # Where the place is a link, the file that it leads to is replaced, not the link.
     path = path.resolve()
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.{UNFINISHED}")
     try:
         with unfinished.open("wb") as file:
             write(file)
@@ -30,5 +40,42 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
         if path.exists():
             shutil.copymode(path, unfinished)
         unfinished.replace(path)
+        _sync_folder(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Brings a folder's own entries to the disk, without which a file's new name may be lost."""
+    # Not every system can open a folder, and not every file system can sync one; the file itself is whole either way.
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Removes what a process that was killed in the middle of a write has left; for who holds the folder."""
+    for file in folder.glob(f".*.{UNFINISHED}"):
+        file.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Keeps every other process from working in a run's folder; the system frees what a dead process held.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        FolderInUseError: if another process holds it.
+    """
+    try:
+        with FileLock(folder / LOCK_FILE, timeout=0):
+            yield
+    except Timeout as error:
+        raise FolderInUseError(
+            f"{folder}: another process is at work in this folder; wait for its end, or stop it"
+        ) from error

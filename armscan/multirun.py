@@ -9,19 +9,25 @@ import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.errors import InvalidValueError
-from armscan.files import write_whole
+from armscan.errors import FolderInUseError, InvalidValueError
+from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, write_whole
 from armscan.mistakes import mistake_in_one_line
+from armscan.words import resume_command
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
+# Of a job's run: its number.
+JOB_TAG = "job"
 MAX_TAG_CHARS = 5000
 NO_OUTCOME, INTERRUPTED = "ended without a word", "interrupted"
 
@@ -147,27 +153,31 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         outcomes = {number: outcome.interrupted() for number, outcome in outcomes.items()}
     failed = {number: outcome for number, outcome in outcomes.items() if outcome.is_failed}
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
-    has_runs = _close_parent(Multirun.folder, status, failed)
+    runs = _close_parent(Multirun.folder, status, failed)
+    word = json.loads((Multirun.folder / PARENT_FILE).read_text())
     if outcomes:
         from armscan.console import print_jobs, print_where_to_look
 
         print_jobs(outcomes)
-        if has_runs:
-            tracking_uri = json.loads((Multirun.folder / PARENT_FILE).read_text())["tracking"]["uri"]
-            print_where_to_look(Multirun.folder, tracking_uri)
+        if runs:
+            print_where_to_look(Multirun.folder, word["tracking"]["uri"])
     for number, outcome in failed.items():
         print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
         print(f"  again alone: python -m armscan.run {outcome.overrides}", file=sys.stderr)
-    if not has_runs:
+    for run in runs:
+        if run.info.status != "FINISHED" and (Path(run.data.tags["folder"]) / LAST_CHECKPOINT).exists():
+            again = resume_command(run.info.run_id, word["tracking"]["uri"])
+            print(f"resume job {run.data.tags[JOB_TAG]} with: {again}", file=sys.stderr)
+    if not runs:
         remove_run_folder(Multirun.folder)
     return 1 if failed or not outcomes else 0
 
 
-def _close_parent(folder: Path, status: str, failed: Mapping[str, Outcome]) -> bool:
+def _close_parent(folder: Path, status: str, failed: Mapping[str, Outcome]) -> list[Run]:
     """Closes the parent run and what a killed job left open; deletes it where no job got as far as a run of its own.
 
     Returns:
-        Whether a job got as far as that.
+        The runs of those that got as far as that, in the order of the jobs.
     """
     from armscan.tracking import open_store
 
@@ -184,7 +194,14 @@ def _close_parent(folder: Path, status: str, failed: Mapping[str, Outcome]) -> b
     client.set_terminated(word["run_id"], status)
     if not children:
         client.delete_run(word["run_id"])
-    return bool(children)
+    return sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))
+
+
+def remove_if_untracked(folder: Path, error: BaseException) -> None:
+    """Removes what a run has left that failed before it was tracked; from then on it can be resumed."""
+    # Where somebody else is at work in the folder, everything is theirs.
+    if not (folder / CONFIG_FILE).exists() and not isinstance(error, FolderInUseError):
+        remove_run_folder(folder)
 
 
 def remove_run_folder(folder: Path) -> None:
@@ -194,7 +211,7 @@ def remove_run_folder(folder: Path) -> None:
     """
     for ours in (folder / ".hydra", folder / OUTCOME_FOLDER):
         shutil.rmtree(ours, ignore_errors=True)
-    for ours in (folder / PARENT_FILE, folder / "multirun.yaml"):
+    for ours in (folder / PARENT_FILE, folder / "multirun.yaml", folder / LOCK_FILE):
         ours.unlink(missing_ok=True)
     here = Path.cwd()
     for emptied in (folder, folder.parent, folder.parent.parent):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -104,3 +105,26 @@ def unseen_windows():
     yield
     pyplot.close("all")
     pyplot.switch_backend(before)
+
+
+@pytest.fixture
+def answer(tmp_path, monkeypatch, capsys):
+    """Runs the command in this process, in an empty folder; returns its exit code and what it printed."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    from armscan import run
+    from armscan.multirun import Multirun
+
+    def command(*arguments):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["armscan.run", *arguments])
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+        monkeypatch.setattr(Multirun, "folder", None)
+        GlobalHydra.instance().clear()
+        try:
+            code = run.main()
+        except SystemExit as leaving:
+            code = leaving.code
+        return code, capsys.readouterr().err.strip()
+
+    return command

@@ -15,8 +15,7 @@ from omegaconf import OmegaConf
 
 from armscan import evaluate
 from armscan.building import build
-from armscan.errors import InvalidValueError
-from armscan.tracking import FAMILIAR_TAG, TrackedRun, find_run, open_store
+from armscan.tracking import FAMILIAR_TAG, TrackedRun, open_store
 from armscan.training import Familiar, save_checkpoint
 from armscan.volumes.resampling import resampled
 
@@ -57,7 +56,7 @@ def tracked(folder, *overrides, agent=None, kept=("config.yaml", "best.pt"), has
     familiar = Familiar.of(experiment.maker.one(experiment.split.training))
     tags = {"volumes.training": " ".join(experiment.split.training)}
     tags |= {FAMILIAR_TAG: familiar.to_json()} if has_tag else {}
-    with TrackedRun(client, experiment_id, name="tiny", config={}, tags=tags) as run:
+    with TrackedRun.start(client, experiment_id, name="tiny", config={}, tags=tags) as run:
         (folder / "config.yaml").write_text(yaml.safe_dump(OmegaConf.to_container(config)))
         if agent is None:
             save_checkpoint(folder / "best.pt", experiment.agent.weights(), {"n_env_steps": 7})
@@ -256,9 +255,9 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         ([], "run is not set, but it must be: give run=ID, or agent=NAME"),
         ([f"run={run_id}", "agent=sac"], "run and agent are both given"),
         ([f"run={run_id}", "projection=zy"], "there is no key 'projection', but only run, agent, data"),
-        (["run=xyz"], "run is 'xyz', but it must be the id of a run"),
-        (["run=ffffffff"], "run is 'ffffffff', but sqlite:///mlruns.db holds no run whose id begins so"),
-        ([f"run={run_id}", "tracking=sqlite:///no.db"], "tracking is 'sqlite:///no.db', but there is no such file"),
+        (["run=xyz"], "the run is 'xyz', but it must be an id as MLflow shows it"),
+        (["run=ffffffff"], "the run is 'ffffffff', but no run of sqlite:///"),
+        ([f"run={run_id}", "tracking=sqlite:///no.db"], "tracking.uri is 'sqlite:///no.db', but there is no "),
         ([f"run={run_id}", "data=/nowhere"], "/nowhere: the folder of volumes does not exist"),
         ([f"run={run_id}", "episodes=0"], "episodes is 0, but it must be a whole number of at least 1"),
         ([f"run={run_id}", f"data={data_folder}", "episodes=3"], "episodes, of which each of 4 volumes is to have one"),
@@ -293,18 +292,10 @@ def test_runs_that_have_kept_too_little_or_damage_are_refused(answer, tmp_path):
     whole = (tmp_path / "best.pt").read_bytes()
     (tmp_path / "best.pt").write_bytes(whole[: len(whole) // 2])
     client.log_artifact(run_id, str(tmp_path / "best.pt"))
-    assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id}: best.pt: is no checkpoint, or damaged")
+    assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id}: best.pt: is damaged")
     save_checkpoint(tmp_path / "best.pt", {"other": 1}, {})
     client.log_artifact(run_id, str(tmp_path / "best.pt"))
     assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id}: the checkpoint is another agent's or network's")
     (tmp_path / "config.yaml").write_text("a: [")
     client.log_artifact(run_id, str(tmp_path / "config.yaml"))
     assert answer(f"run={run_id}")[2] == f"error: run {run_id}: its config.yaml is damaged"
-
-
-def test_several_runs_that_begin_alike_are_named(tmp_path, monkeypatch):
-    tracked(tmp_path)
-    monkeypatch.setattr("armscan.tracking.finding.SHORTEST_PREFIX", 0)
-    tracked(tmp_path)
-    with pytest.raises(InvalidValueError, match="several runs begin so"):
-        find_run(f"sqlite:///{tmp_path}/mlruns.db", "")

@@ -10,11 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 from mlflow import MlflowClient
-
-from armscan import run
-from armscan.multirun import Multirun
 
 SMALL = [
     "data.n_training=1",
@@ -49,25 +45,6 @@ def runs_in(folder):
     client = MlflowClient(tracking_uri=f"sqlite:///{folder}/mlruns.db")
     experiment = client.get_experiment_by_name("armscan")
     return client, client.search_runs([experiment.experiment_id])
-
-
-@pytest.fixture
-def answer(tmp_path, monkeypatch, capsys):
-    """Runs the command in this process, in an empty folder; returns its exit code and what it printed."""
-
-    def command(*arguments):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["armscan.run", *arguments])
-        monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-        monkeypatch.setattr(Multirun, "folder", None)
-        GlobalHydra.instance().clear()
-        try:
-            code = run.main()
-        except SystemExit as leaving:
-            code = leaving.code
-        return code, capsys.readouterr().err.strip()
-
-    return command
 
 
 def test_run_trains_evaluates_and_tracks(tmp_path):

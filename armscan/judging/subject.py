@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from armscan.building import check_sections
 from armscan.errors import CheckpointError, InvalidValueError
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
-from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, find_run
+from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, found_run
 from armscan.training import Familiar, load_checkpoint
 
 # Where a change of the rules goes in the configuration.
@@ -56,7 +56,7 @@ def subject_of_run(tracking: str, run_id: str, changes: Mapping[str, Any]) -> Su
     Raises:
         ArmscanError: if there is no such run, it has kept too little, or what it has kept is damaged.
     """
-    run = find_run(tracking, run_id)
+    run = found_run(tracking, run_id)
     if EVALUATED_TAG in run.tags:
         raise InvalidValueError(f"run is {run_id!r}, but that is an evaluation, of {run.tags[EVALUATED_TAG]}")
     with tempfile.TemporaryDirectory() as folder:

@@ -1,10 +1,10 @@
 """MLflow: the store, its runs, and the pictures that go there."""
 
-from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, find_run
+from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, find_run, found_run
 from armscan.tracking.pictures import draw_learning_curve
 from armscan.tracking.run import TrackedRun
 from armscan.tracking.source import source_tags
-from armscan.tracking.store import open_store
+from armscan.tracking.store import open_existing_store, open_store
 
 __all__ = [
     "EVALUATED_TAG",
@@ -13,6 +13,8 @@ __all__ = [
     "TrackedRun",
     "draw_learning_curve",
     "find_run",
+    "found_run",
+    "open_existing_store",
     "open_store",
     "source_tags",
 ]

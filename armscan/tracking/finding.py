@@ -1,4 +1,4 @@
-"""A run that was tracked, found again: its configuration and its checkpoint."""
+"""A run in the store by its id or the beginning of it, and what it has kept: configuration and checkpoint."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import yaml
 from mlflow import MlflowClient
 from mlflow.entities import Run
 
-from armscan.errors import InvalidValueError, TrackingError, listed
-from armscan.files import BEST_CHECKPOINT
-from armscan.tracking.run import CONFIG_FILE
-from armscan.tracking.store import SQLITE_PREFIX, usable_store
+from armscan.errors import TrackingError, listed
+from armscan.files import BEST_CHECKPOINT, CONFIG_FILE
+from armscan.tracking.store import open_existing_store, usable_store
 
 # What a run's agent was trained on, as `armscan.training.Familiar` writes it.
 FAMILIAR_TAG = "trained_on"
 # Which run an evaluation is of; only evaluations have it.
 EVALUATED_TAG = "evaluation.of"
-SHORTEST_PREFIX, ID_LENGTH = 4, 32
-MOST_RUNS_NAMED = 5
+ID = re.compile(r"[0-9a-f]{1,32}")
+MAX_EXPERIMENTS = 1000
+N_SHOWN = 4
 
 
 @dataclass(frozen=True)
@@ -77,40 +77,48 @@ class FoundRun:
             return Path(self.client.download_artifacts(self.run_id, file, str(folder)))
 
 
-def find_run(uri: str, run_id: str) -> FoundRun:
-    """Returns a tracked run.
+def found_run(uri: str, run_id: str) -> FoundRun:
+    """Returns a run with what it has kept.
 
     Args:
         uri: of the store.
-        run_id: the run's id, or the first four or more characters of it if no other run's begins so.
+        run_id: as in `find_run`.
 
     Raises:
-        InvalidValueError: if it cannot be an id, or no run has it, or several have.
-        TrackingError: if the store does not exist or cannot be used.
+        TrackingError: if no run is meant, or several are, or the store does not exist or cannot be used.
     """
-    if not re.fullmatch(rf"[0-9a-f]{{{SHORTEST_PREFIX},{ID_LENGTH}}}", run_id):
-        raise InvalidValueError(
-            f"run is {run_id!r}, but it must be the id of a run, or at least its first {SHORTEST_PREFIX} characters "
-            "(of 0 to 9 and a to f), as the UI shows it"
-        )
-    is_file = uri.startswith(SQLITE_PREFIX)
-    database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
-    if is_file and not database.is_file():
-        raise TrackingError(
-            f"tracking is {uri!r}, but there is no such file: go to the folder that the runs were started in, or give "
-            "tracking=URI"
-        )
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    client = open_existing_store(uri)
     with usable_store(uri):
-        # MLflow remembers stores by these, wherever a relative one leads by then.
-        client = MlflowClient(tracking_uri=f"{SQLITE_PREFIX}{database}" if is_file else uri)
-        experiments = [experiment.experiment_id for experiment in client.search_experiments()]
-        found = client.search_runs(experiments, f"attributes.run_id LIKE '{run_id}%'", max_results=MOST_RUNS_NAMED)
-        if len(found) == 1:
-            return _found(client, uri, found[0])
-    if found:
-        raise InvalidValueError(f"run is {run_id!r}, but several runs begin so: {listed(r.info.run_id for r in found)}")
-    raise InvalidValueError(f"run is {run_id!r}, but {uri} holds no run whose id begins so")
+        return _found(client, uri, find_run(client, run_id))
+
+
+def find_run(client: MlflowClient, run_id: str) -> Run:
+    """Returns the run of an id.
+
+    Args:
+        client: of an open store.
+        run_id: the id, or a beginning of it that no other run's has, in any experiment of the store.
+
+    Raises:
+        TrackingError: if no run is meant, or several are.
+    """
+    if not ID.fullmatch(run_id):
+        raise TrackingError(
+            f"the run is {run_id!r}, but it must be an id as MLflow shows it, or its beginning: up to 32 of 0-9 and a-f"
+        )
+    experiments = client.search_experiments(max_results=MAX_EXPERIMENTS)
+    found = client.search_runs(
+        [experiment.experiment_id for experiment in experiments],
+        filter_string=f"attributes.run_id LIKE '{run_id}%'",
+        max_results=N_SHOWN + 1,
+    )
+    if not found:
+        raise TrackingError(f"the run is {run_id!r}, but no run of {client.tracking_uri} has an id that begins so")
+    if len(found) > 1:
+        ids = [run.info.run_id for run in found[:N_SHOWN]] + (["others"] if len(found) > N_SHOWN else [])
+        raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the id")
+    return found[0]
 
 
 def _found(client: MlflowClient, uri: str, run: Run) -> FoundRun:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import yaml
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param
 
@@ -18,7 +17,7 @@ from armscan.tracking.pictures import draw_learning_curve
 from armscan.tracking.source import source_tags
 from armscan.training import EpochReport, Evaluation, TrainingResult
 
-CONFIG_FILE, EVALUATION_FILE, CURVE_FILE = "config.yaml", "evaluation.json", "learning_curve.png"
+EVALUATION_FILE, CURVE_FILE = "evaluation.json", "learning_curve.png"
 PARAMS_A_BATCH = 100
 MAX_PARAM_CHARS = 6000
 
@@ -28,15 +27,22 @@ class TrackedRun:
 
     Args:
         client: of an open store.
-        experiment_id: of the run.
+        run_id: of the run.
         name: what the UI calls the run.
-        config: the resolved configuration; its leaves become parameters.
-        tags: further tags.
-        parent_id: the run that this one is a child of, None for none.
+        logged: the names and steps of the figures that are there already, which are not logged again.
     """
 
     def __init__(
-        self,
+        self, client: MlflowClient, run_id: str, *, name: str, logged: Collection[tuple[str, int]] = ()
+    ) -> None:
+        self._client = client
+        self._logged = frozenset(logged)
+        self.run_id = run_id
+        self.name = name
+
+    @classmethod
+    def start(
+        cls,
         client: MlflowClient,
         experiment_id: str,
         *,
@@ -44,19 +50,56 @@ class TrackedRun:
         config: Mapping[str, Any],
         tags: Mapping[str, str],
         parent_id: str | None = None,
-    ) -> None:
-        self._client = client
-        self._config = dict(config)
-        self.name = name
+    ) -> Self:
+        """Makes a new run.
+
+        Args:
+            client: of an open store.
+            experiment_id: of the run.
+            name: what the UI calls the run.
+            config: the resolved configuration; its leaves become parameters.
+            tags: further tags.
+            parent_id: the run that this one is a child of, None for none.
+        """
         parent = {"mlflow.parentRunId": parent_id} if parent_id else {}
         run = client.create_run(experiment_id, run_name=name, tags={**source_tags(), **tags, **parent})
-        self.run_id: str = run.info.run_id
+        tracked = cls(client, run.info.run_id, name=name)
+        tracked.log_config(config)
+        return tracked
+
+    @classmethod
+    def go_on(cls, client: MlflowClient, run_id: str, *, config: Mapping[str, Any], tags: Mapping[str, str]) -> Self:
+        """Opens a run again that was interrupted, as if nothing had happened to it.
+
+        Args:
+            client: of the run's store.
+            run_id: of the run.
+            config: as it was started with; parameters that were not logged any more are.
+            tags: to set anew.
+        """
+        run = client.get_run(run_id)
+        if "failure" in run.data.tags:
+            client.delete_tag(run_id, "failure")
+        code = {f"resumed.{key}": value for key, value in source_tags().items() if key.startswith("git.")}
+        resumed = {"resumed": str(int(run.data.tags.get("resumed", "0")) + 1)}
+        for key, value in (dict(tags) | code | resumed).items():
+            client.set_tag(run_id, key, value)
+        client.update_run(run_id, status="RUNNING")
+        logged = {(name, point.step) for name in run.data.metrics for point in client.get_metric_history(run_id, name)}
+        tracked = cls(client, run_id, name=run.info.run_name or run_id, logged=logged)
+        tracked.log_config(config)
+        return tracked
+
+    def log_config(self, config: Mapping[str, Any]) -> None:
+        """Logs a configuration's leaves as parameters; those that are there already stay as they are."""
         params = [Param(key, str(value)[:MAX_PARAM_CHARS]) for key, value in flattened(config).items()]
         for first in range(0, len(params), PARAMS_A_BATCH):
-            client.log_batch(self.run_id, params=params[first : first + PARAMS_A_BATCH])
+            self._client.log_batch(self.run_id, params=params[first : first + PARAMS_A_BATCH])
 
-    def on_start(self, total_env_steps: int) -> None:
-        """Nothing is known yet."""
+    def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
+        """Makes up for what was not logged any more when the run was killed."""
+        for report in earlier:
+            self.on_epoch(report)
 
     def on_epoch(self, report: EpochReport) -> None:
         """Logs an epoch's figures by environment step."""
@@ -68,11 +111,16 @@ class TrackedRun:
         """The run goes on: evaluation and artifacts come after the training."""
 
     def log_figures(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
-        """Logs figures at an environment step, in one request."""
+        """Logs figures at an environment step, in one request; none twice."""
         now_ms = time.time_ns() // 1_000_000
-        # MLflow has no place for a mean over no episodes.
-        metrics = [Metric(name, value, now_ms, n_env_steps) for name, value in figures.items() if value == value]
-        self._client.log_batch(self.run_id, metrics=metrics)
+        metrics = [
+            Metric(name, value, now_ms, n_env_steps)
+            for name, value in figures.items()
+            # MLflow has no place for a mean over no episodes, which is NaN.
+            if value == value and (name, n_env_steps) not in self._logged
+        ]
+        if metrics:
+            self._client.log_batch(self.run_id, metrics=metrics)
 
     def log_files(self, *files: Path) -> None:
         """Keeps files as artifacts."""
@@ -97,8 +145,7 @@ class TrackedRun:
             draw_learning_curve(result.reports, folder / CURVE_FILE, title=self.name)
         contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
         (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
-        (folder / CONFIG_FILE).write_text(yaml.safe_dump(self._config, sort_keys=False))
-        self.log_files(*sorted(file for file in folder.iterdir() if file.is_file()))
+        self.log_files(*sorted(file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")))
 
     def __enter__(self) -> Self:
         return self

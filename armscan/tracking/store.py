@@ -37,11 +37,33 @@ def open_store(uri: str, *, experiment: str, artifacts: str) -> tuple[MlflowClie
     Raises:
         TrackingError: if the store cannot be reached or used.
     """
-    for name, value in (("uri", uri), ("experiment", experiment), ("artifacts", artifacts)):
-        if not isinstance(value, str) or not value.strip() or value == SQLITE_PREFIX:
-            raise TrackingError(f"tracking.{name} is {value!r}, but it must be a text such as {EXAMPLES[name]!r}")
+    _check_texts(uri=uri, experiment=experiment, artifacts=artifacts)
     with usable_store(uri):
         return _open_locked(uri, experiment, artifacts)
+
+
+def open_existing_store(uri: str) -> MlflowClient:
+    """Opens a tracking store to look for a run in it, and makes nothing.
+
+    Raises:
+        TrackingError: if there is none, or it cannot be used.
+    """
+    _check_texts(uri=uri)
+    if uri.startswith(SQLITE_PREFIX):
+        database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
+        if not database.is_file():
+            raise TrackingError(f"tracking.uri is {uri!r}, but there is no {database}; give the one that the run is in")
+        uri = f"{SQLITE_PREFIX}{database}"
+    with usable_store(uri):
+        client = MlflowClient(tracking_uri=uri)
+        client.search_experiments(max_results=1)
+        return client
+
+
+def _check_texts(**values: object) -> None:
+    for name, value in values.items():
+        if not isinstance(value, str) or not value.strip() or value == SQLITE_PREFIX:
+            raise TrackingError(f"tracking.{name} is {value!r}, but it must be a text such as {EXAMPLES[name]!r}")
 
 
 @contextmanager

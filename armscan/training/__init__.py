@@ -3,6 +3,7 @@
 from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
+from armscan.training.course import Origin, take_up
 from armscan.training.data import Split, mixed_data, nifti_data, phantom_data
 from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Evaluation, evaluate
 from armscan.training.familiar import Familiar
@@ -23,6 +24,7 @@ __all__ = [
     "Evaluation",
     "Familiar",
     "Figures",
+    "Origin",
     "SolvedCriterion",
     "Split",
     "TrainingResult",
@@ -33,5 +35,6 @@ __all__ = [
     "nifti_data",
     "phantom_data",
     "save_checkpoint",
+    "take_up",
     "train",
 ]

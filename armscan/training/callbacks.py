@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,7 +16,7 @@ class EpochReport:
     Args:
         epoch: its number, from 1.
         n_env_steps: environment steps taken so far.
-        wall_s: seconds since training began.
+        wall_s: seconds of training so far; the time between an interruption and a resumption is none.
         metrics: means of the epoch's training, by name.
         evaluation: on the validation volumes.
         is_best: whether no epoch before was as good.
@@ -32,8 +33,13 @@ class EpochReport:
 class Callback(Protocol):
     """Whoever wants to know how training goes."""
 
-    def on_start(self, total_env_steps: int) -> None:
-        """Called once, before the first step."""
+    def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
+        """Called once, before the first step.
+
+        Args:
+            total_env_steps: that training may take.
+            earlier: the epochs before, where a training goes on; whoever was told of them may have been killed since.
+        """
 
     def on_epoch(self, report: EpochReport) -> None:
         """Called at the end of every epoch."""

@@ -1,14 +1,25 @@
-"""Checkpoints: written whole or not at all, read without running code from the file."""
+"""Checkpoints: written whole or not at all, verified on reading, read without running code from the file.
+
+A file is one line, `armscan checkpoint FORMAT SHA-256`, and after it what `torch.save` writes, whose sum that is.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, NoReturn, cast
 
 import torch
 
 from armscan.errors import CheckpointError
 from armscan.files import write_whole
+
+FORMAT = 1
+MAGIC = b"armscan checkpoint "
+HEADER = re.compile(rb"armscan checkpoint ([0-9]{1,9}) ([0-9a-f]{64})\n")
+CHUNK_BYTES = 1 << 20
 
 
 def save_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> None:
@@ -19,7 +30,16 @@ def save_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) ->
         state: of the learner.
         facts: numbers and texts about it, such as how many steps it has taken.
     """
-    write_whole(path, lambda file: torch.save({"state": state, "facts": facts}, file))
+
+    def write(file: BinaryIO) -> None:
+        # Summed up as it is written, so that a large replay buffer is never in memory as one file beside itself.
+        file.write(_header("0" * 64))
+        summing = _Summing(file)
+        torch.save({"state": state, "facts": facts}, cast(BinaryIO, summing))
+        file.seek(0)
+        file.write(_header(summing.digest.hexdigest()))
+
+    write_whole(path, write)
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -29,14 +49,91 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         The learner's state, and the facts beside it.
 
     Raises:
-        CheckpointError: if the file is missing, damaged, or something else.
+        CheckpointError: if the file is missing, damaged, of a newer armscan, or something else.
     """
     try:
-        loaded = torch.load(path, map_location="cpu", weights_only=True)
-        return loaded["state"], loaded["facts"]
+        with path.open("rb") as file:
+            loaded = torch.load(_verified(file, path), map_location="cpu", weights_only=True)
+            return loaded["state"], loaded["facts"]
     except FileNotFoundError as error:
         raise CheckpointError(f"{path}: there is no such checkpoint") from error
-    # torch reports a damaged file by whichever of its readers meets the damage first.
+    except (CheckpointError, MemoryError):
+        raise
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from error
+    # Its sum is right, so nobody's disk is to blame; what torch refuses is told by whichever of its readers meets it.
     except Exception as error:
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise CheckpointError(f"{path}: is no checkpoint, or damaged ({reason})") from error
+        raise CheckpointError(
+            f"{path}: is no checkpoint: it holds something else than tensors, numbers and texts"
+        ) from error
+
+
+def _header(digest: str) -> bytes:
+    return MAGIC + f"{FORMAT} {digest}\n".encode()
+
+
+def _verified(file: BinaryIO, path: Path) -> BinaryIO:
+    """Returns the contents after the first line, whose sum is the one that the line names."""
+    header = file.readline(len(_header("0" * 64)) + 8)
+    if (match := HEADER.fullmatch(header)) is None:
+        _refuse(path, header)
+    if int(match[1]) != FORMAT:
+        newer = "it was written by a newer version" if int(match[1]) > FORMAT else "there never was such a format"
+        raise CheckpointError(
+            f"{path}: is a checkpoint of format {int(match[1])}, but this version of armscan reads {FORMAT}: {newer}"
+        )
+    digest = hashlib.sha256()
+    while chunk := file.read(CHUNK_BYTES):
+        digest.update(chunk)
+    if digest.hexdigest().encode() != match[2]:
+        raise CheckpointError(f"{path}: is damaged: its contents are not those that were written")
+    return cast(BinaryIO, _After(file, len(header)))
+
+
+def _refuse(path: Path, header: bytes) -> NoReturn:
+    if not header:
+        raise CheckpointError(f"{path}: is empty, but it must be a checkpoint")
+    if header.startswith(MAGIC):
+        raise CheckpointError(f"{path}: is damaged: its first line is {header!r}")
+    raise CheckpointError(f"{path}: is no checkpoint of armscan, or damaged: it begins with {header[:16]!r}")
+
+
+class _Summing:
+    """A file to write to that knows the sum of what was written."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.digest = hashlib.sha256()
+
+    def write(self, data: bytes) -> int:
+        """Writes, and adds to the sum."""
+        self.digest.update(data)
+        return self._file.write(data)
+
+    def flush(self) -> None:
+        """Hands on what is waiting."""
+        self._file.flush()
+
+
+class _After(io.RawIOBase):
+    """An open file from a place on, as if it began there; torch counts places from a file's beginning."""
+
+    def __init__(self, file: BinaryIO, offset: int) -> None:
+        super().__init__()
+        self._file, self._offset = file, offset
+        file.seek(offset)
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        return self._file.readinto(buffer)  # type: ignore[attr-defined, no-any-return]
+
+    def tell(self) -> int:
+        return self._file.tell() - self._offset
+
+    def seek(self, place: int, whence: int = io.SEEK_SET) -> int:
+        return self._file.seek(place + (self._offset if whence == io.SEEK_SET else 0), whence) - self._offset

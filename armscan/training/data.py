@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -52,6 +53,22 @@ class Split:
                 if name in seen:
                     raise InvalidValueError(f"{name} is in {seen[name]} and in {part}, but it must be in one split")
                 seen[name] = part
+
+    def fingerprints(self) -> dict[str, dict[str, str]]:
+        """Returns a sum of each volume's contents, by split and name: where they are the same, so are the volumes."""
+        return {
+            part: {name: _fingerprint(volume) for name, volume in getattr(self, part).items()}
+            for part in ("training", "validation", "test")
+        }
+
+
+def _fingerprint(volume: LabelVolume) -> str:
+    """Returns the SHA-256 of all that an agent can notice of a volume: voxels, spacing and labelled plane."""
+    plane = volume.optimal_action
+    rest = (volume.shape, volume.spacing, None if plane is None else plane.to_array().tolist())
+    digest = hashlib.sha256(repr(rest).encode())
+    digest.update(volume.labels.data)
+    return digest.hexdigest()
 
 
 def phantom_data(

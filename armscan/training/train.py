@@ -10,9 +10,10 @@ from pathlib import Path
 from armscan.agents.protocols import Learner
 from armscan.checks import check_float, check_int
 from armscan.errors import InvalidValueError
-from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
+from armscan.files import BEST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
-from armscan.training.checkpoint import load_checkpoint, save_checkpoint
+from armscan.training.checkpoint import load_checkpoint
+from armscan.training.course import Origin, keep
 from armscan.training.evaluation import Evaluation
 
 
@@ -74,7 +75,7 @@ class TrainingResult:
     Args:
         reports: one an epoch.
         is_solved: whether it stopped because the task was solved.
-        wall_s: seconds of learning and validating.
+        wall_s: seconds of learning and validating, before an interruption and after it.
     """
 
     reports: tuple[EpochReport, ...]
@@ -93,6 +94,9 @@ def train(
     validate: Callable[[], Evaluation],
     folder: Path,
     callbacks: Sequence[Callback] = (),
+    *,
+    origin: Origin | None = None,
+    earlier: Sequence[EpochReport] = (),
 ) -> TrainingResult:
     """Trains a learner and leaves it with the weights of its best epoch.
 
@@ -102,17 +106,20 @@ def train(
         validate: evaluates the learner on the validation volumes.
         folder: where `best.pt` and `last.pt` are kept.
         callbacks: who is told.
+        origin: what the checkpoints say that they come from.
+        earlier: what `take_up` returned, where a training goes on.
 
     Returns:
         The course of the training.
     """
-    start_s = time.perf_counter()
-    reports: list[EpochReport] = []
-    is_solved = False
+    reports = list(earlier)
+    start_s = time.perf_counter() - (reports[-1].wall_s if reports else 0.0)
+    is_solved = budget.solved is not None and budget.solved.holds(reports)
     for callback in callbacks:
-        callback.on_start(budget.env_steps)
+        callback.on_start(budget.env_steps, tuple(reports))
     try:
-        learner.warm_up()
+        if not reports:
+            learner.warm_up()
         while learner.n_env_steps < budget.env_steps and not is_solved:
             metrics = learner.learn(min(budget.epoch_env_steps, budget.env_steps - learner.n_env_steps))
             evaluation = validate()
@@ -122,10 +129,10 @@ def train(
                 wall_s=time.perf_counter() - start_s,
                 metrics=metrics,
                 evaluation=evaluation,
-                is_best=all(evaluation.score > earlier.evaluation.score for earlier in reports),
+                is_best=all(evaluation.score > before.evaluation.score for before in reports),
             )
             reports.append(report)
-            _keep(learner, report, folder)
+            keep(learner, reports, folder, origin)
             for callback in callbacks:
                 callback.on_epoch(report)
             is_solved = budget.solved is not None and budget.solved.holds(reports)
@@ -134,11 +141,3 @@ def train(
             callback.on_end()
     learner.load_weights(load_checkpoint(folder / BEST_CHECKPOINT)[0])
     return TrainingResult(tuple(reports), is_solved, time.perf_counter() - start_s)
-
-
-def _keep(learner: Learner, report: EpochReport, folder: Path) -> None:
-    """Writes the last checkpoint, and the best one where it is better than all before."""
-    facts = {"n_env_steps": report.n_env_steps, "epoch": report.epoch, **report.evaluation.metrics()}
-    save_checkpoint(folder / LAST_CHECKPOINT, learner.state(), facts)
-    if report.is_best:
-        save_checkpoint(folder / BEST_CHECKPOINT, learner.weights(), facts)

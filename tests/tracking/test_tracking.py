@@ -6,7 +6,14 @@ import sys
 import pytest
 
 from armscan.errors import TrackingError
-from armscan.tracking import TrackedRun, draw_learning_curve, open_store, source_tags
+from armscan.tracking import (
+    TrackedRun,
+    draw_learning_curve,
+    find_run,
+    open_existing_store,
+    open_store,
+    source_tags,
+)
 from armscan.tracking.run import flattened
 from armscan.training import EpochReport, TrainingResult
 
@@ -36,8 +43,8 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "best.pt").write_text("weights")
-    with TrackedRun(client, experiment_id, name="n", config=config, tags={"overrides": "seed=3"}) as tracked:
-        tracked.on_start(300)
+    with TrackedRun.start(client, experiment_id, name="n", config=config, tags={"overrides": "seed=3"}) as tracked:
+        tracked.on_start(300, ())
         for report in REPORTS:
             tracked.on_epoch(report)
         tracked.on_end()
@@ -56,7 +63,7 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
     history = client.get_metric_history(tracked.run_id, "validation/mean_steps")
     assert [(point.step, point.value) for point in history] == [(100, 9.0), (200, 4.0), (300, 3.0)]
     files = {file.path for file in client.list_artifacts(tracked.run_id)}
-    assert files == {"best.pt", "config.yaml", "evaluation.json", "learning_curve.png"}
+    assert files == {"best.pt", "evaluation.json", "learning_curve.png"}
 
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), "KILLED"), (ValueError("no"), "FAILED")])
@@ -64,7 +71,7 @@ def test_tracked_run_says_how_it_ended(store, error, status):
     client, experiment_id = store
 
     def fail():
-        with TrackedRun(client, experiment_id, name="n", config={}, tags={}) as tracked:
+        with TrackedRun.start(client, experiment_id, name="n", config={}, tags={}) as tracked:
             ids.append(tracked.run_id)
             raise error
 
@@ -78,12 +85,55 @@ def test_tracked_run_says_how_it_ended(store, error, status):
 
 def test_runs_are_children_of_their_parent(store):
     client, experiment_id = store
-    with TrackedRun(client, experiment_id, name="parent", config={}, tags={}) as parent:
+    with TrackedRun.start(client, experiment_id, name="parent", config={}, tags={}) as parent:
         pass
-    with TrackedRun(client, experiment_id, name="child", config={}, tags={}, parent_id=parent.run_id):
+    with TrackedRun.start(client, experiment_id, name="child", config={}, tags={}, parent_id=parent.run_id):
         pass
     (child,) = client.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{parent.run_id}'")
     assert child.info.run_name == "child"
+
+
+def test_run_that_goes_on_logs_what_is_missing_and_nothing_twice(store):
+    client, experiment_id = store
+    first = TrackedRun.start(client, experiment_id, name="n", config={"seed": 3}, tags={"folder": "here"})
+    first.on_epoch(REPORTS[0])
+    first.end("KILLED", reason="interrupted")
+    second = TrackedRun.go_on(client, first.run_id, config={"seed": 3, "more": 4}, tags={"folder": "there"})
+    run = client.get_run(first.run_id)
+    assert run.info.status == "RUNNING"
+    assert "failure" not in run.data.tags
+    assert (run.data.tags["resumed"], run.data.tags["folder"]) == ("1", "there")
+    assert run.data.params == {"seed": "3", "more": "4"}
+    second.on_start(300, REPORTS[:2])
+    second.on_epoch(REPORTS[2])
+    for name, values in {"validation/mean_steps": [9.0, 4.0, 3.0], "wall_s": [1.0, 2.0, 3.0]}.items():
+        history = client.get_metric_history(first.run_id, name)
+        assert [(point.step, point.value) for point in history] == list(zip([100, 200, 300], values, strict=True))
+    second.end("FINISHED")
+    assert client.get_run(first.run_id).info.status == "FINISHED"
+
+
+def test_find_run_takes_the_beginning_of_an_id_and_names_what_is_wrong(store):
+    client, experiment_id = store
+    ids = [client.create_run(experiment_id).info.run_id for _ in range(17)]
+    assert {find_run(client, run_id).info.run_id for run_id in ids} == set(ids)
+    firsts = [run_id[0] for run_id in ids]
+    twice = next(first for first in firsts if firsts.count(first) > 1)
+    with pytest.raises(TrackingError, match=f"the run is '{twice}', but that may be {twice}.*: give more of the id"):
+        find_run(client, twice)
+    shortest = next(ids[0][:n] for n in range(1, 33) if sum(other.startswith(ids[0][:n]) for other in ids) == 1)
+    assert find_run(client, shortest).info.run_id == ids[0]
+    for nonsense in ("", "%", "' OR 1=1", "XYZ", 33 * "a"):
+        with pytest.raises(TrackingError, match="but it must be an id as MLflow shows it"):
+            find_run(client, nonsense)
+    with pytest.raises(TrackingError, match=r"no run of sqlite:.* has an id that begins so"):
+        find_run(client, 32 * "a")
+
+
+def test_open_existing_store_makes_nothing(tmp_path):
+    with pytest.raises(TrackingError, match="but there is no "):
+        open_existing_store(f"sqlite:///{tmp_path}/runs.db")
+    assert not list(tmp_path.iterdir())
 
 
 def test_many_processes_may_open_a_fresh_store_at_once(tmp_path):

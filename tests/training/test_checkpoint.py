@@ -1,9 +1,13 @@
 """Checkpoints."""
 
+import hashlib
+import io
 import pickle
 
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from armscan.errors import CheckpointError
 from armscan.training import load_checkpoint, save_checkpoint
@@ -26,13 +30,56 @@ def test_failing_save_leaves_the_old_checkpoint(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["a.pt"]
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
-def test_truncated_checkpoint_is_refused(tmp_path, kept):
-    save_checkpoint(tmp_path / "a.pt", {"weights": torch.arange(1000.0)}, {})
-    whole = (tmp_path / "a.pt").read_bytes()
-    (tmp_path / "a.pt").write_bytes(whole[: int(kept * len(whole))])
-    with pytest.raises(CheckpointError, match=r"a\.pt: is no checkpoint, or damaged"):
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "a.pt"
+    save_checkpoint(path, {"weights": torch.arange(300.0), "names": ["a", "b"]}, {"n_env_steps": 7})
+    return path.read_bytes()
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_truncated_checkpoint_is_refused(tmp_path, whole, data):
+    kept = data.draw(st.integers(0, len(whole) - 1))
+    (tmp_path / "a.pt").write_bytes(whole[:kept])
+    with pytest.raises(CheckpointError, match=r"a\.pt: is (empty|damaged|no checkpoint)") as refused:
         load_checkpoint(tmp_path / "a.pt")
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_tampered_checkpoint_is_refused(tmp_path, whole, data):
+    # As often within the first line as anywhere else.
+    place = data.draw(st.integers(0, 90) | st.integers(0, len(whole) - 1))
+    flipped = data.draw(st.integers(1, 255))
+    changed = bytearray(whole)
+    changed[place] ^= flipped
+    (tmp_path / "a.pt").write_bytes(changed)
+    with pytest.raises(CheckpointError, match=r"a\.pt: is (damaged|no checkpoint|a checkpoint of format)"):
+        load_checkpoint(tmp_path / "a.pt")
+
+
+@pytest.mark.parametrize("added", [b"x", b"\0" * 1000])
+def test_checkpoint_with_something_added_is_refused(tmp_path, whole, added):
+    (tmp_path / "a.pt").write_bytes(whole + added)
+    with pytest.raises(CheckpointError, match="is damaged"):
+        load_checkpoint(tmp_path / "a.pt")
+
+
+def test_checkpoint_of_a_newer_version_is_refused(tmp_path, whole):
+    (tmp_path / "a.pt").write_bytes(whole.replace(b"checkpoint 1 ", b"checkpoint 2 ", 1))
+    with pytest.raises(CheckpointError, match=r"of format 2, but this version of armscan reads 1: .* a newer version"):
+        load_checkpoint(tmp_path / "a.pt")
+
+
+def test_other_files_are_no_checkpoints(tmp_path):
+    torch.save({"state": {}, "facts": {}}, tmp_path / "a.pt")
+    (tmp_path / "b.pt").write_text("weights: 3\n")
+    (tmp_path / "c.pt").mkdir()
+    for name, message in (("a", "is no checkpoint of"), ("b", "is no checkpoint of"), ("c", "cannot be read")):
+        with pytest.raises(CheckpointError, match=rf"{name}\.pt: {message}"):
+            load_checkpoint(tmp_path / f"{name}.pt")
 
 
 def test_missing_checkpoint_is_named(tmp_path):
@@ -45,8 +92,27 @@ class Malicious:
         return (print, ("this must not run",))
 
 
-def test_checkpoint_runs_no_code_from_the_file(tmp_path, capsys):
-    torch.save({"state": Malicious(), "facts": {}}, tmp_path / "a.pt", pickle_module=pickle)
-    with pytest.raises(CheckpointError):
+def with_a_right_sum(contents):
+    return f"armscan checkpoint 1 {hashlib.sha256(contents).hexdigest()}\n".encode() + contents
+
+
+@pytest.mark.parametrize("is_zipped", [True, False])
+def test_checkpoint_runs_no_code_from_the_file(tmp_path, capsys, is_zipped):
+    file = io.BytesIO()
+    if is_zipped:
+        torch.save({"state": Malicious(), "facts": {}}, file)
+    else:
+        pickle.dump({"state": Malicious(), "facts": {}}, file, protocol=2)
+    (tmp_path / "a.pt").write_bytes(with_a_right_sum(file.getvalue()))
+    with pytest.raises(CheckpointError, match="something else than tensors, numbers and texts"):
         load_checkpoint(tmp_path / "a.pt")
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("content", [3, [1], {"state": {}}])
+def test_checkpoint_that_holds_something_else_is_refused(tmp_path, content):
+    file = io.BytesIO()
+    torch.save(content, file)
+    (tmp_path / "a.pt").write_bytes(with_a_right_sum(file.getvalue()))
+    with pytest.raises(CheckpointError, match="is no checkpoint"):
+        load_checkpoint(tmp_path / "a.pt")

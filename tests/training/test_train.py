@@ -1,16 +1,22 @@
 """Epochs, tests, early stop and checkpoints, with a learner that follows a script."""
 
+import dataclasses
+import shutil
+
 import pytest
 
-from armscan.errors import InvalidValueError
+from armscan.errors import CheckpointError, InvalidValueError
 from armscan.training import (
     BEST_CHECKPOINT,
     LAST_CHECKPOINT,
     Budget,
     Episode,
     Evaluation,
+    Origin,
     SolvedCriterion,
+    course,
     load_checkpoint,
+    take_up,
     train,
 )
 
@@ -61,10 +67,10 @@ class ScriptedLearner:
         self.n_epochs = weights["weights"]
 
     def state(self):
-        return {"state": self.n_epochs}
+        return {"state": self.n_epochs, "n_env_steps": self.n_env_steps}
 
     def load_state(self, state):
-        self.n_epochs = state["state"]
+        self.n_epochs, self.n_env_steps = state["state"], state["n_env_steps"]
 
     def begin(self, *, seed, bounds):
         pass
@@ -77,8 +83,8 @@ class Recorder:
     def __init__(self):
         self.calls = []
 
-    def on_start(self, total_env_steps):
-        self.calls.append(("start", total_env_steps))
+    def on_start(self, total_env_steps, earlier):
+        self.calls.append(("start", total_env_steps, len(earlier)))
 
     def on_epoch(self, report):
         self.calls.append(("epoch", report.n_env_steps, report.is_best))
@@ -109,7 +115,7 @@ def test_train_keeps_the_best_and_the_last_and_ends_with_the_best(tmp_path):
     assert result.best.n_env_steps == 90
     assert load_checkpoint(tmp_path / BEST_CHECKPOINT)[0] == {"weights": 2}
     state, facts = load_checkpoint(tmp_path / LAST_CHECKPOINT)
-    assert (state, facts["n_env_steps"], facts["mean_steps"]) == ({"state": 3}, 100, 5.0)
+    assert (state, facts["n_env_steps"], facts["mean_steps"]) == ({"state": 3, "n_env_steps": 100}, 100, 5.0)
     assert [call[2] for call in recorder.calls if call[0] == "epoch"] == [True, True, False]
 
 
@@ -137,6 +143,125 @@ def test_train_tells_its_callbacks_when_it_fails(tmp_path):
             [recorder],
         )
     assert recorder.calls[-1] == ("end",)
+
+
+SCRIPT = [evaluation_of(9), evaluation_of(3, 4), evaluation_of(5), evaluation_of(2), evaluation_of(6)]
+BUDGET = Budget(env_steps=210, epoch_env_steps=40, validation_episodes=1)
+ORIGIN = Origin(run_id="r", volumes={"training": {"a": "1"}, "validation": {"b": "2"}, "test": {"c": "3"}})
+
+
+class Killed(BaseException):
+    """As by kill -9: nobody is told."""
+
+
+def cut_off(folder, monkeypatch, n_writes):
+    """Trains until so many checkpoints were written, and is killed then."""
+    save, written = course.save_checkpoint, []
+
+    def save_or_die(*arguments):
+        if len(written) == n_writes:
+            raise Killed
+        written.append(arguments)
+        save(*arguments)
+
+    monkeypatch.setattr(course, "save_checkpoint", save_or_die)
+    recorder, script = Recorder(), iter(SCRIPT)
+    with pytest.raises(Killed):
+        train(ScriptedLearner(), BUDGET, lambda: next(script), folder, [recorder], origin=ORIGIN)
+    monkeypatch.setattr(course, "save_checkpoint", save)
+    return recorder
+
+
+def gone_on(folder):
+    """Goes on with a training; returns its callback and its result."""
+    learner, recorder = ScriptedLearner(), Recorder()
+    earlier = take_up(learner, folder, ORIGIN)
+    script = iter(SCRIPT[len(earlier) :])
+    return recorder, train(learner, BUDGET, lambda: next(script), folder, [recorder], origin=ORIGIN, earlier=earlier)
+
+
+def course_of(reports):
+    return [dataclasses.replace(report, wall_s=0.0) for report in reports]
+
+
+@pytest.mark.parametrize("n_writes", range(8))
+def test_training_killed_between_any_two_writes_ends_as_if_it_had_not_been(tmp_path, monkeypatch, n_writes):
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "cut").mkdir()
+    _, whole = gone_on(tmp_path / "whole")
+    cut_off(tmp_path / "cut", monkeypatch, n_writes)
+    recorder, result = gone_on(tmp_path / "cut")
+    assert course_of(result.reports) == course_of(whole.reports)
+    assert result.best.epoch == whole.best.epoch == 4
+    for name in (BEST_CHECKPOINT, LAST_CHECKPOINT):
+        (state, facts), (other, others) = (load_checkpoint(tmp_path / way / name) for way in ("cut", "whole"))
+        assert state == other
+        assert facts["epoch"] == others["epoch"]
+    n_epochs_before = recorder.calls[0][2]
+    assert [call[0] for call in recorder.calls] == ["start", *["epoch"] * (5 - n_epochs_before), "end"]
+
+
+def test_training_that_has_ended_goes_on_to_nothing_but_its_best_weights(tmp_path):
+    _, first = gone_on(tmp_path)
+    recorder, result = gone_on(tmp_path)
+    assert recorder.calls == [("start", 210, 5), ("end",)]
+    assert result.reports == first.reports
+    assert result.wall_s >= first.reports[-1].wall_s
+
+
+def test_training_that_goes_on_counts_epochs_that_had_solved_the_task(tmp_path, monkeypatch):
+    monkeypatch.setattr("tests.training.test_train.SCRIPT", [evaluation_of(9), *[evaluation_of(1)] * 4])
+    cut_off(tmp_path, monkeypatch, 4)
+    learner = ScriptedLearner()
+    earlier = take_up(learner, tmp_path, ORIGIN)
+    assert len(earlier) == 2
+    budget = dataclasses.replace(BUDGET, solved=SolvedCriterion(n_epochs=2))
+    result = train(learner, budget, lambda: evaluation_of(1), tmp_path, origin=ORIGIN, earlier=earlier)
+    assert result.is_solved
+    assert len(result.reports) == 3
+
+
+def test_wall_time_goes_on_without_the_time_in_between(tmp_path, monkeypatch):
+    cut_off(tmp_path, monkeypatch, 4)
+    earlier = take_up(ScriptedLearner(), tmp_path, ORIGIN)
+    long_ago = [dataclasses.replace(report, wall_s=1000.0 * report.epoch) for report in earlier]
+    learner, script = ScriptedLearner(), iter(SCRIPT[2:])
+    learner.n_env_steps = earlier[-1].n_env_steps
+    result = train(learner, BUDGET, lambda: next(script), tmp_path, origin=ORIGIN, earlier=long_ago)
+    assert 2000.0 < result.reports[2].wall_s < 2100.0
+    assert 2000.0 < result.wall_s < 2100.0
+
+
+@pytest.mark.parametrize(
+    ("origin", "message"),
+    [
+        ({"run_id": "other"}, r"last\.pt: is a checkpoint of run 'r', but this is 'other'"),
+        ({"volumes": {"training": {"a": "9"}}}, r"the training volumes are not those .*: a is changed"),
+        ({"volumes": {"validation": {"b": "2", "d": "4"}}}, r"the validation volumes are not those .*: d is new"),
+        ({"volumes": {"test": {}}}, r"the test volumes are not those .*: c is not there any more"),
+    ],
+)
+def test_take_up_refuses_what_comes_from_something_else(tmp_path, origin, message):
+    gone_on(tmp_path)
+    with pytest.raises(CheckpointError, match=message):
+        take_up(ScriptedLearner(), tmp_path, dataclasses.replace(ORIGIN, **origin))
+
+
+def test_take_up_refuses_a_best_checkpoint_that_is_missing_or_not_the_best(tmp_path):
+    gone_on(tmp_path)
+    (tmp_path / BEST_CHECKPOINT).unlink()
+    with pytest.raises(CheckpointError, match=r"best\.pt: there is no such checkpoint"):
+        take_up(ScriptedLearner(), tmp_path, ORIGIN)
+    shutil.copy(tmp_path / LAST_CHECKPOINT, tmp_path / BEST_CHECKPOINT)
+    with pytest.raises(CheckpointError, match=r"best\.pt: is of epoch 5, but the best epoch of .*last\.pt is 4"):
+        take_up(ScriptedLearner(), tmp_path, ORIGIN)
+
+
+@pytest.mark.parametrize("text", [None, "", "[]", "[1]", '[{"epoch": 1}]', '{"a": 1}'])
+def test_take_up_refuses_a_checkpoint_without_its_course(tmp_path, text):
+    course.save_checkpoint(tmp_path / LAST_CHECKPOINT, {}, ORIGIN.facts() | {"reports": text})
+    with pytest.raises(CheckpointError, match="holds no reports of the epochs so far"):
+        take_up(ScriptedLearner(), tmp_path, ORIGIN)
 
 
 @pytest.mark.parametrize(

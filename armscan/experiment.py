@@ -1,0 +1,244 @@
+"""One run from beginning to end: built, tracked, trained, evaluated, and shown.
+
+No part of the configuration goes further than this module and `building.py`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import socket
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+import armscan
+from armscan.agents import Learner
+from armscan.building import Experiment, build
+from armscan.console import print_results, print_where_to_look, progress_reporter
+from armscan.files import BEST_CHECKPOINT, CONFIG_FILE, LAST_CHECKPOINT, held, write_whole
+from armscan.invocation import Invocation
+from armscan.mistakes import quieten_libraries
+from armscan.multirun import JOB_TAG
+from armscan.tracking import FAMILIAR_TAG, TrackedRun, open_store
+from armscan.training import (
+    TEST,
+    TRAINING,
+    EpochReport,
+    Evaluation,
+    Familiar,
+    Origin,
+    Split,
+    TrainingResult,
+    evaluate,
+    film_episode,
+    train,
+)
+from armscan.training.evaluation import Env
+from armscan.words import resume_command
+
+MAX_TAG_CHARS = 5000
+CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")
+# First seeds of the episodes that are played for each purpose, so that none is played for two.
+VALIDATION_SEED, TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED, FILM_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """An experiment and the environments that its agent is judged in, made and so checked before anything is tracked.
+
+    Args:
+        experiment: what is run.
+        training_env: of the training volumes, for the final evaluation.
+        validation_env: for the validation after each epoch.
+        test_env: for the final evaluation.
+        film_env: for the film of an episode.
+    """
+
+    experiment: Experiment
+    training_env: Env
+    validation_env: Env
+    test_env: Env
+    film_env: Env
+
+    @classmethod
+    def built(cls, config: DictConfig) -> Self:
+        """Builds what a configuration describes.
+
+        Raises:
+            InvalidValueError: if something in it is not allowed.
+        """
+        quieten_libraries()
+        torch.set_num_threads(1)
+        experiment = build(config)
+        maker, split = experiment.maker, experiment.split
+        return cls(
+            experiment=experiment,
+            training_env=maker.one(split.training),
+            validation_env=maker.one(split.validation),
+            test_env=maker.one(split.test),
+            film_env=maker.one(split.test, render_mode="rgb_array"),
+        )
+
+    def origin(self, run_id: str) -> Origin:
+        """Returns what the checkpoints of a run say that they come from."""
+        return Origin(run_id=run_id, volumes=self.experiment.split.fingerprints())
+
+
+def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict[str, float]]:
+    """Trains an agent, if it is one that learns, evaluates and tracks it.
+
+    Args:
+        config: the composed configuration.
+        invocation: how it was asked for.
+
+    Returns:
+        The figures of the final evaluations, by the name of their volumes.
+    """
+    stage = Stage.built(config)
+    job = invocation.job
+    with held(invocation.folder):
+        tracked = start_tracking(config, invocation, stage)
+        return carry_out(stage, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
+
+
+def start_tracking(config: DictConfig, invocation: Invocation, stage: Stage) -> TrackedRun:
+    """Writes down what is run, opens the tracking store and starts a run in it."""
+    resolved: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
+    client, experiment_id = open_store(**resolved["tracking"])
+    choices, job, config_file = invocation.choices, invocation.job, invocation.folder / CONFIG_FILE
+    text = yaml.safe_dump(resolved, sort_keys=False).encode()
+    # Another run's, left in a folder that somebody named: they would be taken for this one's.
+    for stale in (LAST_CHECKPOINT, BEST_CHECKPOINT):
+        (invocation.folder / stale).unlink(missing_ok=True)
+    # Before the run is there: whenever it is killed, it can be resumed.
+    write_whole(config_file, lambda file: file.write(text))
+    tracked = TrackedRun.start(
+        client,
+        experiment_id,
+        name=run_name(resolved, choices),
+        config=resolved,
+        tags={
+            "overrides": " ".join(invocation.overrides),
+            **{f"choice.{group}": choices[group] for group in CHOICES_IN_TAGS},
+            **volume_tags(stage.experiment.split),
+            # Where it is applied to other volumes, later, the agent must see what it has learned to see.
+            FAMILIAR_TAG: Familiar.of(stage.training_env).to_json(),
+            **place_tags(invocation.folder),
+            "working_folder": str(Path.cwd()),
+            "config.sha256": hashlib.sha256(text).hexdigest(),
+            **({JOB_TAG: str(job.number)} if job else {}),
+        },
+        parent_id=job.parent_run_id if job else None,
+    )
+    tracked.log_files(config_file)
+    return tracked
+
+
+def volume_tags(split: Split) -> dict[str, str]:
+    """Returns the names of the volumes, as tags of a run."""
+    return {
+        f"volumes.{part}": " ".join(getattr(split, part))[:MAX_TAG_CHARS] for part in ("training", "validation", "test")
+    }
+
+
+def place_tags(folder: Path) -> dict[str, str]:
+    """Returns where a run is at work, and what with, as its tags."""
+    return {"folder": str(folder.resolve()), "host": socket.gethostname(), "armscan.version": armscan.__version__}
+
+
+def run_name(config: dict[str, Any], choices: dict[str, str]) -> str:
+    """Returns what the UI calls a run: what most runs differ by."""
+    projection = config["projection"]
+    parts = [choices["agent"], choices["obs"], projection if isinstance(projection, str) else "+".join(projection)]
+    parts += [
+        f"{wrapper}{config[wrapper]}"
+        for wrapper, without in (("stack", 1), ("memory", 0))
+        if config[wrapper] != without
+    ]
+    return "-".join([*parts, choices["data"], f"seed{config['seed']}"])
+
+
+def carry_out(
+    stage: Stage,
+    tracked: TrackedRun,
+    folder: Path,
+    tracking_uri: str,
+    *,
+    job_label: str | None = None,
+    earlier: Sequence[EpochReport] = (),
+) -> dict[str, dict[str, float]]:
+    """Trains, evaluates and shows, in a run that is tracked.
+
+    Args:
+        stage: what is run.
+        tracked: its run.
+        folder: where it leaves its files.
+        tracking_uri: of the store.
+        job_label: what stands before the lines of one job of several, None for a single run.
+        earlier: the epochs before, where a training goes on.
+
+    Returns:
+        The figures of the final evaluations, by the name of their volumes.
+    """
+    with _told_how_to_resume(tracked.run_id, tracking_uri, folder, is_told=job_label is None), tracked:
+        result = None
+        if isinstance(stage.experiment.agent, Learner):
+            budget, seed = stage.experiment.budget, VALIDATION_SEED + stage.experiment.seed
+            result = train(
+                stage.experiment.agent,
+                budget,
+                partial(
+                    evaluate,
+                    stage.experiment.agent,
+                    stage.validation_env,
+                    n_episodes=budget.validation_episodes,
+                    seed=seed,
+                ),
+                folder,
+                callbacks=[progress_reporter(job_label), tracked],
+                origin=stage.origin(tracked.run_id),
+                earlier=earlier,
+            )
+        evaluations = _judged(stage)
+        film_episode(
+            stage.experiment.agent, stage.film_env, folder / "episode.gif", seed=FILM_SEED + stage.experiment.seed
+        )
+        tracked.keep_results(result, evaluations, folder)
+    if job_label is None:
+        _show(result, evaluations, folder, tracking_uri)
+    return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
+
+
+def _judged(stage: Stage) -> dict[str, Evaluation]:
+    agent, n_episodes, seed = stage.experiment.agent, stage.experiment.n_episodes, stage.experiment.seed
+    return {
+        TRAINING: evaluate(agent, stage.training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),
+        TEST: evaluate(agent, stage.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED + seed),
+    }
+
+
+def _show(result: TrainingResult | None, evaluations: dict[str, Evaluation], folder: Path, tracking_uri: str) -> None:
+    how = f"deterministic policy, as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
+    print_results(f"results ({how})", evaluations)
+    print_where_to_look(
+        folder, tracking_uri, files=("learning_curve.png", "episode.gif") if result else ("episode.gif",)
+    )
+
+
+@contextlib.contextmanager
+def _told_how_to_resume(run_id: str, tracking_uri: str, folder: Path, *, is_told: bool) -> Iterator[None]:
+    """Says how to go on with what ends before its end, where there is something to go on from."""
+    try:
+        yield
+    except BaseException:
+        if is_told and (folder / LAST_CHECKPOINT).exists():
+            print(f"resume with: {resume_command(run_id, tracking_uri)}", file=sys.stderr)
+        raise

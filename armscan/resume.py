@@ -1,0 +1,138 @@
+"""`python -m armscan.run resume=RUN_ID`: a run that was cut off goes on, and ends as if nothing had happened.
+
+Whatever could make it end otherwise is refused before anything of the run is touched: another configuration, other
+volumes, another run's checkpoints, a damaged checkpoint.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mlflow import MlflowClient
+from mlflow.entities import Run
+from omegaconf import DictConfig, OmegaConf
+
+import armscan
+from armscan.agents import Learner
+from armscan.errors import InvalidValueError, ResumeError
+from armscan.experiment import Stage, carry_out, place_tags, volume_tags
+from armscan.files import CONFIG_FILE, held, remove_unfinished
+from armscan.tracking import TrackedRun, find_run, open_existing_store
+from armscan.training import take_up
+from armscan.words import RESUME, TRACKING_URI, default_tracking_uri
+
+
+def resume(words: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Goes on with the run that a command line names.
+
+    Args:
+        words: of the command line.
+
+    Returns:
+        The figures of the final evaluations, by the name of their volumes.
+
+    Raises:
+        InvalidValueError: if the words say anything else.
+        TrackingError: if the run is not found.
+        ResumeError: if it cannot go on.
+        FolderInUseError: if it is still going on.
+        CheckpointError: if its checkpoint is damaged, another run's, or of other volumes.
+    """
+    wanted, uri = _read(words)
+    client = open_existing_store(uri)
+    run_id = find_run(client, wanted).info.run_id
+    folder = _folder_of(client, client.get_run(run_id))
+    with held(folder):
+        # It may have ended just before the folder was free.
+        run = client.get_run(run_id)
+        if run.info.status == "FINISHED":
+            raise ResumeError(f"run {run_id} has finished: there is nothing to resume")
+        config = _config_of(run, folder)
+        remove_unfinished(folder)
+        _enter_working_folder(run)
+        print(f"preparing to go on with {run.info.run_name}, run {run_id}", flush=True)
+        stage = Stage.built(config)
+        agent, split = stage.experiment.agent, stage.experiment.split
+        earlier = take_up(agent, folder, stage.origin(run_id)) if isinstance(agent, Learner) else []
+        plain: dict[str, Any] = OmegaConf.to_container(config)  # type: ignore[assignment]
+        tracked = TrackedRun.go_on(client, run_id, config=plain, tags=volume_tags(split) | place_tags(folder))
+        return carry_out(stage, tracked, folder, client.tracking_uri, earlier=earlier)
+
+
+def _read(words: Sequence[str]) -> tuple[str, str]:
+    """Returns the wanted run and the store to look in."""
+    values = {TRACKING_URI: default_tracking_uri()}
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not equals or key not in (RESUME, TRACKING_URI):
+            raise InvalidValueError(
+                f"{word!r} stands beside {RESUME}=, but a run goes on with the configuration it was started with: "
+                f"only {TRACKING_URI}= may be added"
+            )
+        if key in values and key == RESUME and values[key] != text:
+            raise InvalidValueError(f"{RESUME} names {values[key]!r} and {text!r}, but one run is resumed at a time")
+        values[key] = text
+    return values[RESUME], values[TRACKING_URI]
+
+
+def _folder_of(client: MlflowClient, run: Run) -> Path:
+    """Returns the folder of a run that this version can go on with."""
+    run_id, tags = run.info.run_id, run.data.tags
+    if "folder" not in tags:
+        jobs = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run_id}'")
+        if jobs:
+            cut_off = [job.info.run_id for job in jobs if job.info.status != "FINISHED"]
+            which = ", ".join(cut_off) if cut_off else "all of them have finished"
+            raise ResumeError(f"run {run_id} is the parent of a multirun, whose jobs are resumed one by one: {which}")
+        raise ResumeError(f"run {run_id} cannot be resumed: it is none of armscan.run, which notes the folder of a run")
+    if _release(tags["armscan.version"]) > _release(armscan.__version__):
+        raise ResumeError(
+            f"run {run_id} was made by armscan {tags['armscan.version']}, but this is {armscan.__version__}: "
+            "it goes on with that version or a newer one"
+        )
+    # Asked before the folder, which may have been cleared away since.
+    if run.info.status == "FINISHED":
+        raise ResumeError(f"run {run_id} has finished: there is nothing to resume")
+    folder = Path(tags["folder"])
+    if not folder.is_dir():
+        raise ResumeError(
+            f"run {run_id} cannot be resumed: its folder {folder} is not there; it last ran on the host {tags['host']}"
+        )
+    return folder
+
+
+def _release(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
+
+
+def _config_of(run: Run, folder: Path) -> DictConfig:
+    """Returns the configuration that a run was started with."""
+    file = folder / CONFIG_FILE
+    try:
+        text = file.read_bytes()
+    except OSError as error:
+        raise ResumeError(f"{file}: the run's configuration cannot be read ({error.strerror})") from error
+    if hashlib.sha256(text).hexdigest() != run.data.tags["config.sha256"]:
+        raise ResumeError(
+            f"{file}: is not the configuration that run {run.info.run_id} was started with: changed, or another run's"
+        )
+    config: dict[str, Any] = yaml.safe_load(text)
+    return OmegaConf.create(config)
+
+
+def _enter_working_folder(run: Run) -> None:
+    """Goes to where the run was started, from where its configuration names files."""
+    folder = run.data.tags["working_folder"]
+    try:
+        os.chdir(folder)
+    except OSError as error:
+        raise ResumeError(
+            f"run {run.info.run_id} was started in {folder}, from where its configuration names files, but one cannot "
+            f"go there ({error.strerror})"
+        ) from error

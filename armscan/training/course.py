@@ -1,0 +1,139 @@
+"""The course of a training in its checkpoints: written after each epoch, taken up where a training goes on.
+
+`last.pt` holds all that going on needs: the learner's state and the reports of all epochs. It is written first,
+`best.pt` after it, and only then is anybody told of the epoch. So whatever a kill comes between, `last.pt` is never
+behind, and what is missing elsewhere is made up from it: where its epoch is the best, it has the weights of `best.pt`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from armscan.agents.protocols import Learner
+from armscan.errors import CheckpointError
+from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
+from armscan.training.callbacks import EpochReport
+from armscan.training.checkpoint import load_checkpoint, save_checkpoint
+from armscan.training.evaluation import Episode, Evaluation
+
+EPISODE_FIELDS = tuple(each.name for each in fields(Episode))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Origin:
+    """What a checkpoint comes from: a training goes on only from a checkpoint of its own, on the same volumes.
+
+    Args:
+        run_id: of the run.
+        volumes: fingerprints of the volumes, by split and name.
+    """
+
+    run_id: str = ""
+    volumes: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    def facts(self) -> dict[str, Any]:
+        """Returns what stands in a checkpoint."""
+        return {"run_id": self.run_id, "volumes": self.volumes}
+
+    def check(self, path: Path, facts: dict[str, Any]) -> None:
+        """Raises `CheckpointError` where a checkpoint comes from something else."""
+        if facts.get("run_id") != self.run_id:
+            raise CheckpointError(
+                f"{path}: is a checkpoint of run {facts.get('run_id')!r}, but this is {self.run_id!r}"
+            )
+        for part, now in self.volumes.items():
+            then = facts.get("volumes", {}).get(part, {})
+            changes = {
+                "not there any more": then.keys() - now.keys(),
+                "new": now.keys() - then.keys(),
+                "changed": {name for name in then.keys() & now.keys() if then[name] != now[name]},
+            }
+            for change, names in changes.items():
+                if names:
+                    raise CheckpointError(
+                        f"the {part} volumes are not those that {path} was trained with: {', '.join(sorted(names))} "
+                        f"{'is' if len(names) == 1 else 'are'} {change}"
+                    )
+
+
+def keep(learner: Learner, reports: Sequence[EpochReport], folder: Path, origin: Origin | None) -> None:
+    """Writes the last checkpoint, and the best one where the last epoch is better than all before."""
+    facts = _facts(reports[-1], origin)
+    save_checkpoint(folder / LAST_CHECKPOINT, learner.state(), facts | {"reports": _written(reports)})
+    if reports[-1].is_best:
+        save_checkpoint(folder / BEST_CHECKPOINT, learner.weights(), facts)
+
+
+def take_up(learner: Learner, folder: Path, origin: Origin) -> list[EpochReport]:
+    """Takes a learner to where a training was when its last checkpoint was written.
+
+    Args:
+        learner: that has learned nothing yet.
+        folder: with the checkpoints.
+        origin: of this training.
+
+    Returns:
+        The reports of the epochs so far, for `train`; none where there is no checkpoint yet.
+
+    Raises:
+        CheckpointError: if a checkpoint is damaged, another run's, or of other volumes, or the best one is missing.
+    """
+    last, best = folder / LAST_CHECKPOINT, folder / BEST_CHECKPOINT
+    if not last.exists():
+        return []
+    state, facts = load_checkpoint(last)
+    origin.check(last, facts)
+    reports = _read(facts.get("reports"), last)
+    learner.load_state(state)
+    best_report = [report for report in reports if report.is_best][-1]
+    if best_report is reports[-1]:
+        # Whoever was killed may have been so before this was written.
+        save_checkpoint(best, learner.weights(), _facts(best_report, origin))
+        return reports
+    # Better refused now than when the training is done.
+    best_facts = load_checkpoint(best)[1]
+    origin.check(best, best_facts)
+    if best_facts.get("epoch") != best_report.epoch:
+        raise CheckpointError(
+            f"{best}: is of epoch {best_facts.get('epoch')}, but the best epoch of {last} is {best_report.epoch}"
+        )
+    return reports
+
+
+def _facts(report: EpochReport, origin: Origin | None) -> dict[str, Any]:
+    of_epoch = {"n_env_steps": report.n_env_steps, "epoch": report.epoch, **report.evaluation.metrics()}
+    return (origin or Origin()).facts() | of_epoch
+
+
+def _written(reports: Sequence[EpochReport]) -> str:
+    """Returns reports as a text, which takes a checkpoint's reader no time; JSON keeps every digit of a number."""
+    return json.dumps(
+        [
+            {
+                **{name: getattr(report, name) for name in ("epoch", "n_env_steps", "wall_s", "metrics", "is_best")},
+                "episodes": {
+                    name: [getattr(episode, name) for episode in report.evaluation.episodes] for name in EPISODE_FIELDS
+                },
+            }
+            for report in reports
+        ]
+    )
+
+
+def _read(text: Any, path: Path) -> list[EpochReport]:
+    try:
+        reports = []
+        for plain in json.loads(text):
+            columns = plain.pop("episodes")
+            rows = zip(*(columns[name] for name in EPISODE_FIELDS), strict=True)
+            episodes = tuple(Episode(**dict(zip(EPISODE_FIELDS, row, strict=True))) for row in rows)
+            reports.append(EpochReport(**plain, evaluation=Evaluation(episodes)))
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise CheckpointError(f"{path}: holds no reports of the epochs so far, which going on needs") from error
+    if not any(report.is_best for report in reports):
+        raise CheckpointError(f"{path}: holds no reports of the epochs so far, which going on needs")
+    return reports
