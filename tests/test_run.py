@@ -134,7 +134,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["agent.lrr=1"], "there is no key 'lrr' in agent, but only network, lr, "),
         (["agent=exhaustive", "projection=x"], "agent.swept is ['ty'], but ty is not free; projection leaves only tx"),
         (["agent=optuna", "agent.sampler=x"], "agent.sampler is 'x', but it must be tpe, cmaes or gp"),
-        (["agnet=sac"], "there is no key 'agnet' at the top, but only data, obs, reward, agent, "),
+        (["agnet=sac"], "there is no key 'agnet' at the top, but only data, obs, reward, network, agent, "),
         (["+agent.foo=1"], "there is no key 'foo' in agent, but only "),
         (["data=nifti", "data.pth=x"], "there is no key 'pth' in data, but only path, validation, test or split_seed"),
         (["data=nifti"], "data.path is not set"),
