@@ -188,7 +188,7 @@ def test_labelled_planes_that_score_too_little_are_refused_with_what_may_be_the_
 
 
 def test_images_of_another_shape_are_refused_with_the_reason(answer, tmp_path, coarse_folder):
-    run_id = tracked(tmp_path, "obs=slice", "env.clustering=metric", *IMAGES)
+    run_id = tracked(tmp_path, "obs=slice", "obs.shape=null", "env.clustering=metric", *IMAGES)
     code, _, errors = answer(f"run={run_id}", f"data={coarse_folder}", "episodes=2")
     assert code == 2
     assert "the agent was trained on images of" in errors
@@ -197,7 +197,7 @@ def test_images_of_another_shape_are_refused_with_the_reason(answer, tmp_path, c
 
 
 def test_run_that_has_not_kept_what_it_was_trained_on_is_refused_by_its_network(answer, tmp_path, coarse_folder):
-    run_id = tracked(tmp_path, "obs=slice", "env.clustering=metric", *IMAGES, has_tag=False)
+    run_id = tracked(tmp_path, "obs=slice", "obs.shape=null", "env.clustering=metric", *IMAGES, has_tag=False)
     code, _, errors = answer(f"run={run_id}", f"data={coarse_folder}", "episodes=2")
     assert code == 2
     assert "the checkpoint is another agent's or network's" in errors
