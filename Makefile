@@ -11,7 +11,7 @@ run: $(INSTALLED)
 	$(BIN)/python -m armscan.run $(ARGS)
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" $(ARGS)
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow $(ARGS)
