@@ -26,6 +26,9 @@ class PPO:
     lr: float = 1e-3
     """Learning rate of the actor and the critic."""
 
+    final_lr_share: float = 1.0
+    """What it has come down to at the end of the training, as a share; below 1 the policy settles."""
+
     gamma: float = 0.9
     """Discount; planes are absolute, so that what comes much later matters little."""
 
@@ -74,7 +77,7 @@ class PPO:
             check_bool(f"agent.{name}", getattr(self, name))
         check_float("agent.lr", self.lr, above=0.0, at_most=1.0)
         check_float("agent.max_grad_norm", self.max_grad_norm, above=0.0, at_most=1e6)
-        for name in ("gamma", "gae_lambda"):
+        for name in ("gamma", "gae_lambda", "final_lr_share"):
             check_float(f"agent.{name}", getattr(self, name), at_least=0.0, at_most=1.0)
         for name in ("clip_range", "entropy_coefficient", "value_coefficient"):
             check_float(f"agent.{name}", getattr(self, name), at_least=0.0, at_most=1000.0)
@@ -127,6 +130,6 @@ class PPO:
             builder.build(),
             replay=replay_for(setup.observation_space, n_collected, self.num_envs),
             random_env_steps=0,
-            seed=setup.seed,
-            compute=setup.compute,
+            final_lr_share=self.final_lr_share,
+            setup=setup,
         )

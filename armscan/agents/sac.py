@@ -29,6 +29,9 @@ class SAC:
     lr: float = 1e-3
     """Learning rate of the actor and the critics."""
 
+    final_lr_share: float = 1.0
+    """What it has come down to at the end of the training, as a share; below 1 the policy settles."""
+
     initial_entropy_coefficient: float = 0.1
     """What the entropy coefficient is at first; rewards here are small, so that 1 would drown them for long."""
 
@@ -73,7 +76,7 @@ class SAC:
         for name in ("initial_entropy_coefficient", "updates_per_env_step"):
             check_float(f"agent.{name}", getattr(self, name), above=0.0, at_most=1000.0)
         check_float("agent.target_entropy_per_dim", self.target_entropy_per_dim, at_least=-1000.0, at_most=1000.0)
-        for name in ("gamma", "tau"):
+        for name in ("gamma", "tau", "final_lr_share"):
             check_float(f"agent.{name}", getattr(self, name), at_least=0.0, at_most=1.0)
         for field in fields(self):
             if field.type == "int":
@@ -133,6 +136,6 @@ class SAC:
                 setup.observation_space, min(self.buffer_size, setup.total_env_steps + self.num_envs), self.num_envs
             ),
             random_env_steps=n_random,
-            seed=setup.seed,
-            compute=setup.compute,
+            final_lr_share=self.final_lr_share,
+            setup=setup,
         )

@@ -11,7 +11,6 @@ from tianshou.data import Batch
 from tianshou.highlevel.experiment import Experiment, ExperimentConfig
 from tianshou.highlevel.persistence import PolicyPersistence
 
-from armscan.agents.compute import Compute
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
@@ -34,12 +33,19 @@ class TianshouLearner:
         experiment: as its builder gives it.
         replay: what the experiment's transitions are kept in.
         random_env_steps: steps with random actions before the first update.
-        seed: of everything that is drawn.
-        compute: how the networks are computed.
+        final_lr_share: what the learning rates of actor and critics have come down to at the training's end, as a share
+            of what they were; they fall by as much in each epoch as it has steps.
+        setup: what the agent was given.
     """
 
     def __init__(
-        self, experiment: Experiment, *, replay: Replay, random_env_steps: int, seed: int, compute: Compute
+        self,
+        experiment: Experiment,
+        *,
+        replay: Replay,
+        random_env_steps: int,
+        final_lr_share: float,
+        setup: AgentSetup,
     ) -> None:
         world = experiment.create_experiment_world()
         self._metrics = EpochMetrics()
@@ -55,10 +61,12 @@ class TianshouLearner:
         self._trainer = trainer
         self._replay = replay
         self._random_env_steps = random_env_steps
-        self._seed = seed
+        self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
+        self._final_lr_share = final_lr_share
         self._n_epochs = 0
+        self._first_lrs = [group["lr"] for group in self._lr_groups()]
         for network in networks_of(self._algorithm):
-            compute.apply_to(network)
+            setup.compute.apply_to(network)
 
     @property
     def n_env_steps(self) -> int:
@@ -96,7 +104,7 @@ class TianshouLearner:
         return metrics
 
     def _begin_epoch(self) -> None:
-        """Begins episodes anew, and everything that is drawn."""
+        """Begins episodes anew, and everything that is drawn; the learning rates are those of this moment."""
         self._replay.cut_off()
         for_torch, for_numpy, for_replay, for_envs = np.random.SeedSequence([self._seed, self._n_epochs]).spawn(4)
         torch.manual_seed(int(for_torch.generate_state(1)[0]))
@@ -105,6 +113,12 @@ class TianshouLearner:
         self._replay.seed(int(for_replay.generate_state(1)[0]))
         self._collector.env.seed([int(word) for word in for_envs.generate_state(self._collector.env_num)])
         self._collector.reset_env()
+        share = 1.0 - (1.0 - self._final_lr_share) * min(1.0, self.n_env_steps / self._total_env_steps)
+        for group, first_lr in zip(self._lr_groups(), self._first_lrs, strict=True):
+            group["lr"] = share * first_lr
+
+    def _lr_groups(self) -> list[dict[str, Any]]:
+        return [group for optimiser in self._algorithm._optimizers for group in optimiser._optim.param_groups]
 
     def _check_weights(self, cause: ValueError | None = None) -> None:
         if not all(torch.isfinite(weights).all() for weights in self._algorithm.parameters()):

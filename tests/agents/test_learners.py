@@ -168,6 +168,22 @@ def test_algorithm_refuses_its_own_impossible_parameters(phantom, kind, changes,
 
 
 @by_reinforcement
+def test_learning_rates_come_down_to_their_final_share(make_learner):
+    learner = make_learner(final_lr_share=0.25)
+    rates = []
+    for _ in range(8):
+        rates.append({round(group["lr"] / 1e-3, 6) for group in learner._lr_groups()})
+        if len(rates) == 1:
+            learner.warm_up()
+        learner.learn(20)
+    assert rates[0] == {1.0}
+    assert all(len(each) == 1 for each in rates)
+    falling = [each.pop() for each in rates]
+    assert falling == sorted(falling, reverse=True)
+    assert falling[-1] == 0.25
+
+
+@by_reinforcement
 @pytest.mark.parametrize("part", ["policy.actor", "critic"])
 def test_learner_says_that_it_has_diverged(make_learner, part):
     learner = make_learner()
