@@ -14,16 +14,16 @@ from __future__ import annotations
 import json
 import statistics
 import sys
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+
+from filelock import FileLock
 
 from benchmarks.runs import Run, finished_run
 
 FIGURES = Path(__file__).with_name("results.json")
 TEST = "test volumes"
-KEEPING = threading.Lock()
 JUDGED = ["data.n_test=12", "evaluation.episodes=300"]
 
 
@@ -110,7 +110,8 @@ def measure(name: str, seed: int, data: str, folder: Path) -> None:
     if not ROWS[name].overrides[0].startswith("experiment="):
         overrides.append("data.n_training=64")
     run = finished_run(f"{name}-seed{seed}", ["data=mixed", f"data.path={data}", *overrides], folder)
-    with KEEPING:
+    # Several processes may each measure some rows.
+    with FileLock(f"{FIGURES}.lock"):
         kept = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
         kept.setdefault(name, {})[str(seed)] = figures_of(run)
         FIGURES.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
