@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from functools import partial
 
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from armscan.agents import Agent, AgentSetup
 from armscan.checks import check_int, check_seed
 from armscan.envs import EnvMaker
 from armscan.errors import InvalidValueError
 from armscan.training import Budget, Split
+from armscan.training.familiar import smallest_slice, with_crops
 from armscan.volumes import LabelVolume
 
 SECTIONS = (
@@ -41,6 +42,8 @@ class Experiment:
         budget: of the training.
         n_episodes: of each final evaluation.
         seed: of everything that is drawn.
+        smallest_slice_px: shape (across, depth) that the slices of all volumes have at least; images are cropped to it
+            where nothing else is said, whichever the split.
     """
 
     split: Split
@@ -49,6 +52,7 @@ class Experiment:
     budget: Budget
     n_episodes: int
     seed: int
+    smallest_slice_px: tuple[int, int]
 
 
 def build(config: DictConfig) -> Experiment:
@@ -61,9 +65,27 @@ def build(config: DictConfig) -> Experiment:
     seed = check_seed("seed", config.seed)
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
     split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
-    maker = make_maker(config, split.training)
+    smallest = smallest_slice([*split.training.values(), *split.validation.values(), *split.test.values()])
+    maker = make_maker(with_one_crop(config, smallest, smallest), split.training)
     agent = make_agent(config, maker, split.training, total_env_steps=budget.env_steps, seed=seed)
-    return Experiment(split=split, maker=maker, agent=agent, budget=budget, n_episodes=n_episodes, seed=seed)
+    return Experiment(
+        split=split,
+        maker=maker,
+        agent=agent,
+        budget=budget,
+        n_episodes=n_episodes,
+        seed=seed,
+        smallest_slice_px=smallest,
+    )
+
+
+def with_one_crop(config: DictConfig, trained_px: tuple[int, int], here_px: tuple[int, int]) -> DictConfig:
+    """Returns the configuration with images cropped alike on all volumes, as `with_crops` says."""
+    node = config.env.observation
+    rules = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node
+    cropped = config.copy()
+    cropped.env.observation = with_crops(rules, trained_px, here_px)
+    return cropped
 
 
 def make_maker(config: DictConfig, training: Mapping[str, LabelVolume]) -> EnvMaker:

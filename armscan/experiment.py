@@ -130,7 +130,7 @@ def start_tracking(config: DictConfig, invocation: Invocation, stage: Stage) -> 
             **{f"choice.{group}": choices[group] for group in CHOICES_IN_TAGS},
             **volume_tags(stage.experiment.split),
             # Where it is applied to other volumes, later, the agent must see what it has learned to see.
-            FAMILIAR_TAG: Familiar.of(stage.training_env).to_json(),
+            FAMILIAR_TAG: Familiar.of(stage.training_env, stage.experiment.smallest_slice_px).to_json(),
             **place_tags(invocation.folder),
             "working_folder": str(Path.cwd()),
             "config.sha256": hashlib.sha256(text).hexdigest(),

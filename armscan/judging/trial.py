@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from armscan.agents import Agent, Learner
 from armscan.anatomy import USUAL_PIXEL_MM
-from armscan.building import make_agent, make_maker
+from armscan.building import make_agent, make_maker, with_one_crop
 from armscan.envs import EnvMaker
 from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed
 from armscan.judging.subject import Subject
 from armscan.judging.volumes import Volumes
 from armscan.training import Evaluation, Familiar, evaluate
 from armscan.training.evaluation import Env
-from armscan.training.familiar import smallest_slice, with_crops
+from armscan.training.familiar import smallest_slice
 from armscan.volumes import LabelVolume
 
 # First seed of an evaluation's episodes: none of them is played by a run, whose seeds lie below.
@@ -82,12 +82,7 @@ def prepare(subject: Subject, groups: Mapping[str, Volumes], training: Mapping[s
 
 def _seen_as_trained(config: DictConfig, trained: Familiar, volumes: Volumes) -> DictConfig:
     """Returns the configuration with images cropped as they were in training."""
-    node = config.env.observation
-    rules = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node
-    crops = with_crops(rules, trained.slice_px, smallest_slice(volumes.values()))
-    seen = config.copy()
-    seen.env.observation = crops
-    return seen
+    return with_one_crop(config, trained.slice_px, smallest_slice(volumes.values()))
 
 
 def _env(maker: EnvMaker, volumes: Volumes, clustering: object) -> Env:

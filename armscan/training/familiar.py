@@ -24,7 +24,7 @@ class Familiar:
 
     Args:
         observed: the shape of each part of an observation, of the one vector under the name `vector`.
-        slice_px: shape (across, depth) in pixels that every slice has at least.
+        slice_px: shape (across, depth) in pixels that every slice has at least, and images are cropped to.
         pixel_mm: lowest and highest size of a pixel, (across, depth).
         size_mm: lowest and highest size of a volume, (across, along): what a normalised translation goes over.
     """
@@ -35,13 +35,18 @@ class Familiar:
     size_mm: tuple[Range, Range]
 
     @classmethod
-    def of(cls, env: Env) -> Self:
-        """Returns what an environment is like."""
+    def of(cls, env: Env, slice_px: tuple[int, int] | None = None) -> Self:
+        """Returns what an environment is like.
+
+        Args:
+            env: the environment.
+            slice_px: what its images were cropped to where nothing was said of it; None for its smallest slice.
+        """
         space, volumes = env.observation_space, env.get_wrapper_attr("volumes").values()
         parts = space.spaces if isinstance(space, spaces.Dict) else {"vector": space}
         return cls(
             observed={name: tuple(part.shape or ()) for name, part in parts.items()},
-            slice_px=smallest_slice(volumes),
+            slice_px=slice_px or smallest_slice(volumes),
             pixel_mm=(_range(v.pixel_mm[0] for v in volumes), _range(v.pixel_mm[1] for v in volumes)),
             size_mm=(_range(v.size_mm[0] for v in volumes), _range(v.size_mm[1] for v in volumes)),
         )
