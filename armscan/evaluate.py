@@ -29,16 +29,14 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from omegaconf import OmegaConf
 
 from armscan.checks import check_int, check_seed
 from armscan.errors import InvalidValueError
 from armscan.files import write_whole
-from armscan.mistakes import CONFIG_MODULE, mistake_in_one_line, quieten_libraries
+from armscan.mistakes import mistake_in_one_line, quieten_libraries
+from armscan.settings import plain, usual_tracking
 from armscan.words import answered, read_words
 
 if TYPE_CHECKING:
@@ -173,12 +171,11 @@ def _tracked(
         "changes": dict(request.changes),
         "notes": list(notes),
     }
-    config: Any = OmegaConf.to_container(subject.config)
     with TrackedRun.start(
         client,
         experiment_id,
         name=f"evaluation: {subject.name} on {data}",
-        config={**config, "evaluation": facts},
+        config={**plain(subject.config), "evaluation": facts},
         tags={EVALUATED_TAG: of},
         parent_id=subject.run.run_id if subject.run else None,
     ) as tracked:
@@ -199,10 +196,8 @@ def _tracked(
 
 def _store(request: Request) -> dict[str, str]:
     """Returns where runs are tracked: as the configuration says, where the words say nothing else."""
-    with (resources.files(CONFIG_MODULE) / "tracking" / "mlflow.yaml").open() as file:
-        usual: dict[str, str] = OmegaConf.to_container(OmegaConf.load(file), resolve=True)  # type: ignore[assignment]
     said = {"uri": request.tracking, "experiment": request.experiment}
-    return usual | {name: value for name, value in said.items() if value is not None}
+    return usual_tracking() | {name: value for name, value in said.items() if value is not None}
 
 
 def _check_out(file: Path) -> None:

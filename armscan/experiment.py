@@ -11,13 +11,13 @@ import socket
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
 
 import torch
 import yaml
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 import armscan
 from armscan.agents import Learner
@@ -27,6 +27,7 @@ from armscan.files import BEST_CHECKPOINT, CONFIG_FILE, LAST_CHECKPOINT, held, w
 from armscan.invocation import Invocation
 from armscan.mistakes import quieten_libraries
 from armscan.multirun import JOB_TAG
+from armscan.settings import plain, resume_command
 from armscan.tracking import FAMILIAR_TAG, TrackedRun, open_store
 from armscan.training import (
     TEST,
@@ -42,7 +43,6 @@ from armscan.training import (
     train,
 )
 from armscan.training.evaluation import Env
-from armscan.words import resume_command
 
 MAX_TAG_CHARS = 5000
 CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")
@@ -89,7 +89,12 @@ class Stage:
 
     def origin(self, run_id: str) -> Origin:
         """Returns what the checkpoints of a run say that they come from."""
-        return Origin(run_id=run_id, volumes=self.experiment.split.fingerprints())
+        return Origin(run_id=run_id, volumes=self._fingerprints)
+
+    @cached_property
+    def _fingerprints(self) -> dict[str, dict[str, str]]:
+        """Once: a run that goes on needs them twice, and they take a second for a hundred volumes."""
+        return self.experiment.split.fingerprints()
 
 
 def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict[str, float]]:
@@ -111,7 +116,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
 
 def start_tracking(config: DictConfig, invocation: Invocation, stage: Stage) -> TrackedRun:
     """Writes down what is run, opens the tracking store and starts a run in it."""
-    resolved: dict[str, Any] = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
+    resolved = plain(config)
     client, experiment_id = open_store(**resolved["tracking"])
     choices, job, config_file = invocation.choices, invocation.job, invocation.folder / CONFIG_FILE
     text = yaml.safe_dump(resolved, sort_keys=False).encode()

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, Self
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from armscan.errors import FolderInUseError, InvalidValueError
 from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, write_whole
 from armscan.mistakes import mistake_in_one_line
-from armscan.words import resume_command
+from armscan.settings import plain, resume_command
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -82,7 +82,7 @@ class Multirun(Callback):
         folder = Path(config.hydra.sweep.dir)
         if not isinstance(config.tracking, DictConfig):
             raise InvalidValueError(f"tracking is {config.tracking!r}, but it must be a section, such as its default")
-        tracking: dict[str, str] = OmegaConf.to_container(config.tracking, resolve=True)  # type: ignore[assignment]
+        tracking = plain(config.tracking)
         overrides = list(config.hydra.overrides.task)
         client, experiment_id = open_store(**tracking)
         (folder / OUTCOME_FOLDER).mkdir(parents=True)

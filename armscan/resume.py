@@ -23,9 +23,9 @@ from armscan.agents import Learner
 from armscan.errors import InvalidValueError, ResumeError
 from armscan.experiment import Stage, carry_out, place_tags, volume_tags
 from armscan.files import CONFIG_FILE, held, remove_unfinished
+from armscan.settings import RESUME, TRACKING_URI, plain, usual_tracking
 from armscan.tracking import TrackedRun, find_run, open_existing_store
 from armscan.training import take_up
-from armscan.words import RESUME, TRACKING_URI, default_tracking_uri
 
 
 def resume(words: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -60,14 +60,13 @@ def resume(words: Sequence[str]) -> dict[str, dict[str, float]]:
         stage = Stage.built(config)
         agent, split = stage.experiment.agent, stage.experiment.split
         earlier = take_up(agent, folder, stage.origin(run_id)) if isinstance(agent, Learner) else []
-        plain: dict[str, Any] = OmegaConf.to_container(config)  # type: ignore[assignment]
-        tracked = TrackedRun.go_on(client, run_id, config=plain, tags=volume_tags(split) | place_tags(folder))
+        tracked = TrackedRun.go_on(client, run_id, config=plain(config), tags=volume_tags(split) | place_tags(folder))
         return carry_out(stage, tracked, folder, client.tracking_uri, earlier=earlier)
 
 
 def _read(words: Sequence[str]) -> tuple[str, str]:
     """Returns the wanted run and the store to look in."""
-    values = {TRACKING_URI: default_tracking_uri()}
+    values = {TRACKING_URI: usual_tracking()["uri"]}
     for word in words:
         key, equals, text = word.partition("=")
         if not equals or key not in (RESUME, TRACKING_URI):

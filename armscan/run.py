@@ -21,7 +21,7 @@ from armscan.invocation import Invocation
 from armscan.jobs import start_job
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME, mistake_in_one_line, quieten_libraries
 from armscan.multirun import INTERRUPTED, end_multirun, remove_if_untracked
-from armscan.words import RESUME
+from armscan.settings import RESUME
 
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shlex
 import sys
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
@@ -13,21 +11,6 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from armscan.errors import ArmscanError, InvalidValueError, is_interruption, listed
-
-RESUME, TRACKING_URI = "resume", "tracking.uri"
-# As in conf/tracking/mlflow.yaml.
-DEFAULT_TRACKING_URI = "sqlite:///mlruns.db"
-
-
-def default_tracking_uri() -> str:
-    """Returns the tracking store that a run uses where none is named."""
-    return os.environ.get("MLFLOW_TRACKING_URI", DEFAULT_TRACKING_URI)
-
-
-def resume_command(run_id: str, tracking_uri: str) -> str:
-    """Returns what one types to go on with a run that was cut off."""
-    store = [] if tracking_uri == default_tracking_uri() else [f"{TRACKING_URI}={tracking_uri}"]
-    return shlex.join(["python", "-m", "armscan.run", f"{RESUME}={run_id}", *store])
 
 
 def read_words(words: Sequence[str], allowed: Sequence[str], texts: Collection[str]) -> dict[str, Any]:

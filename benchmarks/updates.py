@@ -45,10 +45,10 @@ def ways() -> dict[str, Compute]:
     """Returns the ways of computing that this machine has, by what they are called."""
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     return {
-        f"{device}, {precision}{', compiled' if compile else ''}": Compute(device, precision, compile)
+        f"{device}, {precision}{', compiled' if is_compiled else ''}": Compute(device, precision, is_compiled)
         for device in devices
         for precision in ("float32", "bfloat16")
-        for compile in (False, True)  # noqa: A001 - its name everywhere
+        for is_compiled in (False, True)
     }
 
 

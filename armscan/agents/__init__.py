@@ -3,7 +3,7 @@
 from armscan.agents.baselines import Exhaustive, Random
 from armscan.agents.compute import Compute
 from armscan.agents.multimodal import Multimodal
-from armscan.agents.networks import MLP, Network, NetworkByObservation
+from armscan.agents.networks import MLP, Network, NetworkByObservation, NetworkChoice
 from armscan.agents.optuna_search import OptunaSearch
 from armscan.agents.ppo import PPO
 from armscan.agents.protocols import Agent, AgentSetup, Algorithm, Learner, VectorEnvMaker
@@ -23,6 +23,7 @@ __all__ = [
     "Multimodal",
     "Network",
     "NetworkByObservation",
+    "NetworkChoice",
     "OptunaSearch",
     "Random",
     "Regression",

@@ -72,7 +72,8 @@ def _decode(joined: Pixels, ends: NDArray[np.uint64], pixels: Pixels) -> None:
     """Fills frames from their runs; `ends` says where each one's end in `joined`."""
     n_pixels, at = np.uint64(pixels.shape[1]), np.uint64(0)
     one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
-    for frame, end in zip(pixels, ends):  # noqa: B905 - Numba knows no strict
+    for k in range(len(ends)):
+        frame, end = pixels[k], ends[k]
         if end - at == n_pixels:
             frame[:] = joined[at:end]
             at = end

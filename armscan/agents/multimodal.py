@@ -56,7 +56,7 @@ class Multimodal:
         )
 
     def chosen_for(self, observation_space: spaces.Space[Any]) -> Multimodal:
-        """See `Network.chosen_for`."""
+        """See `NetworkChoice.chosen_for`."""
         images = images_of(observation_space)
         if not images:
             raise InvalidValueError(

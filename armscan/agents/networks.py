@@ -34,19 +34,23 @@ class Spread:
     def initialise(self, actor: nn.Module) -> nn.Module:
         """Sets the actor's standard deviation to what it is at first; returns the actor."""
         if not self.conditioned:
-            nn.init.constant_(actor.sigma_param, self.initial_log)  # type: ignore[arg-type]
+            nn.init.constant_(actor.get_parameter("sigma_param"), self.initial_log)
         return actor
 
 
-class Network(Protocol):
-    """A kind of network that can be an actor's and a critic's."""
+class NetworkChoice(Protocol):
+    """What says which network takes an observation."""
 
     def chosen_for(self, observation_space: spaces.Space[Any]) -> Network:
-        """Returns the network for such observations: itself, if it can take them.
+        """Returns the network for such observations; a network returns itself, if it can take them.
 
         Raises:
-            InvalidValueError: if it cannot; the reason is said.
+            InvalidValueError: if none can; the reason is said.
         """
+
+
+class Network(NetworkChoice, Protocol):
+    """A kind of network that can be an actor's and a critic's."""
 
     def actor_factory(self, spread: Spread) -> ActorFactory:
         """Returns the factory of a Gaussian actor."""
@@ -71,7 +75,7 @@ class MLP:
         self.activation = ACTIVATIONS[check_choice("network.activation", activation, list(ACTIVATIONS))]
 
     def chosen_for(self, observation_space: spaces.Space[Any]) -> MLP:
-        """See `Network.chosen_for`."""
+        """See `NetworkChoice.chosen_for`."""
         if not is_vector(observation_space):
             raise InvalidValueError(
                 "network is mlp, which takes one vector, but the observation has the parts "
@@ -97,21 +101,13 @@ class NetworkByObservation:
         images: for parts among which there are images.
     """
 
-    def __init__(self, vector: Network, images: Network) -> None:
+    def __init__(self, vector: NetworkChoice, images: NetworkChoice) -> None:
         self.vector, self.images = checked_network(vector), checked_network(images)
 
     def chosen_for(self, observation_space: spaces.Space[Any]) -> Network:
-        """See `Network.chosen_for`."""
+        """See `NetworkChoice.chosen_for`."""
         chosen = self.vector if is_vector(observation_space) else self.images
         return chosen.chosen_for(observation_space)
-
-    def actor_factory(self, spread: Spread) -> ActorFactory:
-        """Cannot be made before the observation is known."""
-        raise NotImplementedError("chosen_for() comes first")
-
-    def critic_factory(self) -> CriticFactory:
-        """Cannot be made before the observation is known."""
-        raise NotImplementedError("chosen_for() comes first")
 
 
 def is_vector(space: spaces.Space[Any]) -> bool:
@@ -119,17 +115,14 @@ def is_vector(space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and len(space.shape) == 1
 
 
-def checked_network(network: Network) -> Network:
-    """Returns the network, if it is one.
+def checked_network(network: NetworkChoice) -> NetworkChoice:
+    """Returns the network, or the choice between some, if it is one.
 
     Raises:
-        InvalidValueError: if it lacks a method of `Network`.
+        InvalidValueError: if it cannot say which network takes an observation.
     """
-    methods = ("chosen_for", "actor_factory", "critic_factory")
-    if isinstance(network, type) or not all(callable(getattr(network, name, None)) for name in methods):
-        raise InvalidValueError(
-            f"network is {network!r}, but it must have the methods of Network: {', '.join(methods)}"
-        )
+    if isinstance(network, type) or not callable(getattr(network, "chosen_for", None)):
+        raise InvalidValueError(f"network is {network!r}, but it must have the methods of Network, chosen_for first")
     return network
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,54 +13,39 @@ from torch import nn
 
 from armscan.agents.compute import Compute
 from armscan.agents.examples import Examples
-from armscan.agents.networks import Network, Spread, checked_network
+from armscan.agents.networks import Spread
+from armscan.agents.parameters import Parameters, number
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.tianshou_envs import SideBySideFactory
 from armscan.agents.tianshou_learner import load_into
-from armscan.checks import check_float, check_int
 from armscan.envs.actions import ActionBounds
 from armscan.envs.history import observation_of, parts_of
 from armscan.envs.task import Observed
+from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
 from armscan.errors import DivergedError, InvalidValueError
 from armscan.volumes.plane import FloatArray
 
 
 @dataclass(frozen=True, kw_only=True)
-class Regression:
+class Regression(Parameters):
     """A network that says from one observation where the optimal plane lies, fitted by squared error.
 
     It is taught with the optimal planes of the training volumes themselves, which no other agent is shown: what it
-    reaches says how much of the task needs no search. The network is that of an actor, of the same size.
+    reaches says how much of the task needs no search. The network is that of an actor, of the same size; only the mean
+    of its actions is used.
 
     Raises:
         InvalidValueError: if a value is impossible.
     """
 
-    network: Network
-    """An actor's; only the mean of its actions is used."""
-
-    lr: float = 1e-3
-    """Learning rate."""
-
-    batch_size: int = 256
-    """Slices of one update."""
-
     buffer_size: int = 100_000
     """Slices that are kept, the latest; never more than the whole training takes."""
 
-    num_envs: int = 16
-    """Training environments that are stepped side by side."""
-
-    updates_per_env_step: float = 0.25
+    updates_per_env_step: float = number(0.25, above=0.0, at_most=1000.0)
     """Gradient steps for each environment step."""
 
     def __post_init__(self) -> None:
-        checked_network(self.network)
-        check_float("agent.lr", self.lr, above=0.0, at_most=1.0)
-        check_float("agent.updates_per_env_step", self.updates_per_env_step, above=0.0, at_most=1000.0)
-        for field in fields(self):
-            if field.type == "int":
-                check_int(f"agent.{field.name}", getattr(self, field.name), at_least=1)
+        super().__post_init__()
         if self.num_envs > self.buffer_size:
             raise InvalidValueError(
                 f"agent.num_envs is {self.num_envs}, but it must be at most agent.buffer_size = {self.buffer_size}"
@@ -108,7 +93,8 @@ class RegressionLearner:
         compute: Compute,
     ) -> None:
         self._regression = regression
-        self._envs = envs
+        assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
+        self._envs, self._teacher = envs, envs.unwrapped
         self._network = network
         self._examples = examples
         self._seed = seed
@@ -136,8 +122,7 @@ class RegressionLearner:
         torch.manual_seed(int(for_torch.generate_state(1)[0]))
         rng = np.random.default_rng(for_draws)
         seeds = [int(word) for word in for_envs.generate_state(self._envs.num_envs)]
-        # Gymnasium's types leave out the lists of seeds that its own vector environments take.
-        observations, _ = self._envs.reset(seed=seeds)  # type: ignore[arg-type]
+        observations, _ = reset_each(self._envs, seeds)
         n_before, losses, start_s = self._n_env_steps, [], time.perf_counter()
         while self._n_env_steps - n_before < n_env_steps:
             n_updates_before = self._n_updates
@@ -159,7 +144,7 @@ class RegressionLearner:
 
     def _step(self, observations: Observed, rng: np.random.Generator) -> Observed:
         """Keeps what is seen, starts of episodes included; returns what is seen from random planes, the next."""
-        self._examples.add(observations, self._envs.unwrapped.optimal_actions)  # type: ignore[attr-defined]
+        self._examples.add(observations, self._teacher.optimal_actions)
         actions = rng.uniform(-1.0, 1.0, self._envs.action_space.shape or ())
         observations, _, terminated, truncated, _ = self._envs.step(actions)
         self._n_env_steps += self._envs.num_envs
@@ -171,7 +156,7 @@ class RegressionLearner:
         observations, optima = self._examples.draw(self._regression.batch_size, rng)
         loss = nn.functional.mse_loss(self._predicted(observations), torch.as_tensor(optima, device=self._device))
         self._optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        torch.autograd.backward(loss)
         self._optimiser.step()
         return loss.detach()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from tianshou.highlevel.config import OffPolicyTrainingConfig
 from tianshou.highlevel.experiment import SACExperimentBuilder
@@ -11,50 +11,35 @@ from tianshou.highlevel.params.algorithm_params import SACParams
 from tianshou.highlevel.params.alpha import AutoAlphaFactoryDefault
 
 from armscan.agents.image_replay import replay_for
-from armscan.agents.networks import Network, Spread, checked_network
+from armscan.agents.networks import Spread
+from armscan.agents.parameters import PolicyParameters, number
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.tianshou_envs import SideBySideFactory
 from armscan.agents.tianshou_learner import TianshouLearner, experiment_config, rounded_up
-from armscan.checks import check_bool, check_float, check_int
 from armscan.errors import InvalidValueError
 
 
 @dataclass(frozen=True, kw_only=True)
-class SAC:
+class SAC(PolicyParameters):
     """Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) with a learned entropy coefficient."""
 
-    network: Network
-    """Of the actor and of both critics."""
-
-    lr: float = 1e-3
-    """Learning rate of the actor and the critics."""
-
-    final_lr_share: float = 1.0
-    """What it has come down to at the end of the training, as a share; below 1 the policy settles."""
-
-    initial_entropy_coefficient: float = 0.1
+    initial_entropy_coefficient: float = number(0.1, above=0.0, at_most=1000.0)
     """What the entropy coefficient is at first; rewards here are small, so that 1 would drown them for long."""
 
-    entropy_lr: float = 3e-4
+    entropy_lr: float = number(3e-4, above=0.0, at_most=1.0)
     """Learning rate of the entropy coefficient."""
 
-    target_entropy_per_dim: float = -1.0
+    target_entropy_per_dim: float = number(-2.0, at_least=-1000.0, at_most=1000.0)
     """The policy's wanted entropy for each action component; lower where it oscillates instead of settling."""
 
-    gamma: float = 0.99
-    """Discount."""
+    gamma: float = number(0.9, at_least=0.0, at_most=1.0)
+    """Discount; planes are absolute, so that what comes much later matters little."""
 
-    tau: float = 0.005
+    tau: float = number(0.005, at_least=0.0, at_most=1.0)
     """How far the target critics move towards the critics at each update."""
-
-    batch_size: int = 256
-    """Transitions of one update."""
 
     buffer_size: int = 100_000
     """Transitions that the replay buffer holds; never more than the whole training takes."""
-
-    num_envs: int = 16
-    """Training environments that are stepped side by side."""
 
     random_env_steps: int = 2_000
     """Steps with random actions before the first update, rounded up to as many for each environment."""
@@ -62,25 +47,11 @@ class SAC:
     env_steps_per_collection: int = 16
     """Environment steps between two rounds of updates, rounded up to as many for each environment."""
 
-    updates_per_env_step: float = 0.25
+    updates_per_env_step: float = number(0.25, above=0.0, at_most=1000.0)
     """Gradient steps for each environment step; they are what training costs."""
 
-    judged_by_sampling: bool = False
-    """Whether the policy is judged as it explores, by sampling, instead of by its mode."""
-
     def __post_init__(self) -> None:
-        checked_network(self.network)
-        check_bool("agent.judged_by_sampling", self.judged_by_sampling)
-        for name in ("lr", "entropy_lr"):
-            check_float(f"agent.{name}", getattr(self, name), above=0.0, at_most=1.0)
-        for name in ("initial_entropy_coefficient", "updates_per_env_step"):
-            check_float(f"agent.{name}", getattr(self, name), above=0.0, at_most=1000.0)
-        check_float("agent.target_entropy_per_dim", self.target_entropy_per_dim, at_least=-1000.0, at_most=1000.0)
-        for name in ("gamma", "tau", "final_lr_share"):
-            check_float(f"agent.{name}", getattr(self, name), at_least=0.0, at_most=1.0)
-        for field in fields(self):
-            if field.type == "int":
-                check_int(f"agent.{field.name}", getattr(self, field.name), at_least=1)
+        super().__post_init__()
         if self.batch_size > self.buffer_size:
             raise InvalidValueError(
                 f"agent.batch_size is {self.batch_size}, but it must be at most agent.buffer_size = {self.buffer_size}"

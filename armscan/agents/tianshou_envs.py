@@ -15,6 +15,7 @@ from tianshou.highlevel.env import ContinuousEnvironments, EnvFactory, EnvMode, 
 
 from armscan.agents.protocols import VectorEnvMaker
 from armscan.envs.task import Observed
+from armscan.envs.vector_env import reset_each
 
 Ids = int | list[int] | NDArray[np.int64] | None
 
@@ -46,8 +47,7 @@ class SideBySide(BaseVectorEnv):
         """Starts episodes; returns the first observations of those environments, and no information."""
         ids = np.arange(self.env_num) if env_id is None else np.atleast_1d(env_id)
         mask = np.isin(np.arange(self.env_num), ids)
-        # Gymnasium's types leave out the lists of seeds that its own vector environments take.
-        observations, _ = self._envs.reset(seed=self._seeds, options={"reset_mask": mask})  # type: ignore[arg-type]
+        observations, _ = reset_each(self._envs, self._seeds, {"reset_mask": mask})
         self._seeds = None
         return _batched(observations)[ids], self._no_info(ids)
 

@@ -155,7 +155,7 @@ class TianshouLearner:
         self._replay.cut_off()
         return {
             "algorithm": dict(self._algorithm.state_dict()),  # type: ignore[no-untyped-call]
-            "entropy_optimiser": {key: optim.state_dict() for key, optim in _entropy_optimisers(self._algorithm)},
+            "entropy_optimiser": optimiser.state_dict() if (optimiser := _entropy_optimiser(self._algorithm)) else {},
             "replay": self._replay.state(),
             "n_env_steps": self.n_env_steps,
             "n_epochs": self._n_epochs,
@@ -168,8 +168,8 @@ class TianshouLearner:
             CheckpointError: if it is that of another agent.
         """
         load_into(self._algorithm, dict(state["algorithm"]))
-        for key, optim in _entropy_optimisers(self._algorithm):
-            optim.load_state_dict(state["entropy_optimiser"][key])
+        if optimiser := _entropy_optimiser(self._algorithm):
+            optimiser.load_state_dict(state["entropy_optimiser"])
         self._replay.load_state(state["replay"])
         self._collector.collect_step = state["n_env_steps"]
         self._n_epochs = state["n_epochs"]
@@ -203,10 +203,9 @@ def load_into(module: torch.nn.Module, weights: dict[str, Any]) -> None:
         raise CheckpointError(f"the checkpoint is another agent's or network's: {error}") from error
 
 
-def _entropy_optimisers(algorithm: Any) -> list[tuple[str, torch.optim.Optimizer]]:
+def _entropy_optimiser(algorithm: Any) -> torch.optim.Optimizer | None:
     """The optimiser of a learned entropy coefficient, which Tianshou leaves out of an algorithm's state."""
-    optimiser = getattr(getattr(algorithm, "alpha", None), "_optim", None)
-    return [] if optimiser is None else [("entropy", optimiser)]
+    return getattr(getattr(algorithm, "alpha", None), "_optim", None)
 
 
 def _batch_of_one(observation: Observed) -> Any:

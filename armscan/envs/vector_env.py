@@ -174,6 +174,16 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         return mask
 
 
+def reset_each(
+    envs: VectorEnv[Any, Any, Any],
+    seeds: int | Sequence[int | None] | None = None,
+    options: dict[str, Any] | None = None,
+) -> tuple[Observed, dict[str, Any]]:
+    """Resets vector environments, with a seed for each where there is a list of them."""
+    # Gymnasium's types leave out such lists, which its own vector environments take.
+    return envs.reset(seed=seeds, options=options)  # type: ignore[arg-type]
+
+
 def _checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
     allowed = (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
     found = [known for known in allowed if isinstance(mode, str | AutoresetMode) and mode in (known, known.value)]

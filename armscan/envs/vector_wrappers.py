@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from armscan.checks import check_int
 from armscan.envs.history import BestPairs, FrameHistory, Mask, boxes_of, observation_of, parts_of, space_of
 from armscan.envs.task import Observed
-from armscan.envs.vector_env import VectorStep
+from armscan.envs.vector_env import VectorStep, reset_each
 from armscan.envs.wrappers import MOST_KEPT, checked_env, with_memory, with_memory_box
 
 
@@ -28,8 +28,7 @@ class _VectorRemembering(VectorWrapper, ABC):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
         """Starts episodes."""
-        # Gymnasium's types leave out the lists of seeds that its own vector environments take.
-        observations, infos = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        observations, infos = reset_each(self.env, seed, options)
         is_first = infos["_reward"]
         self._has_ended &= ~is_first
         self._refill(observations, infos, is_first)

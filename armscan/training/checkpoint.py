@@ -72,7 +72,7 @@ def _header(digest: str) -> bytes:
     return MAGIC + f"{FORMAT} {digest}\n".encode()
 
 
-def _verified(file: BinaryIO, path: Path) -> BinaryIO:
+def _verified(file: io.BufferedReader, path: Path) -> BinaryIO:
     """Returns the contents after the first line, whose sum is the one that the line names."""
     header = file.readline(len(_header("0" * 64)) + 8)
     if (match := HEADER.fullmatch(header)) is None:
@@ -118,7 +118,7 @@ class _Summing:
 class _After(io.RawIOBase):
     """An open file from a place on, as if it began there; torch counts places from a file's beginning."""
 
-    def __init__(self, file: BinaryIO, offset: int) -> None:
+    def __init__(self, file: io.BufferedReader, offset: int) -> None:
         super().__init__()
         self._file, self._offset = file, offset
         file.seek(offset)
@@ -130,7 +130,7 @@ class _After(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any) -> int:
-        return self._file.readinto(buffer)  # type: ignore[attr-defined, no-any-return]
+        return self._file.readinto(buffer)
 
     def tell(self) -> int:
         return self._file.tell() - self._offset

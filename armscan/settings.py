@@ -1,0 +1,34 @@
+"""The configuration outside Hydra: as plain values, and what it says of the tracking store where nothing else does."""
+
+from __future__ import annotations
+
+import shlex
+from importlib import resources
+from typing import Any, cast
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from armscan.mistakes import CONFIG_MODULE
+
+RESUME, TRACKING_URI = "resume", "tracking.uri"
+
+
+def plain(config: DictConfig | ListConfig) -> dict[str, Any]:
+    """Returns a configuration, or a section of one, as plain dictionaries, lists, numbers and texts, all resolved.
+
+    Raises:
+        MissingMandatoryValue: if a value that must be given is not.
+    """
+    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+
+
+def usual_tracking() -> dict[str, str]:
+    """Returns the section `tracking` as it is where nobody says anything else."""
+    with (resources.files(CONFIG_MODULE) / "tracking" / "mlflow.yaml").open() as file:
+        return plain(OmegaConf.load(file))
+
+
+def resume_command(run_id: str, tracking_uri: str) -> str:
+    """Returns what one types to go on with a run that was cut off."""
+    store = [] if tracking_uri == usual_tracking()["uri"] else [f"{TRACKING_URI}={tracking_uri}"]
+    return shlex.join(["python", "-m", "armscan.run", f"{RESUME}={run_id}", *store])
