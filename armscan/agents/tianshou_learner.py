@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from tianshou.data import Batch
 from tianshou.highlevel.experiment import Experiment, ExperimentConfig
 from tianshou.highlevel.persistence import PolicyPersistence
+from tianshou.trainer import Trainer
 
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.protocols import AgentSetup
@@ -54,8 +56,7 @@ class TianshouLearner:
         assert world.training_collector is not None
         self._collector = world.training_collector
         self._collector.buffer = replay
-        trainer = experiment.algorithm_factory.create_trainer(world, _NoPersistence())
-        trainer.params.show_progress = False
+        trainer = _silenced(experiment.algorithm_factory.create_trainer(world, _NoPersistence()))
         trainer.reset(reset_collectors=False)
         self._algorithm = world.algorithm
         self._trainer = trainer
@@ -201,6 +202,19 @@ def load_into(module: torch.nn.Module, weights: dict[str, Any]) -> None:
         module.load_state_dict(weights)
     except (RuntimeError, KeyError, ValueError) as error:
         raise CheckpointError(f"the checkpoint is another agent's or network's: {error}") from error
+
+
+def _silenced(trainer: Trainer[Any, Any]) -> Trainer[Any, Any]:
+    """Returns the trainer without progress bars; of many gradient steps it shows one whatever `show_progress` says."""
+
+    class Silenced(type(trainer)):  # type: ignore[misc]
+        @property
+        def _pbar(self) -> Callable[..., Any]:
+            make_bar = super()._pbar
+            return lambda *args, **options: make_bar(*args, **options | {"disable": True})
+
+    trainer.__class__ = Silenced
+    return trainer
 
 
 def _entropy_optimiser(algorithm: Any) -> torch.optim.Optimizer | None:

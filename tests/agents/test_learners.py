@@ -41,6 +41,14 @@ def test_learner_counts_every_environment_step(make_learner):
     assert learner.learn(7)["speed/env_steps_per_s"] > 0
 
 
+@pytest.mark.parametrize("algorithm", ["sac"], indirect=True)
+def test_learner_of_many_updates_a_collection_shows_no_bars_of_its_own(make_learner, capfd):
+    learner = make_learner(env_steps_per_collection=20, updates_per_env_step=2.0)
+    learner.warm_up()
+    learner.learn(40)
+    assert "".join(capfd.readouterr()) == ""
+
+
 @by_reinforcement
 def test_learner_reports_episodes_losses_and_speed(make_learner):
     learner = make_learner()
