@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -13,9 +14,11 @@ from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError
 
-# What training keeps in the folder of its run, the configuration it was started with, and who is at work in it.
+# What training keeps in the folder of its run, what the run was started with, and who is at work in it.
 BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
-CONFIG_FILE = "config.yaml"
+CONFIG_FILE, VOLUMES_FILE = "config.yaml", "volumes.json"
+# The tags of a run that hold the sums of what it was started with.
+SUM_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
 LOCK_FILE = ".lock"
 UNFINISHED = "unfinished"
 
@@ -43,6 +46,11 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
         _sync_folder(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def sum_of(contents: bytes) -> str:
+    """Returns the SHA-256 of a file's contents."""
+    return hashlib.sha256(contents).hexdigest()
 
 
 def _sync_folder(folder: Path) -> None:

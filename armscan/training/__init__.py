@@ -9,6 +9,7 @@ from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Eva
 from armscan.training.familiar import Familiar
 from armscan.training.figures import Figures
 from armscan.training.film import film_episode
+from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
 
 __all__ = [
@@ -24,12 +25,15 @@ __all__ = [
     "Evaluation",
     "Familiar",
     "Figures",
+    "Fingerprints",
     "Origin",
     "SolvedCriterion",
     "Split",
     "TrainingResult",
+    "check_unchanged",
     "evaluate",
     "film_episode",
+    "fingerprint",
     "load_checkpoint",
     "mixed_data",
     "nifti_data",
