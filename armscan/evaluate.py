@@ -128,7 +128,9 @@ def evaluate(request: Request) -> Path:
     else:
         folder = None if request.data == PHANTOMS else request.data
         subject = judging.subject_of_words(request.agent_words, folder, request.changes)
-    own = cache(partial(judging.own_split, subject.config))
+    # Elsewhere, of an agent's own volumes only those matter that its reward is fitted to.
+    parts = ("training",) if request.data else judging.PARTS
+    own = cache(partial(judging.own_split, subject, parts))
     groups = judging.volume_groups(request.data, request.n_phantoms, own)
     for label, volumes in groups.items():
         check_int(
@@ -139,7 +141,9 @@ def evaluate(request: Request) -> Path:
     trial = judging.prepare(subject, groups, judging.TrainingVolumes(own))
     notes = list(trial.notes)
     if request.data and subject.run:
-        notes += judging.known_volumes(subject.run.tags, groups)
+        notes += judging.known_volumes(subject, groups)
+    if subject.run and subject.volumes is None and own.cache_info().currsize:
+        notes.append("the run has not kept fingerprints of its volumes: nobody knows whether these are still the same")
     for note in notes:
         print(f"note: {note}")
     _check_out(request.out or FOLDER / "evaluation.json")

@@ -2,7 +2,7 @@
 
 from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
-from armscan.training.checkpoint import load_checkpoint, save_checkpoint
+from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from armscan.training.course import Origin, take_up
 from armscan.training.data import Split, mixed_data, nifti_data, phantom_data
 from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Evaluation, evaluate
@@ -35,6 +35,7 @@ __all__ = [
     "film_episode",
     "fingerprint",
     "load_checkpoint",
+    "load_weights",
     "mixed_data",
     "nifti_data",
     "phantom_data",
