@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import shutil
@@ -34,7 +35,7 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """
     # Where the place is a link, the file that it leads to is replaced, not the link.
     path = path.resolve()
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.{UNFINISHED}")
+    unfinished = _unfinished(path)
     try:
         with unfinished.open("wb") as file:
             write(file)
@@ -46,6 +47,19 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
         _sync_folder(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def check_writable(path: Path) -> None:
+    """Raises the `OSError` that `write_whole` would meet at a place; leaves nothing there."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    unfinished = _unfinished(path.resolve())
+    unfinished.touch()
+    unfinished.unlink()
+
+
+def _unfinished(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.{UNFINISHED}")
 
 
 def sum_of(contents: bytes) -> str:

@@ -161,9 +161,10 @@ def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(answer,
 def test_evaluate_gives_the_same_figures_again(answer, tmp_path):
     run_id = tracked(tmp_path, "projection=zy")
     figures = []
-    for name in ("first.json", "second.json"):
-        assert answer(f"run={run_id}", "episodes=4", "seed=3", f"out={name}")[0] == 0
-        contents = json.loads((tmp_path / name).read_text())["splits"]["test volumes"]["figures"]
+    # The second replaces the first.
+    for _ in range(2):
+        assert answer(f"run={run_id}", "episodes=4", "seed=3", "out=a.json")[0] == 0
+        contents = json.loads((tmp_path / "a.json").read_text())["splits"]["test volumes"]["figures"]
         figures.append({key: value for key, value in contents.items() if "seconds" not in key})
     assert figures[0] == figures[1]
 
@@ -312,6 +313,23 @@ def test_baselines_are_evaluated_by_their_run_or_by_name(answer, tmp_path, phant
     assert "mlflow.parentRunId" not in tags
 
 
+def test_baseline_takes_a_preset_as_a_run_does_and_an_experiment_of_mlflow(answer, tmp_path):
+    words = [
+        "agent=random",
+        "experiment=best_full",
+        "data=phantoms",
+        "phantoms=1",
+        "episodes=1",
+        "tracking_experiment=x",
+    ]
+    code, _, errors = answer(*words)
+    assert (code, errors) == (0, "")
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    (run,) = client.search_runs([client.get_experiment_by_name("x").experiment_id])
+    assert run.data.params["projection"] == "full"
+    assert run.data.params["agent._target_"] == "armscan.agents.Random"
+
+
 class GuesserOfAnything(Guesser):
     """The same, whatever else its configuration says."""
 
@@ -328,15 +346,47 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         (["run=xyz"], "the run is 'xyz', but it must be an id as MLflow shows it"),
         (["run=ffffffff"], "the run is 'ffffffff', but no run of sqlite:///"),
         ([f"run={run_id}", "tracking=sqlite:///no.db"], "tracking.uri is 'sqlite:///no.db', but there is no "),
-        ([f"run={run_id}", "data=/nowhere"], "/nowhere: the folder of volumes does not exist"),
+        ([f"run={run_id}", "data=/nowhere"], "data is '/nowhere', but there is no such folder: it must be "),
+        (["agent=random", "data=phantom"], "data is 'phantom', but there is no such folder: it must be a folder of "),
+        (
+            ["agent=random", f"data={data_folder}", "data.n_test=1"],
+            "there is no key 'n_test' in data, but only path, validation, test or split_seed",
+        ),
         ([f"run={run_id}", "episodes=0"], "episodes is 0, but it must be a whole number of at least 1"),
         ([f"run={run_id}", f"data={data_folder}", "episodes=3"], "episodes, of which each of 4 volumes is to have one"),
         ([f"run={run_id}", "seed=-1"], "seed is -1, but it must be a whole number of at least 0"),
         ([f"run={run_id}", "phantoms=3"], "phantoms is 3, but it is for data=phantoms"),
-        ([f"run={run_id}", "experiment=x"], "experiment is for agent=NAME"),
+        ([f"run={run_id}", "experiment=x"], "experiment is a preset, for agent=NAME"),
+        (
+            ["agent=random", "experiment=best_zy", "data=phantoms"],
+            "experiment sets agent.final_lr_share, but the agent",
+        ),
+        ([f"run={run_id}", "tracking_experiment=x"], "tracking_experiment is for agent=NAME"),
+        (["agent=random", "experiment=x"], "experiment is 'x', but it must be best_full, "),
+        (
+            [f"run={run_id}", "tracking.uri=x"],
+            "tracking.uri is of armscan.run, and not read by an evaluation: give tra",
+        ),
+        (
+            ["agent=random", "+tracking.uri=x"],
+            "tracking.uri is of armscan.run, and not read by an evaluation: give tra",
+        ),
+        (["agent=random", "tracking.artifacts=x"], "tracking.artifacts is of armscan.run, and not read by"),
+        (["agent=random", "evaluation.episodes=5", "episodes=2"], "evaluation.episodes is of armscan.run, and not"),
+        (["agent=random", "env.delta=0.01", "delta=0.5"], "delta and env.delta are both given, but they are one value"),
+        (["agent=random", "data.path=a", f"data={data_folder}"], "data and data.path are both given"),
         ([f"run={run_id}", "delta=7"], "delta is 7, but it must be a finite number above 0 and at most 1"),
         ([f"run={run_id}", "device=tpu"], "device is 'tpu', but it must be auto, cpu or cuda"),
         ([f"run={run_id}", "out=/dev/null/x.json"], "out is '/dev/null/x.json', but no file can be written there"),
+        (
+            [f"run={run_id}", "episodes=1", "out=/proc/x.json"],
+            "out is '/proc/x.json', but no file can be written there: ",
+        ),
+        ([f"run={run_id}", "episodes=1", "out=."], "out is '.', but no file can be written there: Is a directory"),
+        *(
+            ([f"run={run_id}", "episodes=1", f"out={name}"], f"out is '{name}', but that file is no evaluation, and")
+            for name in ("config.yaml", "volumes.json")
+        ),
         (["agent=nobody"], "agent is 'nobody', but it must be "),
         (["agent=sac", *FEW], "sac has to be trained first: give run=ID"),
         (["agent=sac", "projection=q", *FEW], "projection is 'q', but it must be x, y"),

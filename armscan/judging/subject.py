@@ -15,18 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from armscan.building import check_sections
 from armscan.errors import CheckpointError, InvalidValueError
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
+from armscan.settings import CHANGES
 from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, found_run
 from armscan.training import Familiar, Fingerprints, Origin, load_weights
-
-# Where a change of the rules goes in the configuration.
-CHANGES = {
-    "delta": "env.delta",
-    "max_steps": "env.max_steps",
-    "start": "env.start",
-    "clustering": "env.clustering",
-    "judged_by_sampling": "agent.judged_by_sampling",
-    "device": "compute.device",
-}
 
 # Files and folders that the section `data` names.
 PATHS = ("path", "cache_dir")
@@ -77,13 +68,13 @@ def subject_of_words(words: Sequence[str], folder: str | None, changes: Mapping[
     """Returns the agent of a configuration, composed as `python -m armscan.run` composes it.
 
     Args:
-        words: `key=value`, `agent=NAME` among them.
+        words: `key=value`, `agent=NAME` among them, and `data=nifti` where there is a folder.
         folder: of the volumes that it is evaluated on, which are its own then; None for those of the configuration.
         changes: of the rules.
     """
     GlobalHydra.instance().clear()
     with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
-        config = compose(CONFIG_NAME, [*words, *(["data=nifti"] if folder else [])])
+        config = compose(CONFIG_NAME, list(words))
     if folder:
         config.data.path = folder
     OmegaConf.resolve(config)
