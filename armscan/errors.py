@@ -48,6 +48,10 @@ class CheckpointError(ArmscanError, ValueError):
     """A checkpoint cannot be read, or belongs to another agent."""
 
 
+class ChangedVolumesError(ArmscanError, ValueError):
+    """Volumes are not those any more that a run or a checkpoint is of."""
+
+
 class FolderInUseError(ArmscanError, RuntimeError):
     """Another process is at work in a run's folder."""
 

@@ -3,7 +3,8 @@
     python -m armscan.evaluate run=ID                      a tracked run's agent, on the run's own volumes
     python -m armscan.evaluate run=ID data=FOLDER          ... on the volumes of a folder
     python -m armscan.evaluate run=ID data=phantoms        ... on phantoms that no run trains on
-    python -m armscan.evaluate agent=NAME projection=zy    a baseline, with any key=value of armscan.run
+    python -m armscan.evaluate agent=NAME projection=zy    a baseline, with any key=value of armscan.run and
+                                                           experiment=PRESET; not tracking.* and evaluation.*
 
 run=ID              the run's id, or its first four or more characters, as the UI shows them
 agent=NAME          instead of run: an agent that need not be trained
@@ -13,9 +14,9 @@ episodes=200        for each split, in turn on its volumes
 seed=0              of the episodes; the same one gives every agent the same ones
 delta=0.01          end episodes above -delta; likewise max_steps=50, start=random, clustering=metric
 judged_by_sampling=true    let the policy act as it explores; device=cpu: compute there
-out=FILE            the figures and episodes as JSON, where nothing is said in evaluations/
+out=FILE            the figures and episodes as JSON, where nothing is said in evaluations/; only such is replaced
 tracking=URI        the store, MLFLOW_TRACKING_URI or sqlite:///mlruns.db where nothing is said
-experiment=armscan  with agent=NAME: that the evaluation is tracked in; otherwise it is the run's
+tracking_experiment=armscan   with agent=NAME: of MLflow, that the evaluation is tracked in; otherwise the run's
 
 docs/evaluation.md says what the figures mean.
 """
@@ -27,89 +28,24 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from armscan.checks import check_int, check_seed
+from armscan.checks import check_int
 from armscan.errors import InvalidValueError
-from armscan.files import write_whole
+from armscan.files import check_writable, write_whole
 from armscan.mistakes import mistake_in_one_line, quieten_libraries
+from armscan.request import PHANTOMS, Request, parse
 from armscan.settings import plain, usual_tracking
-from armscan.words import answered, read_words
+from armscan.words import answered
 
 if TYPE_CHECKING:
     from armscan.judging import Judgement, Subject, Trial
 
-CHANGES = ("delta", "max_steps", "start", "clustering", "judged_by_sampling", "device")
-OWN = ("run", "data", "phantoms", "episodes", "seed", "out", "tracking", "experiment", *CHANGES)
-TEXTS = ("run", "data", "start", "clustering", "device", "out", "tracking", "experiment")
-PHANTOMS = "phantoms"
-N_PHANTOMS, N_EPISODES = 8, 200
 FOLDER = Path("evaluations")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Request:
-    """What is to be evaluated, and how.
-
-    Args:
-        run: the id of a tracked run, None for an agent without one.
-        agent_words: what the configuration of an agent without a run is composed of.
-        data: a folder, `phantoms`, or None for the volumes of the agent's own configuration.
-        n_phantoms: how many.
-        n_episodes: for each split.
-        seed: of the episodes.
-        changes: rules that are changed.
-        out: the JSON file, None for one of its own in `evaluations`.
-        tracking: of the store, None for the usual one.
-        experiment: likewise.
-    """
-
-    run: str | None = None
-    agent_words: tuple[str, ...] = ()
-    data: str | None = None
-    n_phantoms: int = N_PHANTOMS
-    n_episodes: int = N_EPISODES
-    seed: int = 0
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    out: Path | None = None
-    tracking: str | None = None
-    experiment: str | None = None
-
-
-def parse(words: Sequence[str]) -> Request:
-    """Returns what `key=value` words ask for.
-
-    Raises:
-        InvalidValueError: if a word is something else, a key unknown, or a value of another kind.
-    """
-    keys = [word.partition("=")[0] for word in words]
-    with_agent = "agent" in keys
-    # Beside an agent without a run, whatever is not this command's own is of the configuration.
-    others = [word for word, key in zip(words, keys, strict=True) if with_agent and key not in OWN]
-    values = read_words([word for word in words if word not in others], ("run", "agent", *OWN[1:]), TEXTS)
-    if with_agent and "run" in values:
-        raise InvalidValueError("run and agent are both given, but a run has its agent: give one of them")
-    if not with_agent and "run" not in values:
-        raise InvalidValueError("run is not set, but it must be: give run=ID, or agent=NAME (--help explains)")
-    if "phantoms" in values and values.get("data") != PHANTOMS:
-        raise InvalidValueError(f"phantoms is {values['phantoms']!r}, but it is for data={PHANTOMS}")
-    if "experiment" in values and not with_agent:
-        raise InvalidValueError("experiment is for agent=NAME: the evaluation of a run is tracked in the run's own")
-    return Request(
-        run=values.get("run"),
-        agent_words=tuple(others),
-        data=values.get("data"),
-        n_phantoms=check_int("phantoms", values.get("phantoms", N_PHANTOMS), at_least=1, at_most=10_000),
-        n_episodes=check_int("episodes", values.get("episodes", N_EPISODES), at_least=1),
-        seed=check_seed("seed", values.get("seed", 0)),
-        changes={name: values[name] for name in CHANGES if name in values},
-        out=Path(values["out"]) if "out" in values else None,
-        tracking=values.get("tracking"),
-        experiment=values.get("experiment"),
-    )
+# What the JSON of every evaluation holds.
+KEYS_OF_A_REPORT = {"of", "name", "splits", "volumes", "episodes", "tracked_as"}
 
 
 def evaluate(request: Request) -> Path:
@@ -122,13 +58,18 @@ def evaluate(request: Request) -> Path:
     from armscan.console import print_where_to_look
 
     torch.set_num_threads(1)
+    if request.folder and not Path(request.folder).is_dir():
+        raise InvalidValueError(
+            f"data is {request.data!r}, but there is no such folder: it must be a folder of volumes, or {PHANTOMS}"
+        )
     store = _store(request)
     if request.run is not None:
         subject = judging.subject_of_run(store["uri"], request.run, request.changes)
     else:
-        folder = None if request.data == PHANTOMS else request.data
-        subject = judging.subject_of_words(request.agent_words, folder, request.changes)
-    own = cache(partial(judging.own_split, subject.config))
+        subject = judging.subject_of_words(request.config_words, request.folder, request.changes)
+    # Elsewhere, of an agent's own volumes only those matter that its reward is fitted to.
+    parts = ("training",) if request.data else judging.PARTS
+    own = cache(partial(judging.own_split, subject, parts))
     groups = judging.volume_groups(request.data, request.n_phantoms, own)
     for label, volumes in groups.items():
         check_int(
@@ -139,10 +80,12 @@ def evaluate(request: Request) -> Path:
     trial = judging.prepare(subject, groups, judging.TrainingVolumes(own))
     notes = list(trial.notes)
     if request.data and subject.run:
-        notes += judging.known_volumes(subject.run.tags, groups)
+        notes += judging.known_volumes(subject, groups)
+    if subject.run and subject.volumes is None and own.cache_info().currsize:
+        notes.append("the run has not kept fingerprints of its volumes: nobody knows whether these are still the same")
     for note in notes:
         print(f"note: {note}")
-    _check_out(request.out or FOLDER / "evaluation.json")
+    _check_out(request.out)
     judgement, file = _tracked(request, subject, trial, notes, store)
     for table in judging.judgement_tables(judgement):
         Console().print(table)
@@ -196,18 +139,31 @@ def _tracked(
 
 def _store(request: Request) -> dict[str, str]:
     """Returns where runs are tracked: as the configuration says, where the words say nothing else."""
-    said = {"uri": request.tracking, "experiment": request.experiment}
+    said = {"uri": request.tracking, "experiment": request.tracking_experiment}
     return usual_tracking() | {name: value for name, value in said.items() if value is not None}
 
 
-def _check_out(file: Path) -> None:
-    """Makes the folder of the JSON file, before an evaluation that may take hours is played for it."""
+def _check_out(out: Path | None) -> None:
+    """Writes where the JSON file will lie, before an evaluation that may take hours is played for it."""
+    file = out or FOLDER / "evaluation.json"
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(file)
+        is_anothers = out is not None and file.exists() and not _is_report(file)
     except OSError as error:
         raise InvalidValueError(f"out is {str(file)!r}, but no file can be written there: {error.strerror}") from error
-    if file.is_dir() or not os.access(file.parent, os.W_OK):
-        raise InvalidValueError(f"out is {str(file)!r}, but no file can be written there")
+    if is_anothers:
+        raise InvalidValueError(
+            f"out is {str(file)!r}, but that file is no evaluation, and would be lost: name another"
+        )
+
+
+def _is_report(file: Path) -> bool:
+    try:
+        contents = json.loads(file.read_bytes())
+    except ValueError:
+        return False
+    return isinstance(contents, dict) and contents.keys() >= KEYS_OF_A_REPORT
 
 
 def _file_name(text: str) -> str:
@@ -221,10 +177,11 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     quieten_libraries()
+    request = parse(words)
     try:
-        evaluate(parse(words))
+        evaluate(request)
     except Exception as error:
-        line = mistake_in_one_line(error)
+        line = mistake_in_one_line(error, request.config_words)
         if line is None or os.environ.get("ARMSCAN_TRACEBACKS"):
             raise
         raise InvalidValueError(line) from error

@@ -6,12 +6,13 @@ No part of the configuration goes further than this module and `building.py`.
 from __future__ import annotations
 
 import contextlib
-import hashlib
+import json
 import socket
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, Self
 
@@ -23,7 +24,16 @@ import armscan
 from armscan.agents import Learner
 from armscan.building import Experiment, build
 from armscan.console import print_results, print_where_to_look, progress_reporter
-from armscan.files import BEST_CHECKPOINT, CONFIG_FILE, LAST_CHECKPOINT, held, write_whole
+from armscan.files import (
+    BEST_CHECKPOINT,
+    CONFIG_FILE,
+    LAST_CHECKPOINT,
+    SUM_TAGS,
+    VOLUMES_FILE,
+    held,
+    sum_of,
+    write_whole,
+)
 from armscan.invocation import Invocation
 from armscan.mistakes import quieten_libraries
 from armscan.multirun import JOB_TAG
@@ -35,6 +45,7 @@ from armscan.training import (
     EpochReport,
     Evaluation,
     Familiar,
+    Fingerprints,
     Origin,
     Split,
     TrainingResult,
@@ -89,11 +100,11 @@ class Stage:
 
     def origin(self, run_id: str) -> Origin:
         """Returns what the checkpoints of a run say that they come from."""
-        return Origin(run_id=run_id, volumes=self._fingerprints)
+        return Origin(run_id=run_id, volumes=self.fingerprints)
 
     @cached_property
-    def _fingerprints(self) -> dict[str, dict[str, str]]:
-        """Once: a run that goes on needs them twice, and they take a second for a hundred volumes."""
+    def fingerprints(self) -> Fingerprints:
+        """Of the volumes; once, because they take a second for a hundred of them."""
         return self.experiment.split.fingerprints()
 
 
@@ -118,13 +129,17 @@ def start_tracking(config: DictConfig, invocation: Invocation, stage: Stage) -> 
     """Writes down what is run, opens the tracking store and starts a run in it."""
     resolved = plain(config)
     client, experiment_id = open_store(**resolved["tracking"])
-    choices, job, config_file = invocation.choices, invocation.job, invocation.folder / CONFIG_FILE
-    text = yaml.safe_dump(resolved, sort_keys=False).encode()
+    choices, job = invocation.choices, invocation.job
+    started_with = {
+        CONFIG_FILE: yaml.safe_dump(resolved, sort_keys=False).encode(),
+        VOLUMES_FILE: json.dumps(stage.fingerprints, indent=1).encode(),
+    }
     # Another run's, left in a folder that somebody named: they would be taken for this one's.
     for stale in (LAST_CHECKPOINT, BEST_CHECKPOINT):
         (invocation.folder / stale).unlink(missing_ok=True)
     # Before the run is there: whenever it is killed, it can be resumed.
-    write_whole(config_file, lambda file: file.write(text))
+    for name, contents in started_with.items():
+        write_whole(invocation.folder / name, methodcaller("write", contents))
     tracked = TrackedRun.start(
         client,
         experiment_id,
@@ -138,12 +153,12 @@ def start_tracking(config: DictConfig, invocation: Invocation, stage: Stage) -> 
             FAMILIAR_TAG: Familiar.of(stage.training_env, stage.experiment.smallest_slice_px).to_json(),
             **place_tags(invocation.folder),
             "working_folder": str(Path.cwd()),
-            "config.sha256": hashlib.sha256(text).hexdigest(),
+            **{SUM_TAGS[name]: sum_of(contents) for name, contents in started_with.items()},
             **({JOB_TAG: str(job.number)} if job else {}),
         },
         parent_id=job.parent_run_id if job else None,
     )
-    tracked.log_files(config_file)
+    tracked.log_files(*(invocation.folder / name for name in started_with))
     return tracked
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -13,9 +15,11 @@ from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError
 
-# What training keeps in the folder of its run, the configuration it was started with, and who is at work in it.
+# What training keeps in the folder of its run, what the run was started with, and who is at work in it.
 BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
-CONFIG_FILE = "config.yaml"
+CONFIG_FILE, VOLUMES_FILE = "config.yaml", "volumes.json"
+# The tags of a run that hold the sums of what it was started with.
+SUM_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
 LOCK_FILE = ".lock"
 UNFINISHED = "unfinished"
 
@@ -31,7 +35,7 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """
     # Where the place is a link, the file that it leads to is replaced, not the link.
     path = path.resolve()
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.{UNFINISHED}")
+    unfinished = _unfinished(path)
     try:
         with unfinished.open("wb") as file:
             write(file)
@@ -43,6 +47,24 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
         _sync_folder(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def check_writable(path: Path) -> None:
+    """Raises the `OSError` that `write_whole` would meet at a place; leaves nothing there."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    unfinished = _unfinished(path.resolve())
+    unfinished.touch()
+    unfinished.unlink()
+
+
+def _unfinished(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.{UNFINISHED}")
+
+
+def sum_of(contents: bytes) -> str:
+    """Returns the SHA-256 of a file's contents."""
+    return hashlib.sha256(contents).hexdigest()
 
 
 def _sync_folder(folder: Path) -> None:

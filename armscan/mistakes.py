@@ -6,6 +6,7 @@ import logging
 import re
 import sys
 import warnings
+from collections.abc import Sequence
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
@@ -24,8 +25,14 @@ from armscan.errors import ArmscanError, listed
 CONFIG_MODULE, CONFIG_NAME = "armscan.conf", "config"
 
 
-def mistake_in_one_line(error: BaseException) -> str | None:
-    """Returns what a user did wrong and what is allowed instead; None where the error is no user's mistake."""
+def mistake_in_one_line(error: BaseException, words: Sequence[str] | None = None) -> str | None:
+    """Returns what a user did wrong and what is allowed instead; None where the error is no user's mistake.
+
+    Args:
+        error: whatever was raised.
+        words: that the configuration was composed of; those of the command line where they are None.
+    """
+    words = sys.argv[1:] if words is None else words
     ours = next((cause for cause in _causes(error) if isinstance(cause, ArmscanError)), None)
     if ours is not None:
         return str(ours)
@@ -34,13 +41,13 @@ def mistake_in_one_line(error: BaseException) -> str | None:
             group, _, choice = str(error.missing_cfg_file).rpartition("/")
             return f"{group} is {choice!r}, but it must be {listed(options)}"
         case ConfigCompositionException():
-            return _composition_mistake(error)
+            return _composition_mistake(error, words)
         case OverrideParseException():
             return f"{error.override!r} cannot be read: what follows the options must be key=value"
         case MissingMandatoryValue():
             return f"{error.full_key} is not set, but it must be: give {error.full_key}=VALUE"
         case InstantiationException():
-            return _instantiation_mistake(error)
+            return _instantiation_mistake(error, words)
         case HydraException() | OmegaConfBaseException():
             return " ".join(str(error).split())
         case ValueError() if _is_raised_by_hydra(error):
@@ -80,7 +87,7 @@ def _is_raised_by_hydra(error: BaseException) -> bool:
     return trace is not None and str(trace.tb_frame.f_globals.get("__name__")).startswith("hydra.")
 
 
-def _composition_mistake(error: ConfigCompositionException) -> str:
+def _composition_mistake(error: ConfigCompositionException, words: Sequence[str]) -> str:
     text = " ".join(str(error).split())
     if ambiguous := re.match(r"Ambiguous value for argument '(.*?)'", text):
         return (
@@ -89,24 +96,27 @@ def _composition_mistake(error: ConfigCompositionException) -> str:
     if unknown := re.match(r"Could not override '(.*?)'", text):
         key = unknown.group(1)
         parent, _, name = key.rpartition(".")
-        allowed = _keys_under(parent)
+        allowed = _keys_under(parent, words)
         where = f"in {parent}" if parent else "at the top"
         return f"there is no key {name!r} {where}" + (f", but only {listed(allowed)}" if allowed else "")
     return text
 
 
-def _instantiation_mistake(error: InstantiationException) -> str:
+def _instantiation_mistake(error: InstantiationException, words: Sequence[str]) -> str:
     text = " ".join(str(error).split())
     if unexpected := re.search(r"unexpected keyword argument '(\w+)'.*full_key: (\S+)", text):
         key, parent = unexpected.groups()
-        allowed = _keys_under(parent)
+        allowed = _keys_under(parent, words)
+        # Words that choose groups give it to those that have no place for it: a preset does.
+        if key in allowed:
+            return f"experiment sets {parent}.{key}, but the {parent} that is chosen beside it has no such value"
         return f"there is no key {key!r} in {parent}" + (f", but only {listed(allowed)}" if allowed else "")
     return f"{text} (HYDRA_FULL_ERROR=1 shows where)"
 
 
-def _keys_under(parent: str) -> list[str]:
-    """The keys that the configuration has under a parent, with the groups chosen as on the command line."""
-    choices = [word for word in sys.argv[1:] if re.fullmatch(r"[a-z_/]+=[a-z_0-9]+", word)]
+def _keys_under(parent: str, words: Sequence[str]) -> list[str]:
+    """The keys that the configuration has under a parent, with the groups chosen as by these words."""
+    choices = [word for word in words if re.fullmatch(r"[a-z_/]+=[a-z_0-9]+", word)]
     GlobalHydra.instance().clear()
     for overrides in (choices, []):
         try:

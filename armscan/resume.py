@@ -6,7 +6,7 @@ volumes, another run's checkpoints, a damaged checkpoint.
 
 from __future__ import annotations
 
-import hashlib
+import json
 import os
 import re
 from collections.abc import Sequence
@@ -22,10 +22,18 @@ import armscan
 from armscan.agents import Learner
 from armscan.errors import InvalidValueError, ResumeError
 from armscan.experiment import Stage, carry_out, place_tags, volume_tags
-from armscan.files import CONFIG_FILE, held, remove_unfinished
+from armscan.files import (
+    CONFIG_FILE,
+    LAST_CHECKPOINT,
+    SUM_TAGS,
+    VOLUMES_FILE,
+    held,
+    remove_unfinished,
+    sum_of,
+)
 from armscan.settings import RESUME, TRACKING_URI, plain, usual_tracking
 from armscan.tracking import TrackedRun, find_run, open_existing_store
-from armscan.training import take_up
+from armscan.training import Fingerprints, check_unchanged, take_up
 
 
 def resume(words: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -42,7 +50,8 @@ def resume(words: Sequence[str]) -> dict[str, dict[str, float]]:
         TrackingError: if the run is not found.
         ResumeError: if it cannot go on.
         FolderInUseError: if it is still going on.
-        CheckpointError: if its checkpoint is damaged, another run's, or of other volumes.
+        CheckpointError: if its checkpoint is damaged or another run's.
+        ChangedVolumesError: if its volumes are not those any more that it was started with.
     """
     wanted, uri = _read(words)
     client = open_existing_store(uri)
@@ -54,10 +63,12 @@ def resume(words: Sequence[str]) -> dict[str, dict[str, float]]:
         if run.info.status == "FINISHED":
             raise ResumeError(f"run {run_id} has finished: there is nothing to resume")
         config = _config_of(run, folder)
+        _check_last_checkpoint(run, folder)
         remove_unfinished(folder)
         _enter_working_folder(run)
         print(f"preparing to go on with {run.info.run_name}, run {run_id}", flush=True)
         stage = Stage.built(config)
+        _check_volumes(run, folder, stage.fingerprints)
         agent, split = stage.experiment.agent, stage.experiment.split
         earlier = take_up(agent, folder, stage.origin(run_id)) if isinstance(agent, Learner) else []
         tracked = TrackedRun.go_on(client, run_id, config=plain(config), tags=volume_tags(split) | place_tags(folder))
@@ -112,17 +123,39 @@ def _release(version: str) -> tuple[int, ...]:
 
 def _config_of(run: Run, folder: Path) -> DictConfig:
     """Returns the configuration that a run was started with."""
-    file = folder / CONFIG_FILE
-    try:
-        text = file.read_bytes()
-    except OSError as error:
-        raise ResumeError(f"{file}: the run's configuration cannot be read ({error.strerror})") from error
-    if hashlib.sha256(text).hexdigest() != run.data.tags["config.sha256"]:
-        raise ResumeError(
-            f"{file}: is not the configuration that run {run.info.run_id} was started with: changed, or another run's"
-        )
-    config: dict[str, Any] = yaml.safe_load(text)
+    config: dict[str, Any] = yaml.safe_load(_started_with(run, folder / CONFIG_FILE, "configuration"))
     return OmegaConf.create(config)
+
+
+def _started_with(run: Run, file: Path, what: str) -> bytes:
+    """Returns the contents of a file that a run was started with."""
+    try:
+        contents = file.read_bytes()
+    except OSError as error:
+        raise ResumeError(f"{file}: the run's {what} cannot be read ({error.strerror})") from error
+    if sum_of(contents) != run.data.tags[SUM_TAGS[file.name]]:
+        raise ResumeError(
+            f"{file}: is not the {what} that run {run.info.run_id} was started with: changed, or another run's"
+        )
+    return contents
+
+
+def _check_last_checkpoint(run: Run, folder: Path) -> None:
+    """Raises `ResumeError` where a training would begin again whose epochs are tracked already."""
+    last = folder / LAST_CHECKPOINT
+    if not last.exists() and any(name.startswith("validation/") for name in run.data.metrics):
+        raise ResumeError(
+            f"{last}: there is no such checkpoint any more, but run {run.info.run_id} has tracked epochs, which would "
+            "be trained and tracked again: put it back, or start another run"
+        )
+
+
+def _check_volumes(run: Run, folder: Path, now: Fingerprints) -> None:
+    """Raises `ChangedVolumesError` where a run would go on with other volumes, whether it has a checkpoint or not."""
+    # Of runs that were started before it was kept, the checkpoint says so.
+    if SUM_TAGS[VOLUMES_FILE] in run.data.tags:
+        then = json.loads(_started_with(run, folder / VOLUMES_FILE, "record of its volumes"))
+        check_unchanged(then, now, f"run {run.info.run_id} was started with")
 
 
 def _enter_working_folder(run: Run) -> None:

@@ -10,6 +10,15 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from armscan.mistakes import CONFIG_MODULE
 
+# The rules that an evaluation may change in one word, and where they stand in the configuration.
+CHANGES = {
+    "delta": "env.delta",
+    "max_steps": "env.max_steps",
+    "start": "env.start",
+    "clustering": "env.clustering",
+    "judged_by_sampling": "agent.judged_by_sampling",
+    "device": "compute.device",
+}
 RESUME, TRACKING_URI = "resume", "tracking.uri"
 
 

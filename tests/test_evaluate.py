@@ -1,6 +1,8 @@
 """The command that evaluates, as a person types it, on real tracked runs."""
 
+import contextlib
 import json
+import shutil
 import subprocess
 import sys
 
@@ -15,8 +17,9 @@ from omegaconf import OmegaConf
 
 from armscan import evaluate
 from armscan.building import build
+from armscan.files import SUM_TAGS, sum_of
 from armscan.tracking import FAMILIAR_TAG, TrackedRun, open_store
-from armscan.training import Familiar, save_checkpoint
+from armscan.training import Familiar, load_checkpoint, save_checkpoint
 from armscan.volumes.resampling import resampled
 
 from .test_run import SMALL, armscan_run, runs_in
@@ -41,35 +44,39 @@ class Guesser:
         return self._rng.uniform(-1, 1, self._n_free)
 
 
-def tracked(folder, *overrides, agent=None, kept=("config.yaml", "best.pt"), has_tag=True):
-    """Tracks a run of an agent that has learned nothing; returns its id."""
+def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json", "best.pt"), has_tag=True, few=FEW):
+    """Tracks a run of an agent that has learned nothing, started in this folder; returns its id."""
     GlobalHydra.instance().clear()
     with initialize_config_module("armscan.conf", version_base="1.3"):
-        config = compose("config", [*FEW, *overrides])
+        config = compose("config", [*few, *overrides])
     OmegaConf.resolve(config)
     if agent:
         config.agent = agent
-    experiment = build(config)
+    with contextlib.chdir(folder):
+        experiment = build(config)
     client, experiment_id = open_store(
         f"sqlite:///{folder}/mlruns.db", experiment="armscan", artifacts=str(folder / "artifacts")
     )
     familiar = Familiar.of(experiment.maker.one(experiment.split.training))
-    tags = {"volumes.training": " ".join(experiment.split.training)}
+    (folder / "config.yaml").write_text(yaml.safe_dump(OmegaConf.to_container(config)))
+    (folder / "volumes.json").write_text(json.dumps(experiment.split.fingerprints()))
+    tags = {SUM_TAGS[name]: sum_of((folder / name).read_bytes()) for name in SUM_TAGS if name in kept}
+    tags |= {"volumes.training": " ".join(experiment.split.training), "working_folder": str(folder)}
     tags |= {FAMILIAR_TAG: familiar.to_json()} if has_tag else {}
     with TrackedRun.start(client, experiment_id, name="tiny", config={}, tags=tags) as run:
-        (folder / "config.yaml").write_text(yaml.safe_dump(OmegaConf.to_container(config)))
         if agent is None:
-            save_checkpoint(folder / "best.pt", experiment.agent.weights(), {"n_env_steps": 7})
+            facts = {"n_env_steps": 7, "run_id": run.run_id}
+            save_checkpoint(folder / "best.pt", experiment.agent.weights(), facts)
         run.log_files(*(folder / name for name in kept if (folder / name).exists()))
     return run.run_id
 
 
 @pytest.fixture
 def answer(tmp_path, monkeypatch, capsys):
-    """Runs the command in this process, in an empty folder; returns its exit code and what it printed."""
+    """Runs the command in this process, in a folder; returns its exit code and what it printed."""
 
-    def command(*words):
-        monkeypatch.chdir(tmp_path)
+    def command(*words, cwd=tmp_path):
+        monkeypatch.chdir(cwd)
         monkeypatch.setenv("COLUMNS", "200")
         code = evaluate.main(words)
         printed = capsys.readouterr()
@@ -154,9 +161,10 @@ def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(answer,
 def test_evaluate_gives_the_same_figures_again(answer, tmp_path):
     run_id = tracked(tmp_path, "projection=zy")
     figures = []
-    for name in ("first.json", "second.json"):
-        assert answer(f"run={run_id}", "episodes=4", "seed=3", f"out={name}")[0] == 0
-        contents = json.loads((tmp_path / name).read_text())["splits"]["test volumes"]["figures"]
+    # The second replaces the first.
+    for _ in range(2):
+        assert answer(f"run={run_id}", "episodes=4", "seed=3", "out=a.json")[0] == 0
+        contents = json.loads((tmp_path / "a.json").read_text())["splits"]["test volumes"]["figures"]
         figures.append({key: value for key, value in contents.items() if "seconds" not in key})
     assert figures[0] == figures[1]
 
@@ -203,35 +211,98 @@ def test_run_that_has_not_kept_what_it_was_trained_on_is_refused_by_its_network(
     assert "the checkpoint is another agent's or network's" in errors
 
 
-def test_fitted_rewards_alone_need_the_training_volumes(answer, tmp_path, data_folder):
-    data = ["data=nifti", f"data.path={data_folder}"]
-    for reward, code in (("published", 0), ("agreement", 2)):
-        GlobalHydra.instance().clear()
-        run_id = tracked_on_files(tmp_path, reward, data)
-        ended, _, errors = answer(f"run={run_id}", "data=phantoms", "phantoms=1", "episodes=1")
-        assert ended == code, errors
+@pytest.fixture
+def wrists(tmp_path, data_folder):
+    """A folder of volumes whose manifest splits them."""
+    folder = tmp_path / "wrists"
+    shutil.copytree(data_folder, folder)
+    entries = json.loads((folder / "optimal_actions.json").read_text())
+    (folder / "optimal_actions.json").unlink()
+    names = list(entries)
+    splits = {"train": names[:2], "validation": [names[2]], "test": [names[3]]}
+    (folder / "manifest.yaml").write_text(yaml.safe_dump({"volumes": entries, "splits": splits}))
+    return folder
+
+
+ON_FILES = {"few": ["data=nifti", "data.path=wrists", "env.max_steps=2"]}
+
+
+def swapped(manifest):
+    """Training and test volumes, exchanged."""
+    splits = manifest["splits"]
+    return manifest | {"splits": splits | {"train": splits["test"], "test": splits["train"]}}
+
+
+def test_own_volumes_are_those_of_the_folder_that_the_run_was_started_in(answer, tmp_path, wrists):
+    run_id = tracked(tmp_path, "projection=zy", agent=GUESSER, **ON_FILES)
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(wrists, elsewhere / "wrists")
+    manifest = yaml.safe_load((wrists / "manifest.yaml").read_text())
+    (elsewhere / "wrists" / "manifest.yaml").write_text(yaml.safe_dump(swapped(manifest)))
+    words = [f"run={run_id}", "episodes=2", f"tracking=sqlite:///{tmp_path}/mlruns.db", "out=a.json"]
+    code, _, errors = answer(*words, cwd=elsewhere)
+    assert (code, errors) == (0, "")
+    assert list(json.loads((elsewhere / "a.json").read_text())["volumes"]["test volumes"]) == manifest["splits"]["test"]
+    wrists.rename(tmp_path / "away")
+    code, _, errors = answer(*words, cwd=elsewhere)
+    assert code == 2
     assert errors.startswith(
-        "error: the reward is fitted to the volumes that the agent was trained on, but they cannot"
+        f"error: the volumes of run {run_id} cannot be read: {wrists}: the folder of volumes does not"
     )
+    assert f"it was started in {tmp_path}" in errors
 
 
-def tracked_on_files(folder, reward, data):
-    """Tracks a run on files that are gone afterwards."""
-    few, FEW[:] = list(FEW), ["env.max_steps=4"]
-    try:
-        run_id = tracked(folder, f"reward={reward}", *data, kept=("best.pt",))
-        config = yaml.safe_load((folder / "config.yaml").read_text())
-        config["data"]["path"] = str(folder / "gone")
-        (folder / "config.yaml").write_text(yaml.safe_dump(config))
-        client = MlflowClient(f"sqlite:///{folder}/mlruns.db")
-        client.log_artifact(run_id, str(folder / "config.yaml"))
-    finally:
-        FEW[:] = few
-    return run_id
+@pytest.mark.parametrize("reward", ["published", "agreement"])
+def test_own_volumes_that_have_changed_are_refused_where_they_matter(answer, tmp_path, wrists, reward):
+    run_id = tracked(tmp_path, f"reward={reward}", "projection=zy", agent=GUESSER, **ON_FILES)
+    manifest = yaml.safe_load((wrists / "manifest.yaml").read_text())
+    (wrists / "manifest.yaml").write_text(yaml.safe_dump(swapped(manifest)))
+    line = f"the training volumes are not those that run {run_id} was started with: "
+    code, _, errors = answer(f"run={run_id}", "episodes=2")
+    assert code == 2
+    assert errors.startswith(f"error: {line}")
+    code, printed, errors = answer(f"run={run_id}", "data=wrists", "episodes=4")
+    if reward == "agreement":
+        assert code == 2
+        assert errors.startswith(
+            "error: the reward is fitted to the volumes that the agent was trained on, but they are"
+        )
+        assert line in errors
+    else:
+        assert (code, errors) == (0, "")
+        known = ", ".join(manifest["splits"]["train"])
+        assert f"note: the agent was trained on these volumes: {known}\n" in printed
+
+
+def test_volumes_of_the_training_are_known_under_other_names_and_others_under_theirs(answer, tmp_path, wrists):
+    run_id = tracked(tmp_path, agent=GUESSER, **ON_FILES)
+    manifest = yaml.safe_load((wrists / "manifest.yaml").read_text())
+    one, _, third, last = manifest["volumes"]
+    copies = tmp_path / "copies"
+    copies.mkdir()
+    # One of the training under another name, and one of the test under that of the validation.
+    for name, copy in {one: "copy.nii.gz", last: third}.items():
+        shutil.copy(wrists / name, copies / copy)
+    entries = {"copy.nii.gz": manifest["volumes"][one], third: manifest["volumes"][last]}
+    (copies / "manifest.yaml").write_text(yaml.safe_dump({"volumes": entries}))
+    code, printed, errors = answer(f"run={run_id}", "data=copies", "episodes=2")
+    assert (code, errors) == (0, "")
+    assert f"note: the agent was trained on these volumes: copy.nii.gz (there {one})\n" in printed
+    assert f"note: the agent's checkpoint was chosen on other volumes of these names: {third}\n" in printed
+
+
+def test_run_without_fingerprints_is_evaluated_with_a_note(answer, tmp_path):
+    run_id = tracked(tmp_path, agent=GUESSER, kept=("config.yaml",))
+    code, printed, _ = answer(f"run={run_id}", "episodes=1")
+    assert code == 0
+    assert "note: the run has not kept fingerprints of its volumes" in printed
+    code, printed, _ = answer(f"run={run_id}", "data=phantoms", "phantoms=1", "episodes=1")
+    assert code == 0
+    assert "fingerprints" not in printed
 
 
 def test_baselines_are_evaluated_by_their_run_or_by_name(answer, tmp_path, phantom):
-    run_id = tracked(tmp_path, "projection=zy", agent=GUESSER, kept=("config.yaml",))
+    run_id = tracked(tmp_path, "projection=zy", agent=GUESSER)
     assert answer(f"run={run_id}", "data=phantoms", "phantoms=2", "episodes=2", "out=run.json")[0] == 0
     words = ["agent=sac", "~agent.network", "agent._target_=tests.test_evaluate.GuesserOfAnything", "projection=zy"]
     code, _, errors = answer(*words, "data=phantoms", "phantoms=2", "episodes=2", "max_steps=50", "out=agent.json")
@@ -240,6 +311,23 @@ def test_baselines_are_evaluated_by_their_run_or_by_name(answer, tmp_path, phant
     assert by_name["of"] == "sac"
     tags = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db").get_run(by_name["tracked_as"]).data.tags
     assert "mlflow.parentRunId" not in tags
+
+
+def test_baseline_takes_a_preset_as_a_run_does_and_an_experiment_of_mlflow(answer, tmp_path):
+    words = [
+        "agent=random",
+        "experiment=best_full",
+        "data=phantoms",
+        "phantoms=1",
+        "episodes=1",
+        "tracking_experiment=x",
+    ]
+    code, _, errors = answer(*words)
+    assert (code, errors) == (0, "")
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    (run,) = client.search_runs([client.get_experiment_by_name("x").experiment_id])
+    assert run.data.params["projection"] == "full"
+    assert run.data.params["agent._target_"] == "armscan.agents.Random"
 
 
 class GuesserOfAnything(Guesser):
@@ -258,15 +346,47 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         (["run=xyz"], "the run is 'xyz', but it must be an id as MLflow shows it"),
         (["run=ffffffff"], "the run is 'ffffffff', but no run of sqlite:///"),
         ([f"run={run_id}", "tracking=sqlite:///no.db"], "tracking.uri is 'sqlite:///no.db', but there is no "),
-        ([f"run={run_id}", "data=/nowhere"], "/nowhere: the folder of volumes does not exist"),
+        ([f"run={run_id}", "data=/nowhere"], "data is '/nowhere', but there is no such folder: it must be "),
+        (["agent=random", "data=phantom"], "data is 'phantom', but there is no such folder: it must be a folder of "),
+        (
+            ["agent=random", f"data={data_folder}", "data.n_test=1"],
+            "there is no key 'n_test' in data, but only path, validation, test or split_seed",
+        ),
         ([f"run={run_id}", "episodes=0"], "episodes is 0, but it must be a whole number of at least 1"),
         ([f"run={run_id}", f"data={data_folder}", "episodes=3"], "episodes, of which each of 4 volumes is to have one"),
         ([f"run={run_id}", "seed=-1"], "seed is -1, but it must be a whole number of at least 0"),
         ([f"run={run_id}", "phantoms=3"], "phantoms is 3, but it is for data=phantoms"),
-        ([f"run={run_id}", "experiment=x"], "experiment is for agent=NAME"),
+        ([f"run={run_id}", "experiment=x"], "experiment is a preset, for agent=NAME"),
+        (
+            ["agent=random", "experiment=best_zy", "data=phantoms"],
+            "experiment sets agent.final_lr_share, but the agent",
+        ),
+        ([f"run={run_id}", "tracking_experiment=x"], "tracking_experiment is for agent=NAME"),
+        (["agent=random", "experiment=x"], "experiment is 'x', but it must be best_full, "),
+        (
+            [f"run={run_id}", "tracking.uri=x"],
+            "tracking.uri is of armscan.run, and not read by an evaluation: give tra",
+        ),
+        (
+            ["agent=random", "+tracking.uri=x"],
+            "tracking.uri is of armscan.run, and not read by an evaluation: give tra",
+        ),
+        (["agent=random", "tracking.artifacts=x"], "tracking.artifacts is of armscan.run, and not read by"),
+        (["agent=random", "evaluation.episodes=5", "episodes=2"], "evaluation.episodes is of armscan.run, and not"),
+        (["agent=random", "env.delta=0.01", "delta=0.5"], "delta and env.delta are both given, but they are one value"),
+        (["agent=random", "data.path=a", f"data={data_folder}"], "data and data.path are both given"),
         ([f"run={run_id}", "delta=7"], "delta is 7, but it must be a finite number above 0 and at most 1"),
         ([f"run={run_id}", "device=tpu"], "device is 'tpu', but it must be auto, cpu or cuda"),
         ([f"run={run_id}", "out=/dev/null/x.json"], "out is '/dev/null/x.json', but no file can be written there"),
+        (
+            [f"run={run_id}", "episodes=1", "out=/proc/x.json"],
+            "out is '/proc/x.json', but no file can be written there: ",
+        ),
+        ([f"run={run_id}", "episodes=1", "out=."], "out is '.', but no file can be written there: Is a directory"),
+        *(
+            ([f"run={run_id}", "episodes=1", f"out={name}"], f"out is '{name}', but that file is no evaluation, and")
+            for name in ("config.yaml", "volumes.json")
+        ),
         (["agent=nobody"], "agent is 'nobody', but it must be "),
         (["agent=sac", *FEW], "sac has to be trained first: give run=ID"),
         (["agent=sac", "projection=q", *FEW], "projection is 'q', but it must be x, y"),
@@ -281,21 +401,69 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
     assert len(runs_in(tmp_path)[1]) == 1
 
 
-def test_runs_that_have_kept_too_little_or_damage_are_refused(answer, tmp_path):
+def test_runs_that_have_kept_too_little_are_refused_with_what_to_do(answer, tmp_path):
     run_id = tracked(tmp_path, kept=())
-    assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id} has kept no config.yaml: it is FINISHED")
-    run_id = tracked(tmp_path, kept=("config.yaml",))
+    assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id} has no config.yaml among its artifacts, as each")
+    run_id = tracked(tmp_path, kept=("config.yaml", "volumes.json"))
     assert answer(f"run={run_id}")[2] == (
         f"error: run {run_id} has kept no checkpoint, so that there is nothing to evaluate"
     )
     client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
-    whole = (tmp_path / "best.pt").read_bytes()
-    (tmp_path / "best.pt").write_bytes(whole[: len(whole) // 2])
+    for status, ended in (("KILLED", "ended before its time (KILLED)"), ("RUNNING", "is still running, or was killed")):
+        client.update_run(run_id, status=status)
+        assert answer(f"run={run_id}")[2] == (
+            f"error: run {run_id} {ended}, and a run keeps its checkpoint in the store at its end: go on with it by "
+            f"python -m armscan.run resume={run_id}"
+        )
+
+
+def with_nan(weights, facts):
+    name = next(iter(weights))
+    return weights | {name: weights[name] * float("nan")}, facts
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (
+            lambda weights, facts: (weights, facts | {"run_id": "5f"}),
+            "best.pt: is a checkpoint of run '5f', but this is",
+        ),
+        (
+            lambda weights, facts: (weights, facts | {"reports": "[]"}),
+            "best.pt: holds all of a training, as last.pt does",
+        ),
+        (lambda weights, facts: ({"other": 1}, facts), "the checkpoint is another agent's or network's"),
+        (lambda weights, facts: ([1], facts), "best.pt: holds no weights"),
+        (with_nan, "best.pt: holds weights that are not finite, in "),
+    ],
+)
+def test_checkpoints_that_are_none_of_the_run_are_refused_before_anything_is_tracked(answer, tmp_path, change, line):
+    run_id = tracked(tmp_path)
+    save_checkpoint(tmp_path / "best.pt", *change(*load_checkpoint(tmp_path / "best.pt")))
+    client, runs = runs_in(tmp_path)
     client.log_artifact(run_id, str(tmp_path / "best.pt"))
-    assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id}: best.pt: is damaged")
-    save_checkpoint(tmp_path / "best.pt", {"other": 1}, {})
-    client.log_artifact(run_id, str(tmp_path / "best.pt"))
-    assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id}: the checkpoint is another agent's or network's")
-    (tmp_path / "config.yaml").write_text("a: [")
-    client.log_artifact(run_id, str(tmp_path / "config.yaml"))
-    assert answer(f"run={run_id}")[2] == f"error: run {run_id}: its config.yaml is damaged"
+    code, _, errors = answer(f"run={run_id}")
+    assert code == 2
+    assert errors.startswith(f"error: run {run_id}: {line}")
+    assert len(errors) < 350
+    assert len(runs_in(tmp_path)[1]) == len(runs)
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "volumes.json", "best.pt"])
+def test_artifacts_that_were_changed_are_refused(answer, tmp_path, name):
+    run_id = tracked(tmp_path)
+    contents = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(contents.replace(b"0", b"1"))
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    client.log_artifact(run_id, str(tmp_path / name))
+    what = "best.pt: is damaged" if name == "best.pt" else f"its {name} is not the one that it was started with"
+    assert answer(f"run={run_id}")[2].startswith(f"error: run {run_id}: {what}")
+
+
+@pytest.mark.parametrize(("text", "what"), [("a: [", "is damaged"), ("3", "holds no configuration")])
+def test_configuration_without_a_sum_must_still_be_one(answer, tmp_path, text, what):
+    run_id = tracked(tmp_path, kept=())
+    (tmp_path / "config.yaml").write_text(text)
+    MlflowClient(f"sqlite:///{tmp_path}/mlruns.db").log_artifact(run_id, str(tmp_path / "config.yaml"))
+    assert answer(f"run={run_id}")[2] == f"error: run {run_id}: its config.yaml {what}"

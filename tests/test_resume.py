@@ -1,7 +1,9 @@
 """Runs that are killed, at any moment, and go on: real processes, ended by the system's own kill -9."""
 
+import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +16,7 @@ from mlflow import MlflowClient
 
 import armscan
 from armscan.errors import FolderInUseError
-from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, held, write_whole
+from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, held, write_whole
 from armscan.tracking import open_store
 from armscan.training import load_checkpoint
 
@@ -25,6 +27,7 @@ PPO = [*(each for each in LONGER if not each.startswith("agent.random")), "agent
 PPO += ["agent.env_steps_per_collection=100"]
 IMAGES = [*(each for each in LONGER if not each.startswith("network")), "obs=slice_channels", "obs.shape=[36,36]"]
 IMAGES += ["network=multimodal", "network.filters=[2,2,2]", "network.vector_sizes=[8]", "network.head_sizes=[8]"]
+TWO = ("00001_labels.nii.gz", "00002_labels.nii.gz")
 COMMAND = ["-m", "armscan.run"]
 # The same, but every checkpoint stays unfinished for a while.
 SLOWLY_WRITTEN = """
@@ -286,7 +289,7 @@ def test_resume_refuses_a_run_of_something_else(answer, cut_off):
     assert "it is none of armscan.run" in refused(answer, f"resume={run_id}")
 
 
-def test_resume_refuses_a_damaged_checkpoint_and_leaves_the_run_as_it_is(answer, tmp_path):
+def test_resume_refuses_a_checkpoint_that_is_damaged_or_gone_and_leaves_the_run_as_it_is(answer, tmp_path):
     assert answer(*SMALL)[0] == 0
     client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path}/mlruns.db")
     (run,) = runs_in(tmp_path)[1]
@@ -295,12 +298,36 @@ def test_resume_refuses_a_damaged_checkpoint_and_leaves_the_run_as_it_is(answer,
     contents = last.read_bytes()
     last.write_bytes(contents[:-1])
     assert f"{last}: is damaged" in refused(answer, f"resume={run.info.run_id}")
+    last.unlink()
+    assert f"{last}: there is no such checkpoint any more, but run" in refused(answer, f"resume={run.info.run_id}")
     assert client.get_run(run.info.run_id).info.status == "KILLED"
     # A run that was killed when all but the closing was done; its figures stand already.
     last.write_bytes(contents)
     assert answer(f"resume={run.info.run_id}")[0] == 0
     assert client.get_run(run.info.run_id).info.status == "FINISHED"
     assert len(client.get_metric_history(run.info.run_id, "test_volumes/mean_steps")) == 1
+
+
+def test_resume_refuses_other_volumes_where_there_is_no_checkpoint(answer, tmp_path, data_folder):
+    shutil.copytree(data_folder, tmp_path / "wrists")
+    few = [word for word in SMALL if not word.startswith(("agent.", "network", "data."))]
+    assert answer("agent=random", "data=nifti", "data.path=wrists", f"data.test=[{TWO[0]}]", *few)[0] == 0
+    client, (run,) = runs_in(tmp_path)
+    client.set_terminated(run.info.run_id, "KILLED")
+    word, record = f"resume={run.info.run_id}", Path(run.data.tags["folder"]) / VOLUMES_FILE
+    kept = record.read_bytes()
+    record.write_bytes(kept.replace(b"00001_labels", b"00009_labels"))
+    assert f"{record}: is not the record of its volumes that run" in refused(answer, word)
+    record.write_bytes(kept)
+    # Two wrists, each with its plane, exchange their names, and with them the splits.
+    manifest = tmp_path / "wrists" / "optimal_actions.json"
+    entries = json.loads(manifest.read_text())
+    for name, other in (TWO, TWO[::-1]):
+        shutil.copy(data_folder / name, tmp_path / "wrists" / other)
+    manifest.write_text(json.dumps(entries | {TWO[0]: entries[TWO[1]], TWO[1]: entries[TWO[0]]}))
+    line = f"volumes are not those that run {run.info.run_id} was started with: "
+    assert line in refused(answer, word)
+    assert client.get_run(run.info.run_id).info.status == "KILLED"
 
 
 def test_folder_is_free_again_when_its_process_was_killed(tmp_path):

@@ -68,7 +68,9 @@ def test_run_trains_evaluates_and_tracks(tmp_path):
     assert steps == sorted(set(steps))
     assert steps[-1] >= 400
     artifacts = {file.path for file in client.list_artifacts(tracked.info.run_id)}
-    assert artifacts == {"best.pt", "last.pt", "config.yaml", "episode.gif", "evaluation.json", "learning_curve.png"}
+    assert artifacts == {
+        *("best.pt", "last.pt", "config.yaml", "volumes.json", "episode.gif", "evaluation.json", "learning_curve.png")
+    }
     (folder,) = (tmp_path / "outputs").glob("*/*")
     evaluation = json.loads((folder / "evaluation.json").read_text())
     assert len(evaluation["test volumes"]["episodes"]) == 3
@@ -116,7 +118,7 @@ def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_pat
         assert child.info.run_name == f"{child.data.tags['choice.agent']}-cluster-zy-phantom-seed0"
         assert {"training_volumes/success_rate", "test_volumes/mean_distance_deg"} <= child.data.metrics.keys()
         artifacts = {file.path for file in client.list_artifacts(child.info.run_id)}
-        assert artifacts == {"config.yaml", "episode.gif", "evaluation.json"}
+        assert artifacts == {"config.yaml", "volumes.json", "episode.gif", "evaluation.json"}
 
 
 def test_run_on_labelmap_files(tmp_path, data_folder):

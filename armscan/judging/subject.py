@@ -15,18 +15,12 @@ from omegaconf import DictConfig, OmegaConf
 from armscan.building import check_sections
 from armscan.errors import CheckpointError, InvalidValueError
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
+from armscan.settings import CHANGES
 from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, found_run
-from armscan.training import Familiar, load_checkpoint
+from armscan.training import Familiar, Fingerprints, Origin, load_weights
 
-# Where a change of the rules goes in the configuration.
-CHANGES = {
-    "delta": "env.delta",
-    "max_steps": "env.max_steps",
-    "start": "env.start",
-    "clustering": "env.clustering",
-    "judged_by_sampling": "agent.judged_by_sampling",
-    "device": "compute.device",
-}
+# Files and folders that the section `data` names.
+PATHS = ("path", "cache_dir")
 
 
 @dataclass(frozen=True)
@@ -40,6 +34,7 @@ class Subject:
         weights: of a learner, None where it has kept none.
         n_env_steps: that it was trained for.
         familiar: what it was trained on, None where that was not kept.
+        volumes: the fingerprints of its run's volumes, None where these were not kept.
     """
 
     name: str
@@ -48,6 +43,7 @@ class Subject:
     weights: dict[str, Any] | None = field(default=None, repr=False)
     n_env_steps: int = 0
     familiar: Familiar | None = None
+    volumes: Fingerprints | None = field(default=None, repr=False)
 
 
 def subject_of_run(tracking: str, run_id: str, changes: Mapping[str, Any]) -> Subject:
@@ -60,23 +56,25 @@ def subject_of_run(tracking: str, run_id: str, changes: Mapping[str, Any]) -> Su
     if EVALUATED_TAG in run.tags:
         raise InvalidValueError(f"run is {run_id!r}, but that is an evaluation, of {run.tags[EVALUATED_TAG]}")
     with tempfile.TemporaryDirectory() as folder:
-        config = changed(OmegaConf.create(run.config(Path(folder))), changes)
+        config = _from_its_folder(changed(OmegaConf.create(run.config(Path(folder))), changes), run.tags)
         weights, facts = _weights(run, Path(folder))
+        # Of learners that were trained before runs kept them, the checkpoint has them.
+        volumes = run.volumes(Path(folder)) or facts.get("volumes") or None
     familiar = Familiar.from_json(run.tags[FAMILIAR_TAG]) if FAMILIAR_TAG in run.tags else None
-    return Subject(run.name, config, run, weights, int(facts.get("n_env_steps", 0)), familiar)
+    return Subject(run.name, config, run, weights, int(facts.get("n_env_steps", 0)), familiar, volumes)
 
 
 def subject_of_words(words: Sequence[str], folder: str | None, changes: Mapping[str, Any]) -> Subject:
     """Returns the agent of a configuration, composed as `python -m armscan.run` composes it.
 
     Args:
-        words: `key=value`, `agent=NAME` among them.
+        words: `key=value`, `agent=NAME` among them, and `data=nifti` where there is a folder.
         folder: of the volumes that it is evaluated on, which are its own then; None for those of the configuration.
         changes: of the rules.
     """
     GlobalHydra.instance().clear()
     with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
-        config = compose(CONFIG_NAME, [*words, *(["data=nifti"] if folder else [])])
+        config = compose(CONFIG_NAME, list(words))
     if folder:
         config.data.path = folder
     OmegaConf.resolve(config)
@@ -99,15 +97,22 @@ def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
     return config
 
 
+def _from_its_folder(config: DictConfig, tags: Mapping[str, str]) -> DictConfig:
+    """Returns a run's configuration with the files of its data named from anywhere, not from where it was started."""
+    for key in PATHS:
+        if isinstance(path := config.data.get(key), str) and "working_folder" in tags:
+            config.data[key] = str(Path(tags["working_folder"], path))
+    return config
+
+
 def _weights(run: FoundRun, folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
     path = run.checkpoint(folder)
     if path is None:
         return None, {}
     try:
-        weights, facts = load_checkpoint(path)
+        weights, facts = load_weights(path)
+        Origin(run_id=run.run_id).check(path, facts)
     except CheckpointError as error:
         # The file lies in a folder that is gone when this is read.
         raise CheckpointError(f"run {run.run_id}: {str(error).replace(str(path), path.name)}") from error
-    if not isinstance(weights, dict) or not isinstance(facts, dict):
-        raise CheckpointError(f"run {run.run_id}: {path.name} holds no weights")
     return weights, facts

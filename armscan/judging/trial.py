@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from textwrap import shorten
 
 from omegaconf import DictConfig
 
@@ -14,6 +15,8 @@ from armscan.envs import EnvMaker
 from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed
 from armscan.judging.subject import Subject
 from armscan.judging.volumes import Volumes
+from armscan.settings import resume_command
+from armscan.tracking import FoundRun
 from armscan.training import Evaluation, Familiar, evaluate
 from armscan.training.evaluation import Env
 from armscan.training.familiar import smallest_slice
@@ -22,6 +25,7 @@ from armscan.volumes import LabelVolume
 # First seed of an evaluation's episodes: none of them is played by a run, whose seeds lie below.
 FIRST_SEED = 5 * 10**6
 PIXEL_TOLERANCE = 0.1
+MAX_REASON_CHARS = 250
 
 
 @dataclass(frozen=True)
@@ -110,8 +114,19 @@ def _load_weights(agent: Agent, subject: Subject) -> None:
     if subject.run is None:
         raise InvalidValueError(f"{subject.name} has to be trained first: give run=ID of a run that has trained one")
     if subject.weights is None:
-        raise CheckpointError(f"run {subject.run.run_id} has kept no checkpoint, so that there is nothing to evaluate")
+        raise CheckpointError(_without_checkpoint(subject.run))
     try:
         agent.load_weights(subject.weights)
     except CheckpointError as error:
-        raise CheckpointError(f"run {subject.run.run_id}: {error}") from error
+        # torch lists every name that it misses, and every one that it does not know.
+        raise CheckpointError(f"run {subject.run.run_id}: {shorten(str(error), MAX_REASON_CHARS)}") from error
+
+
+def _without_checkpoint(run: FoundRun) -> str:
+    if run.status == "FINISHED":
+        return f"run {run.run_id} has kept no checkpoint, so that there is nothing to evaluate"
+    ended = "is still running, or was killed" if run.status == "RUNNING" else f"ended before its time ({run.status})"
+    return (
+        f"run {run.run_id} {ended}, and a run keeps its checkpoint in the store at its end: go on with it by "
+        f"{resume_command(run.run_id, run.uri)}"
+    )

@@ -2,28 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
 from hydra.utils import instantiate
-from omegaconf import DictConfig
 
 from armscan.errors import InvalidValueError
+from armscan.judging.subject import Subject
 from armscan.mistakes import mistake_in_one_line
-from armscan.training import TEST, TRAINING, VALIDATION, Split
+from armscan.training import TEST, TRAINING, VALIDATION, Split, check_unchanged, fingerprint
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 
 PHANTOMS = "phantoms"
+PARTS = ("training", "validation", "test")
 # No phantom of a run has these seeds: its test phantoms begin a million below.
 PHANTOMS_FIRST_SEED = 3_000_000
 Volumes = dict[str, LabelVolume]
 
 
-def own_split(config: DictConfig) -> Split:
-    """Reads the volumes that a configuration describes."""
-    split: Split = instantiate(config.data, _convert_="object")
+def own_split(subject: Subject, parts: Sequence[str] = PARTS) -> Split:
+    """Reads an agent's own volumes: those that its configuration describes.
+
+    Args:
+        subject: the agent.
+        parts: of the split that matter: in these the volumes of a run must still be those that it was started with.
+
+    Raises:
+        ChangedVolumesError: if they are not.
+        InvalidValueError: if they cannot be read.
+    """
+    run = subject.run
+    try:
+        split: Split = instantiate(subject.config.data, _convert_="object")
+    # Hydra wraps whatever is raised while it builds.
+    except Exception as error:
+        line = mistake_in_one_line(error)
+        if run is None or line is None:
+            raise
+        raise InvalidValueError(
+            f"the volumes of run {run.run_id} cannot be read: {line} (it was started in "
+            f"{run.tags.get('working_folder', 'a folder that was not kept')} on {run.tags.get('host', 'some host')})"
+        ) from error
+    if run is not None and subject.volumes is not None:
+        now = {part: prints for part, prints in split.fingerprints().items() if part in parts}
+        check_unchanged(subject.volumes, now, f"run {run.run_id} was started with")
     return split
 
 
@@ -50,22 +74,31 @@ def data_name(data: str | None) -> str:
     return "own volumes" if data is None else Path(data).resolve().name
 
 
-def known_volumes(tags: Mapping[str, str], groups: Mapping[str, Volumes]) -> list[str]:
-    """Returns a sentence for each purpose that a run has had volumes of these names for.
+def known_volumes(subject: Subject, groups: Mapping[str, Volumes]) -> list[str]:
+    """Returns a sentence for each purpose that an agent's run has had these volumes for, or others of these names.
 
     Args:
-        tags: of the run.
+        subject: the agent of a run.
         groups: the volumes, by what they are called.
     """
-    names = [name for volumes in groups.values() for name in volumes]
+    assert subject.run is not None
+    volumes = {name: volume for group in groups.values() for name, volume in group.items()}
+    prints = {name: fingerprint(volume) for name, volume in volumes.items()} if subject.volumes else {}
     notes = []
     for part, what in (
         ("training", "the agent was trained on"),
         ("validation", "the agent's checkpoint was chosen on"),
     ):
-        had = tags.get(f"volumes.{part}", "").split(" ")
-        if known := [name for name in names if name in had]:
-            notes.append(f"{what} volumes of these names: {', '.join(known)}")
+        had = (subject.volumes or {}).get(part, {})
+        names_of = {print_: name for name, print_ in had.items()}
+        same = {name: names_of[print_] for name, print_ in prints.items() if print_ in names_of}
+        if same:
+            shown = (name if name == there else f"{name} (there {there})" for name, there in same.items())
+            notes.append(f"{what} these volumes: {', '.join(shown)}")
+        names = had or subject.run.tags.get(f"volumes.{part}", "").split(" ")
+        if others := [name for name in volumes if name in names and name not in same]:
+            which = "other volumes" if had else "volumes"
+            notes.append(f"{what} {which} of these names: {', '.join(others)}")
     return notes
 
 
@@ -89,7 +122,7 @@ class TrainingVolumes(Mapping[str, LabelVolume]):
             if line is None:
                 raise
             raise InvalidValueError(
-                f"the reward is fitted to the volumes that the agent was trained on, but they cannot be read: {line}"
+                f"the reward is fitted to the volumes that the agent was trained on, but they are not to be had: {line}"
             ) from error
 
     def __getitem__(self, name: str) -> LabelVolume:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from dataclasses import dataclass, field
@@ -13,8 +14,9 @@ from mlflow import MlflowClient
 from mlflow.entities import Run
 
 from armscan.errors import TrackingError, listed
-from armscan.files import BEST_CHECKPOINT, CONFIG_FILE
+from armscan.files import BEST_CHECKPOINT, CONFIG_FILE, SUM_TAGS, VOLUMES_FILE, sum_of
 from armscan.tracking.store import open_existing_store, usable_store
+from armscan.training import Fingerprints
 
 # What a run's agent was trained on, as `armscan.training.Familiar` writes it.
 FAMILIAR_TAG = "trained_on"
@@ -53,11 +55,11 @@ class FoundRun:
         """Returns the resolved configuration; `folder` takes the file.
 
         Raises:
-            TrackingError: if the run has kept none, or it is damaged.
+            TrackingError: if the run has kept none, it is damaged, or not the one that the run was started with.
         """
         try:
-            config = yaml.safe_load(self._fetched(CONFIG_FILE, folder).read_text())
-        except (UnicodeDecodeError, yaml.YAMLError) as error:
+            config = yaml.safe_load(self._started_with(CONFIG_FILE, folder))
+        except yaml.YAMLError as error:
             raise TrackingError(f"run {self.run_id}: its {CONFIG_FILE} is damaged") from error
         if not isinstance(config, dict):
             raise TrackingError(f"run {self.run_id}: its {CONFIG_FILE} holds no configuration")
@@ -67,12 +69,31 @@ class FoundRun:
         """Returns the best checkpoint, fetched into `folder`; None where the run has kept none."""
         return self._fetched(BEST_CHECKPOINT, folder) if BEST_CHECKPOINT in self.files else None
 
-    def _fetched(self, file: str, folder: Path) -> Path:
+    def volumes(self, folder: Path) -> Fingerprints | None:
+        """Returns the fingerprints of its volumes; None where the run was made before these were kept.
+
+        Raises:
+            TrackingError: if they are gone, or not those that the run was started with.
+        """
+        if SUM_TAGS[VOLUMES_FILE] not in self.tags:
+            return None
+        volumes: Fingerprints = json.loads(self._started_with(VOLUMES_FILE, folder))
+        return volumes
+
+    def _started_with(self, file: str, folder: Path) -> bytes:
         if file not in self.files:
             raise TrackingError(
-                f"run {self.run_id} has kept no {file}: it is {self.status}, and only a run that has come to its "
-                "end can be evaluated"
+                f"run {self.run_id} has no {file} among its artifacts, as each run of armscan.run has from its start: "
+                "it was removed, or this is the parent of a multirun, or something else"
             )
+        contents = self._fetched(file, folder).read_bytes()
+        if sum_of(contents) != self.tags.get(SUM_TAGS[file], sum_of(contents)):
+            raise TrackingError(
+                f"run {self.run_id}: its {file} is not the one that it was started with: changed, or another run's"
+            )
+        return contents
+
+    def _fetched(self, file: str, folder: Path) -> Path:
         with usable_store(self.uri):
             return Path(self.client.download_artifacts(self.run_id, file, str(folder)))
 

@@ -2,13 +2,14 @@
 
 from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
-from armscan.training.checkpoint import load_checkpoint, save_checkpoint
+from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from armscan.training.course import Origin, take_up
 from armscan.training.data import Split, mixed_data, nifti_data, phantom_data
 from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Evaluation, evaluate
 from armscan.training.familiar import Familiar
 from armscan.training.figures import Figures
 from armscan.training.film import film_episode
+from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
 
 __all__ = [
@@ -24,13 +25,17 @@ __all__ = [
     "Evaluation",
     "Familiar",
     "Figures",
+    "Fingerprints",
     "Origin",
     "SolvedCriterion",
     "Split",
     "TrainingResult",
+    "check_unchanged",
     "evaluate",
     "film_episode",
+    "fingerprint",
     "load_checkpoint",
+    "load_weights",
     "mixed_data",
     "nifti_data",
     "phantom_data",

@@ -68,6 +68,26 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         ) from error
 
 
+def load_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Reads a checkpoint that holds weights alone, as `best.pt` does.
+
+    Returns:
+        The weights by name, and the facts beside them.
+
+    Raises:
+        CheckpointError: as `load_checkpoint` does, or if it holds something else, or weights that are not finite.
+    """
+    weights, facts = load_checkpoint(path)
+    if not isinstance(weights, dict) or not isinstance(facts, dict):
+        raise CheckpointError(f"{path}: holds no weights")
+    if "reports" in facts:
+        raise CheckpointError(f"{path}: holds all of a training, as last.pt does, not the weights of its best epoch")
+    for name, weight in weights.items():
+        if isinstance(weight, torch.Tensor) and not torch.isfinite(weight).all():
+            raise CheckpointError(f"{path}: holds weights that are not finite, in {name}")
+    return weights, facts
+
+
 def _header(digest: str) -> bytes:
     return MAGIC + f"{FORMAT} {digest}\n".encode()
 

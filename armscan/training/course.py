@@ -19,6 +19,7 @@ from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
 from armscan.training.evaluation import Episode, Evaluation
+from armscan.training.fingerprints import Fingerprints, check_unchanged
 
 EPISODE_FIELDS = tuple(each.name for each in fields(Episode))
 
@@ -33,31 +34,24 @@ class Origin:
     """
 
     run_id: str = ""
-    volumes: dict[str, dict[str, str]] = field(default_factory=dict)
+    volumes: Fingerprints = field(default_factory=dict)
 
     def facts(self) -> dict[str, Any]:
         """Returns what stands in a checkpoint."""
         return {"run_id": self.run_id, "volumes": self.volumes}
 
     def check(self, path: Path, facts: dict[str, Any]) -> None:
-        """Raises `CheckpointError` where a checkpoint comes from something else."""
+        """Checks that a checkpoint comes from this.
+
+        Raises:
+            CheckpointError: if it is another run's.
+            ChangedVolumesError: if it is of other volumes.
+        """
         if facts.get("run_id") != self.run_id:
             raise CheckpointError(
                 f"{path}: is a checkpoint of run {facts.get('run_id')!r}, but this is {self.run_id!r}"
             )
-        for part, now in self.volumes.items():
-            then = facts.get("volumes", {}).get(part, {})
-            changes = {
-                "not there any more": then.keys() - now.keys(),
-                "new": now.keys() - then.keys(),
-                "changed": {name for name in then.keys() & now.keys() if then[name] != now[name]},
-            }
-            for change, names in changes.items():
-                if names:
-                    raise CheckpointError(
-                        f"the {part} volumes are not those that {path} was trained with: {', '.join(sorted(names))} "
-                        f"{'is' if len(names) == 1 else 'are'} {change}"
-                    )
+        check_unchanged(facts.get("volumes", {}), self.volumes, f"{path} was trained with")
 
 
 def keep(learner: Learner, reports: Sequence[EpochReport], folder: Path, origin: Origin | None) -> None:
@@ -80,7 +74,8 @@ def take_up(learner: Learner, folder: Path, origin: Origin) -> list[EpochReport]
         The reports of the epochs so far, for `train`; none where there is no checkpoint yet.
 
     Raises:
-        CheckpointError: if a checkpoint is damaged, another run's, or of other volumes, or the best one is missing.
+        CheckpointError: if a checkpoint is damaged or another run's, or the best one is missing.
+        ChangedVolumesError: if a checkpoint is of other volumes.
     """
     last, best = folder / LAST_CHECKPOINT, folder / BEST_CHECKPOINT
     if not last.exists():

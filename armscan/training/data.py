@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 
 from armscan.checks import LARGEST_SEED, check_float, check_int, check_path, check_seed
 from armscan.errors import InvalidValueError, listed
+from armscan.training.fingerprints import Fingerprints, fingerprint
 from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 
@@ -54,21 +54,12 @@ class Split:
                     raise InvalidValueError(f"{name} is in {seen[name]} and in {part}, but it must be in one split")
                 seen[name] = part
 
-    def fingerprints(self) -> dict[str, dict[str, str]]:
-        """Returns a sum of each volume's contents, by split and name: where they are the same, so are the volumes."""
+    def fingerprints(self) -> Fingerprints:
+        """Returns a sum of each volume's contents, by split and name."""
         return {
-            part: {name: _fingerprint(volume) for name, volume in getattr(self, part).items()}
+            part: {name: fingerprint(volume) for name, volume in getattr(self, part).items()}
             for part in ("training", "validation", "test")
         }
-
-
-def _fingerprint(volume: LabelVolume) -> str:
-    """Returns the SHA-256 of all that an agent can notice of a volume: voxels, spacing and labelled plane."""
-    plane = volume.optimal_action
-    rest = (volume.shape, volume.spacing, None if plane is None else plane.to_array().tolist())
-    digest = hashlib.sha256(repr(rest).encode())
-    digest.update(volume.labels.data)
-    return digest.hexdigest()
 
 
 def phantom_data(

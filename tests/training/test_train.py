@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from armscan.errors import CheckpointError, InvalidValueError
+from armscan.errors import ChangedVolumesError, CheckpointError, InvalidValueError
 from armscan.training import (
     BEST_CHECKPOINT,
     LAST_CHECKPOINT,
@@ -243,7 +243,7 @@ def test_wall_time_goes_on_without_the_time_in_between(tmp_path, monkeypatch):
 )
 def test_take_up_refuses_what_comes_from_something_else(tmp_path, origin, message):
     gone_on(tmp_path)
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises((CheckpointError, ChangedVolumesError), match=message):
         take_up(ScriptedLearner(), tmp_path, dataclasses.replace(ORIGIN, **origin))
 
 

@@ -1,0 +1,47 @@
+"""Fingerprints of volumes: where they are the same, so are the volumes, whatever their files are called."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+
+from armscan.errors import ChangedVolumesError
+from armscan.volumes import LabelVolume
+
+# By split (training, validation, test) and the volume's name.
+Fingerprints = dict[str, dict[str, str]]
+
+
+def fingerprint(volume: LabelVolume) -> str:
+    """Returns the SHA-256 of all that an agent can notice of a volume: voxels, spacing and labelled plane."""
+    plane = volume.optimal_action
+    rest = (volume.shape, volume.spacing, None if plane is None else plane.to_array().tolist())
+    digest = hashlib.sha256(repr(rest).encode())
+    digest.update(volume.labels.data)
+    return digest.hexdigest()
+
+
+def check_unchanged(then: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], those_of: str) -> None:
+    """Checks that volumes are what they were.
+
+    Args:
+        then: the fingerprints as they were.
+        now: as they are, of the splits that matter.
+        those_of: what was done with them then, for the message: `run 7f was started with`.
+
+    Raises:
+        ChangedVolumesError: if a volume is new, gone, changed, or in another split.
+    """
+    for part, prints in now.items():
+        before = then.get(part, {})
+        changes = {
+            "not there any more": before.keys() - prints.keys(),
+            "new": prints.keys() - before.keys(),
+            "changed": {name for name in before.keys() & prints.keys() if before[name] != prints[name]},
+        }
+        for change, names in changes.items():
+            if names:
+                raise ChangedVolumesError(
+                    f"the {part} volumes are not those that {those_of}: {', '.join(sorted(names))} "
+                    f"{'is' if len(names) == 1 else 'are'} {change}"
+                )
