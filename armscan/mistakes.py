@@ -6,6 +6,7 @@ import logging
 import re
 import sys
 import warnings
+from importlib import resources
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
@@ -43,6 +44,8 @@ def mistake_in_one_line(error: BaseException) -> str | None:
             return _instantiation_mistake(error)
         case HydraException() | OmegaConfBaseException():
             return " ".join(str(error).split())
+        case ValueError() if _is_raised_by_hydra(error) and (emptied := _emptied_group()):
+            return f"{emptied} is None, but it must be {listed(_choices_of(emptied))}"
         case ValueError() if _is_raised_by_hydra(error):
             return " ".join(str(error).split())
         case OSError() if error.filename is not None:
@@ -100,8 +103,26 @@ def _instantiation_mistake(error: InstantiationException) -> str:
     if unexpected := re.search(r"unexpected keyword argument '(\w+)'.*full_key: (\S+)", text):
         key, parent = unexpected.groups()
         allowed = _keys_under(parent)
+        if key in allowed:
+            # The last of several choices gives the class, and all of them its arguments.
+            return (
+                f"{parent} is put together from several choices, of which the last has no key {key!r}: choose one, or "
+                "name several observations to be merged, as in env.observation=[cluster,slice]"
+            )
         return f"there is no key {key!r} in {parent}" + (f", but only {listed(allowed)}" if allowed else "")
     return f"{text} (HYDRA_FULL_ERROR=1 shows where)"
+
+
+def _emptied_group() -> str | None:
+    """The group that was given as null on the command line, if one was."""
+    groups = (word.removesuffix("=null") for word in sys.argv[1:] if word.endswith("=null"))
+    return next((group for group in groups if group.isidentifier() and _choices_of(group)), None)
+
+
+def _choices_of(group: str) -> list[str]:
+    """The choices of a group of the configuration, none where there is no such group."""
+    folder = resources.files(CONFIG_MODULE) / group
+    return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir()) if folder.is_dir() else []
 
 
 def _keys_under(parent: str) -> list[str]:

@@ -117,6 +117,11 @@ class RegressionLearner:
         """Environment steps taken so far."""
         return self._n_env_steps
 
+    @property
+    def env_steps_at_once(self) -> int:
+        """One for each environment."""
+        return self._envs.num_envs
+
     def warm_up(self) -> None:
         """Does nothing: every step is random, and the first slices can be learned from."""
 

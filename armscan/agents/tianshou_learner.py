@@ -77,6 +77,11 @@ class TianshouLearner:
         """Environment steps taken so far, the random ones included."""
         return int(self._collector.collect_step)
 
+    @property
+    def env_steps_at_once(self) -> int:
+        """Those of one collection."""
+        return int(self._trainer.params.collection_step_num_env_steps)
+
     def warm_up(self) -> None:
         """Fills the replay buffer with random steps."""
         self._begin_epoch()

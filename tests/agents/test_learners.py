@@ -39,6 +39,9 @@ def test_learner_counts_every_environment_step(make_learner):
     learner.learn(40)
     assert first + 40 <= learner.n_env_steps <= first + 60
     assert learner.learn(7)["speed/env_steps_per_s"] > 0
+    before = learner.n_env_steps
+    learner.learn(1)
+    assert learner.n_env_steps - before == learner.env_steps_at_once
 
 
 @pytest.mark.parametrize("algorithm", ["sac"], indirect=True)
