@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from armscan.agents import Agent, AgentSetup
 from armscan.checks import check_int, check_seed
 from armscan.envs import EnvMaker
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, listed
 from armscan.training import Budget, Split
 from armscan.training.familiar import smallest_slice, with_crops
 from armscan.volumes import LabelVolume
@@ -29,6 +29,8 @@ SECTIONS = (
     "evaluation",
     "compute",
 )
+SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
+EVALUATION_KEYS = ("episodes",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,8 +109,27 @@ def make_agent(
         seed=seed,
         compute=instantiate(config.compute, _convert_="object"),
     )
-    agent: Agent = instantiate(config.agent, _convert_="object").agent(setup)
+    algorithm = instantiate(config.agent, _convert_="object")
+    if not callable(getattr(algorithm, "agent", None)):
+        raise InvalidValueError(
+            f"agent is {algorithm!r}, but it must have the method of Algorithm, agent: give agent._target_ such a class"
+        )
+    agent: Agent = algorithm.agent(setup)
     return agent
+
+
+def check_keys(config: DictConfig) -> None:
+    """Raises `InvalidValueError` where a key was added that nothing reads.
+
+    Sections that objects are made of refuse such keys by themselves.
+    """
+    check_sections(config)
+    for node, where, allowed in (
+        (config, "at the top", (*SECTIONS, *SINGLE_KEYS)),
+        (config.evaluation, "in evaluation", EVALUATION_KEYS),
+    ):
+        if unread := [key for key in node if key not in allowed]:
+            raise InvalidValueError(f"there is no key {unread[0]!r} {where}, but only {listed(allowed)}")
 
 
 def check_sections(config: DictConfig) -> None:

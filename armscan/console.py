@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from armscan.multirun import Outcome
+from armscan.multirun import INTERRUPTED, Outcome
 from armscan.training import TEST, Callback, EpochReport, Evaluation
 
 RESULT_ROWS = (
@@ -120,7 +120,8 @@ def print_jobs(outcomes: Mapping[str, Outcome]) -> None:
     for number, outcome in outcomes.items():
         judged = outcome.figures.get(TEST, {})
         figures = [f"{judged['success_rate']:.1%}", f"{judged['mean_steps']:.2f}"] if judged else ["-", "-"]
-        table.add_row(number, outcome.varied, "failed" if outcome.is_failed else outcome.failure or "done", *figures)
+        ended = {None: "done", INTERRUPTED: INTERRUPTED}.get(outcome.failure, "failed")
+        table.add_row(number, outcome.varied, ended, *figures)
     Console().print(table)
 
 

@@ -22,7 +22,7 @@ from omegaconf import DictConfig
 
 import armscan
 from armscan.agents import Learner
-from armscan.building import Experiment, build
+from armscan.building import Experiment, build, check_keys
 from armscan.console import print_results, print_where_to_look, progress_reporter
 from armscan.files import (
     BEST_CHECKPOINT,
@@ -42,6 +42,7 @@ from armscan.tracking import FAMILIAR_TAG, TrackedRun, open_store
 from armscan.training import (
     TEST,
     TRAINING,
+    Budget,
     EpochReport,
     Evaluation,
     Familiar,
@@ -90,13 +91,25 @@ class Stage:
         torch.set_num_threads(1)
         experiment = build(config)
         maker, split = experiment.maker, experiment.split
-        return cls(
+        stage = cls(
             experiment=experiment,
             training_env=maker.one(split.training),
             validation_env=maker.one(split.validation),
             test_env=maker.one(split.test),
             film_env=maker.one(split.test, render_mode="rgb_array"),
         )
+        stage._check()
+        return stage
+
+    def _check(self) -> None:
+        """Raises `InvalidValueError` where the agent cannot act in one of the environments that it is judged in."""
+        envs = (self.training_env, self.validation_env, self.test_env)
+        for env in envs[1:]:
+            Familiar.of(self.training_env).check_observed(Familiar.of(env))
+        if not isinstance(self.experiment.agent, Learner):
+            # How many planes there are to go through depends on the sizes of the volumes.
+            for bounds in {bounds for env in envs for bounds in env.get_wrapper_attr("task").bounds.values()}:
+                self.experiment.agent.begin(seed=0, bounds=bounds)
 
     def origin(self, run_id: str) -> Origin:
         """Returns what the checkpoints of a run say that they come from."""
@@ -118,6 +131,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     Returns:
         The figures of the final evaluations, by the name of their volumes.
     """
+    check_keys(config)
     stage = Stage.built(config)
     job = invocation.job
     with held(invocation.folder):
@@ -211,6 +225,7 @@ def carry_out(
     with _told_how_to_resume(tracked.run_id, tracking_uri, folder, is_told=job_label is None), tracked:
         result = None
         if isinstance(stage.experiment.agent, Learner):
+            _tell_of_longer_epochs(stage.experiment.agent, stage.experiment.budget, job_label)
             budget, seed = stage.experiment.budget, VALIDATION_SEED + stage.experiment.seed
             result = train(
                 stage.experiment.agent,
@@ -235,6 +250,17 @@ def carry_out(
     if job_label is None:
         _show(result, evaluations, folder, tracking_uri)
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
+
+
+def _tell_of_longer_epochs(learner: Learner, budget: Budget, job_label: str | None) -> None:
+    """Says so where an epoch is longer than was asked for, because the agent takes more steps at once."""
+    if (n := learner.env_steps_at_once) > budget.epoch_env_steps:
+        label = f"[{job_label}] " if job_label else ""
+        print(
+            f"{label}validating every {n} environment steps, which the agent takes at once, instead of "
+            f"training.epoch_env_steps = {budget.epoch_env_steps}",
+            flush=True,
+        )
 
 
 def _judged(stage: Stage) -> dict[str, Evaluation]:

@@ -7,6 +7,7 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib import resources
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
@@ -50,6 +51,8 @@ def mistake_in_one_line(error: BaseException, words: Sequence[str] | None = None
             return _instantiation_mistake(error, words)
         case HydraException() | OmegaConfBaseException():
             return " ".join(str(error).split())
+        case ValueError() if _is_raised_by_hydra(error) and (emptied := _emptied_group(words)):
+            return f"{emptied} is None, but it must be {listed(_choices_of(emptied))}"
         case ValueError() if _is_raised_by_hydra(error):
             return " ".join(str(error).split())
         case OSError() if error.filename is not None:
@@ -107,11 +110,29 @@ def _instantiation_mistake(error: InstantiationException, words: Sequence[str]) 
     if unexpected := re.search(r"unexpected keyword argument '(\w+)'.*full_key: (\S+)", text):
         key, parent = unexpected.groups()
         allowed = _keys_under(parent, words)
-        # Words that choose groups give it to those that have no place for it: a preset does.
+        if key in allowed and any(re.match(r"[a-z_/]+=\[", word) for word in words):
+            # The last of several choices gives the class, and all of them its arguments.
+            return (
+                f"{parent} is put together from several choices, of which the last has no key {key!r}: choose one, or "
+                "name several observations to be merged, as in env.observation=[cluster,slice]"
+            )
         if key in allowed:
+            # Words that choose groups give it to those that have no place for it: a preset does.
             return f"experiment sets {parent}.{key}, but the {parent} that is chosen beside it has no such value"
         return f"there is no key {key!r} in {parent}" + (f", but only {listed(allowed)}" if allowed else "")
     return f"{text} (HYDRA_FULL_ERROR=1 shows where)"
+
+
+def _emptied_group(words: Sequence[str]) -> str | None:
+    """The group that was given as null in these words, if one was."""
+    groups = (word.removesuffix("=null") for word in words if word.endswith("=null"))
+    return next((group for group in groups if group.isidentifier() and _choices_of(group)), None)
+
+
+def _choices_of(group: str) -> list[str]:
+    """The choices of a group of the configuration, none where there is no such group."""
+    folder = resources.files(CONFIG_MODULE) / group
+    return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir()) if folder.is_dir() else []
 
 
 def _keys_under(parent: str, words: Sequence[str]) -> list[str]:

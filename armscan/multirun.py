@@ -48,10 +48,9 @@ class Outcome:
     failure: str | None = None
     figures: dict[str, dict[str, float]] = field(default_factory=dict)
 
-    @property
-    def is_failed(self) -> bool:
-        """Whether something went wrong; to be interrupted is nobody's failure."""
-        return self.failure not in (None, INTERRUPTED)
+    def is_failed(self, *, is_interrupted: bool) -> bool:
+        """Whether something went wrong; to be interrupted is no failure where the whole multirun was."""
+        return self.failure is not None and not (is_interrupted and self.failure == INTERRUPTED)
 
     def interrupted(self) -> Outcome:
         """Returns the outcome of a job whose multirun was interrupted: its own, if it had one by then."""
@@ -151,7 +150,9 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     outcomes = {file.stem: Outcome(**json.loads(file.read_text())) for file in files}
     if is_interrupted:
         outcomes = {number: outcome.interrupted() for number, outcome in outcomes.items()}
-    failed = {number: outcome for number, outcome in outcomes.items() if outcome.is_failed}
+    failed = {
+        number: outcome for number, outcome in outcomes.items() if outcome.is_failed(is_interrupted=is_interrupted)
+    }
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
     runs = _close_parent(Multirun.folder, status, failed)
     word = json.loads((Multirun.folder / PARENT_FILE).read_text())

@@ -7,6 +7,9 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf, open_dict
 
 from armscan.building import build
+from armscan.envs import SliceObservation
+from armscan.errors import InvalidValueError
+from armscan.experiment import Stage
 from armscan.training import Split
 
 
@@ -19,19 +22,47 @@ def split_of_sizes(volume):
     )
 
 
-@pytest.mark.parametrize("shape", ["null", "[40,36]"])
-def test_build_crops_images_of_all_splits_alike(phantom, shape, monkeypatch):
+class AsLargeAsTheSlice(SliceObservation):
+    """One's own, without a crop that could be the same everywhere."""
+
+    def __init__(self):
+        super().__init__()
+
+
+def config_of_sizes(phantom, monkeypatch, *overrides):
+    """The configuration with volumes of which that of the test is narrower."""
     monkeypatch.setattr("tests.test_building.PHANTOM", phantom, raising=False)
     with initialize_config_module("armscan.conf", version_base="1.3"):
-        config = compose("config", overrides=["obs=slice", f"obs.shape={shape}"])
+        config = compose("config", overrides=list(overrides))
     with open_dict(config):
         config.data = OmegaConf.create({"_target_": "tests.test_building.data"})
-    experiment = build(config)
+    return config
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["obs=slice", "obs.shape=null"],
+        ["obs=slice", "obs.shape=[40,36]"],
+        ["env.observation=slice"],
+        ["env.observation=[slice_channels,slice]"],
+    ],
+    ids=str,
+)
+def test_build_crops_images_of_all_splits_alike(phantom, overrides, monkeypatch):
+    experiment = build(config_of_sizes(phantom, monkeypatch, *overrides))
     volumes = (experiment.split.training, experiment.split.validation, experiment.split.test)
     frames = [experiment.maker.one(each).unwrapped.task._observation for each in volumes]
     assert {frame.observations[0]._frame.crop for frame in frames} == {(336, 80)}
     spaces = [experiment.maker.one(each).observation_space for each in volumes]
     assert spaces[0] == spaces[1] == spaces[2]
+
+
+def test_stage_refuses_volumes_that_an_observation_is_of_another_shape_on(phantom, monkeypatch):
+    own = "env.observation={_target_: tests.test_building.AsLargeAsTheSlice}"
+    config = config_of_sizes(phantom, monkeypatch, own)
+    with pytest.raises(InvalidValueError, match=r"part 'slice' has the shape \(360, 80\), but .* \(336, 80\)"):
+        Stage.built(config)
 
 
 def data():

@@ -86,6 +86,15 @@ def test_run_of_the_same_seed_gives_the_same_figures(tmp_path):
     assert first == second
 
 
+def test_run_says_when_it_validates_where_the_agent_takes_more_steps_at_once_than_an_epoch_has(tmp_path):
+    words = [word for word in SMALL if not word.startswith("agent.random")]
+    ended = armscan_run(*words, "agent=ppo", "agent.env_steps_per_collection=250", cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    assert "validating every 256 environment steps, which the agent takes at once, instead of" in ended.stdout
+    assert "training.epoch_env_steps = 200" in ended.stdout
+    assert "512/400 steps" in ended.stdout
+
+
 def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_path):
     varied = ["-m", "obs=cluster,action_reward", "env.delta=0.05,7"]
     ended = armscan_run(*varied, "projection=zy", "stack=2", "memory=1", *SMALL, cwd=tmp_path)
@@ -143,7 +152,18 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["data=nifti", "data.path=/nowhere"], "/nowhere: the folder of volumes does not exist"),
         (["seed=["], "'seed=[' cannot be read: what follows the options must be key=value"),
         (["foo"], "'foo' cannot be read"),
-        (["obs=null"], "Config group override must be a string or a list"),
+        (["obs=null"], "obs is None, but it must be action_reward, cluster, "),
+        (["obs=[cluster,slice]"], "env.observation is put together from several choices, of which the last has no key"),
+        (["+foo=1"], "there is no key 'foo' at the top, but only data, obs, "),
+        (["+evaluation.seed=4"], "there is no key 'seed' in evaluation, but only episodes"),
+        (["network.images=null"], "network.images is None, but it must have the methods of Network"),
+        (["agent.network=mlp"], "network is 'mlp', but it must have the methods of Network, chosen_for first; on the"),
+        (["agent._target_=builtins.dict"], "agent is {"),
+        (["compute.precision=half"], "compute.precision is 'half', but it must be float32 or bfloat16"),
+        (
+            ["agent=exhaustive_grid", "projection=zy", "agent.step_mm=0.01", "agent.step_deg=0.01"],
+            "agent.step_mm is 0.01 and agent.step_deg is 0.01, which give ",
+        ),
         (["obs=cluster,action_reward"], "obs=cluster,action_reward gives several values, which needs -m"),
         (["seed=-1"], "seed is -1, but it must be a whole number of at least 0"),
         (["stack=0"], "stack is 0, but it must be a whole number of at least 1"),
@@ -155,7 +175,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["training.solved=3"], "training.solved is 3, but it must be a SolvedCriterion or null"),
         (["reward.targets=3"], "targets is 3, but it must be 3 whole numbers"),
         (["env.observation=3"], "observation is 3, but it must be action_reward, cluster"),
-        (["projection=null"], "projection is ['None'], but it must be x, y, xy, zy or full"),
+        (["projection=null"], "projection is None, but it must be x, y, xy, zy or full"),
         (
             ["seed=99999999999999999999"],
             "seed is 99999999999999999999, but it must be a whole number of at least 0 and",
@@ -167,7 +187,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["tracking.uri=./mlruns"], "tracking.uri is './mlruns', but this store cannot be used"),
         (["-m", "obs=cluster,foo"], "obs is 'foo', but it must be action_reward, cluster"),
         (["obs=cluster", "-m", "agent=foo"], "agent is 'foo', but it must be "),
-        (["-m", "seed=1,2", "tracking=null"], "Config group override must be a string or a list"),
+        (["-m", "seed=1,2", "tracking=null"], "tracking is None, but it must be mlflow"),
         (["-m", "seed=1,2", "tracking.uri=./mlruns"], "tracking.uri is './mlruns', but this store cannot be used"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -240,7 +260,12 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
     assert len(tracked) == n_jobs + bool(multirun)
 
 
-def test_killed_job_takes_no_other_with_it(tmp_path):
+@pytest.mark.parametrize(
+    ("ending", "line"),
+    [(signal.SIGKILL, "killed by SIGKILL: out of memory?"), (signal.SIGTERM, "failed: interrupted")],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
     command = [sys.executable, "-m", "armscan.run", "-m", "seed=0,1", *SMALL, "training.env_steps=8000"]
     with (tmp_path / "printed").open("w") as printed:
         process = subprocess.Popen(command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT)
@@ -250,10 +275,11 @@ def test_killed_job_takes_no_other_with_it(tmp_path):
         assert process.poll() is None
         assert time.monotonic() < deadline_s
         time.sleep(0.2)
-    os.kill(job_process_ids(process.pid)[0], signal.SIGKILL)
+    os.kill(job_process_ids(process.pid)[0], ending)
     assert process.wait(timeout=240) == 1
     output = (tmp_path / "printed").read_text()
-    assert output.count("killed by SIGKILL: out of memory?") == 1
+    assert output.count(line) == 1
+    assert "again alone: python -m armscan.run seed=" in output
     assert "Traceback" not in output
     statuses = sorted(each.info.status for each in runs_in(tmp_path)[1])
     assert statuses == ["FAILED", "FAILED", "FINISHED"]

@@ -149,10 +149,15 @@ class ExhaustiveAgent:
         halves = [self._half_range_steps(name, bounds) for name in self._swept]
         # A step that ends on the range's end is within it, however the quotient was rounded.
         n_each_side = [math.floor(half + 1e-9) for half in halves]
-        if math.prod(2 * n + 1 for n in n_each_side) > MOST_PLANES:
+        if (n_planes := math.prod(2 * n + 1 for n in n_each_side)) > MOST_PLANES:
+            ranges = " and ".join(
+                f"+-{bound:g} degrees of {name}" if name in ROTATIONS else f"{bound:g} mm of {name}"
+                for name, bound in zip(COMPONENTS, bounds.rotation_deg + bounds.translation_mm, strict=True)
+                if name in self._swept
+            )
             raise InvalidValueError(
-                f"agent.step_mm is {self._step_mm:g} and agent.step_deg is {self._step_deg:g}, but together they must "
-                f"give at most {MOST_PLANES} planes within {bounds}"
+                f"agent.step_mm is {self._step_mm:g} and agent.step_deg is {self._step_deg:g}, which give {n_planes} "
+                f"planes within {ranges}, but there must be at most {MOST_PLANES}"
             )
         counts = np.meshgrid(*(np.arange(-n, n + 1) for n in n_each_side), indexing="ij")
         steps = np.stack(counts, axis=-1).reshape(-1, len(self._swept))

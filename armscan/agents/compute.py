@@ -34,8 +34,8 @@ class Compute:
 
     def __post_init__(self) -> None:
         check_choice("device", self.device, DEVICES)
-        check_choice("precision", self.precision, PRECISIONS)
-        check_bool("compile", self.compile)
+        check_choice("compute.precision", self.precision, PRECISIONS)
+        check_bool("compute.compile", self.compile)
         if self.device == "cuda" and not torch.cuda.is_available():
             raise InvalidValueError("device is 'cuda', but torch finds no CUDA device here; it must be 'cpu' or 'auto'")
 

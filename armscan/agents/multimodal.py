@@ -18,7 +18,7 @@ from tianshou.utils.net.continuous import ContinuousActorProbabilistic
 from tianshou.utils.torch_utils import torch_device
 from torch import nn
 
-from armscan.agents.networks import Spread
+from armscan.agents.networks import MOST_UNITS, Spread, check_weights, linear_weights
 from armscan.checks import check_ints
 from armscan.errors import InvalidValueError
 
@@ -51,7 +51,7 @@ class Multimodal:
     ) -> None:
         self.filters = list(check_ints("network.filters", filters, 3, "for the convolutions", at_least=1, at_most=4096))
         self.vector_sizes, self.head_sizes = (
-            list(check_ints(f"network.{name}", sizes, None, "", at_least=1, at_most=65536))
+            list(check_ints(f"network.{name}", sizes, None, "", at_least=1, at_most=MOST_UNITS))
             for name, sizes in (("vector_sizes", vector_sizes), ("head_sizes", head_sizes))
         )
 
@@ -70,6 +70,15 @@ class Multimodal:
                     f"the observation's {name} is {' x '.join(map(str, box.shape[-2:]))} pixels, but the convolutions "
                     f"of network=multimodal need at least {smallest} x {smallest}: change obs.shape or obs.crop"
                 )
+        n_weights = linear_weights(self.vector_sizes)
+        n_features = self.vector_sizes[-1]
+        for box in images.values():
+            n_pixels, n_channels = np.array(box.shape[-2:]), int(np.prod(box.shape[:-2]))
+            for n_filters, (kernel, stride) in zip(self.filters, CONVOLUTIONS, strict=True):
+                n_weights += n_channels * n_filters * kernel**2
+                n_pixels, n_channels = (n_pixels - kernel) // stride + 1, n_filters
+            n_features += n_channels * int(np.prod(n_pixels))
+        check_weights(self, n_weights + linear_weights([n_features, *self.head_sizes]))
         return self
 
     def actor_factory(self, spread: Spread) -> ActorFactory:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Protocol
 
 import torch
@@ -16,6 +17,9 @@ from torch import nn
 from armscan.checks import check_choice, check_ints
 from armscan.errors import InvalidValueError
 
+# An actor and two critics, their lagging copies and the moments of their optimisers take 14 times a network's weights,
+# which is then 4 GB.
+MOST_UNITS, MOST_WEIGHTS = 16_384, 2**26
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "gelu": nn.GELU}
 
 
@@ -71,7 +75,9 @@ class MLP:
     """
 
     def __init__(self, hidden_sizes: Sequence[int] = (64, 64), activation: str = "relu") -> None:
-        self.hidden_sizes = list(check_ints("network.hidden_sizes", hidden_sizes, None, "", at_least=1, at_most=65536))
+        self.hidden_sizes = list(
+            check_ints("network.hidden_sizes", hidden_sizes, None, "", at_least=1, at_most=MOST_UNITS)
+        )
         self.activation = ACTIVATIONS[check_choice("network.activation", activation, list(ACTIVATIONS))]
 
     def chosen_for(self, observation_space: spaces.Space[Any]) -> MLP:
@@ -82,6 +88,7 @@ class MLP:
                 f"{', '.join(observation_space) if isinstance(observation_space, spaces.Dict) else observation_space}; "
                 "take network=multimodal, or obs=cluster, or env.flat=true to put images and all into one vector"
             )
+        check_weights(self, linear_weights([*(observation_space.shape or ()), *self.hidden_sizes]))
         return self
 
     def actor_factory(self, spread: Spread) -> ActorFactory:
@@ -102,7 +109,8 @@ class NetworkByObservation:
     """
 
     def __init__(self, vector: NetworkChoice, images: NetworkChoice) -> None:
-        self.vector, self.images = checked_network(vector), checked_network(images)
+        self.vector = checked_network(vector, "network.vector")
+        self.images = checked_network(images, "network.images")
 
     def chosen_for(self, observation_space: spaces.Space[Any]) -> Network:
         """See `NetworkChoice.chosen_for`."""
@@ -115,15 +123,32 @@ def is_vector(space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and len(space.shape) == 1
 
 
-def checked_network(network: NetworkChoice) -> NetworkChoice:
-    """Returns the network, or the choice between some, if it is one.
+def checked_network(network: NetworkChoice, name: str = "network") -> NetworkChoice:
+    """Returns the network, or the choice between some, if it is one; `name` says which it is in messages.
 
     Raises:
         InvalidValueError: if it cannot say which network takes an observation.
     """
     if isinstance(network, type) or not callable(getattr(network, "chosen_for", None)):
-        raise InvalidValueError(f"network is {network!r}, but it must have the methods of Network, chosen_for first")
+        by_name = f"; on the command line network={network} chooses one by its name" if isinstance(network, str) else ""
+        raise InvalidValueError(
+            f"{name} is {network!r}, but it must have the methods of Network, chosen_for first{by_name}"
+        )
     return network
+
+
+def linear_weights(sizes: Sequence[int]) -> int:
+    """Returns how many weights there are between layers of these sizes."""
+    return sum(n_before * n for n_before, n in pairwise(sizes))
+
+
+def check_weights(network: Network, n_weights: int) -> None:
+    """Raises `InvalidValueError` where a network has too many weights."""
+    if n_weights > MOST_WEIGHTS:
+        raise InvalidValueError(
+            f"network is {type(network).__name__.lower()} with {n_weights} weights, but there must be at most "
+            f"{MOST_WEIGHTS}: take smaller layers, or smaller images (obs.shape)"
+        )
 
 
 class _MLPActorFactory(ActorFactory):

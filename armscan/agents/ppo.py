@@ -8,12 +8,14 @@ from tianshou.highlevel.config import OnPolicyTrainingConfig
 from tianshou.highlevel.experiment import PPOExperimentBuilder
 from tianshou.highlevel.params.algorithm_params import PPOParams
 
+from armscan.agents.budget import check_batch, check_collection
 from armscan.agents.image_replay import replay_for
 from armscan.agents.networks import Spread
 from armscan.agents.parameters import PolicyParameters, number
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.tianshou_envs import SideBySideFactory
-from armscan.agents.tianshou_learner import TianshouLearner, experiment_config, rounded_up
+from armscan.agents.tianshou_learner import TianshouLearner, experiment_config
+from armscan.errors import InvalidValueError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +41,7 @@ class PPO(PolicyParameters):
     """To which the gradient is clipped."""
 
     normalise_advantage: bool = True
-    """Whether advantages are normalised in each batch."""
+    """Whether advantages are normalised in each batch, which then has two transitions at least."""
 
     conditioned_sigma: bool = False
     """Whether the policy's standard deviation depends on the observation."""
@@ -53,14 +55,24 @@ class PPO(PolicyParameters):
     passes_per_collection: int = 8
     """How often each round of updates goes through all that was collected."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.normalise_advantage and self.batch_size == 1:
+            raise InvalidValueError(
+                "agent.batch_size is 1, but it must be at least 2 with agent.normalise_advantage=true: a single "
+                "advantage has no spread that it could be divided by"
+            )
+
     def agent(self, setup: AgentSetup) -> TianshouLearner:
         """Makes an agent that has learned nothing yet.
 
         Raises:
-            InvalidValueError: if the network cannot take the observations.
+            InvalidValueError: if the training is shorter than a collection, a collection too small for a batch, or the
+                network cannot take the observations.
         """
         network = self.network.chosen_for(setup.observation_space)
-        n_collected = rounded_up(self.env_steps_per_collection, self.num_envs)
+        n_collected = check_collection(self.env_steps_per_collection, self.num_envs, setup)
+        check_batch(self.batch_size, n_collected, "the environment steps of a collection")
         builder = PPOExperimentBuilder(
             SideBySideFactory(setup.make_envs),
             experiment_config(setup),

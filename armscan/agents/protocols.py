@@ -45,6 +45,10 @@ class Learner(Agent, Protocol):
     def n_env_steps(self) -> int:
         """Environment steps taken so far, all of them counted."""
 
+    @property
+    def env_steps_at_once(self) -> int:
+        """The fewest environment steps that `learn` can take."""
+
     def warm_up(self) -> None:
         """Takes the steps that come before the first update; called once, at the very beginning."""
 

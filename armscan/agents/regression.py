@@ -11,6 +11,7 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import nn
 
+from armscan.agents.budget import check_batch, check_updates, kept_at_most
 from armscan.agents.compute import Compute
 from armscan.agents.examples import Examples
 from armscan.agents.networks import Spread
@@ -55,14 +56,22 @@ class Regression(Parameters):
         """Makes an agent that has learned nothing yet.
 
         Raises:
-            InvalidValueError: if the network cannot take the observations.
+            InvalidValueError: if the training takes too few steps to learn anything, or the network cannot take the
+                observations.
         """
         chosen = self.network.chosen_for(setup.observation_space)
+        if self.num_envs > setup.total_env_steps:
+            raise InvalidValueError(
+                f"agent.num_envs is {self.num_envs}, but it must be at most training.env_steps = "
+                f"{setup.total_env_steps}"
+            )
+        check_updates(self.updates_per_env_step, setup)
+        size = kept_at_most(self.buffer_size, self.num_envs, setup)
+        check_batch(self.batch_size, size, "which is all that is kept of the training's slices")
         envs = setup.make_envs(self.num_envs)
         shapes = SideBySideFactory(lambda _: envs).create_envs(self.num_envs, 1, seed=setup.seed)
         torch.manual_seed(setup.seed)
         network = chosen.actor_factory(Spread(conditioned=False)).create_module(shapes, setup.compute.torch_device)
-        size = min(self.buffer_size, setup.total_env_steps + self.num_envs)
         examples = Examples(size, setup.observation_space, len(setup.action_names))
         return RegressionLearner(self, envs, network, examples, seed=setup.seed, compute=setup.compute)
 
@@ -107,6 +116,11 @@ class RegressionLearner:
     def n_env_steps(self) -> int:
         """Environment steps taken so far."""
         return self._n_env_steps
+
+    @property
+    def env_steps_at_once(self) -> int:
+        """One for each environment."""
+        return self._envs.num_envs
 
     def warm_up(self) -> None:
         """Does nothing: every step is random, and the first slices can be learned from."""

@@ -10,12 +10,13 @@ from tianshou.highlevel.experiment import SACExperimentBuilder
 from tianshou.highlevel.params.algorithm_params import SACParams
 from tianshou.highlevel.params.alpha import AutoAlphaFactoryDefault
 
+from armscan.agents.budget import check_batch, check_collection, check_updates, kept_at_most, rounded_up
 from armscan.agents.image_replay import replay_for
 from armscan.agents.networks import Spread
 from armscan.agents.parameters import PolicyParameters, number
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.tianshou_envs import SideBySideFactory
-from armscan.agents.tianshou_learner import TianshouLearner, experiment_config, rounded_up
+from armscan.agents.tianshou_learner import TianshouLearner, experiment_config
 from armscan.errors import InvalidValueError
 
 
@@ -48,7 +49,7 @@ class SAC(PolicyParameters):
     """Environment steps between two rounds of updates, rounded up to as many for each environment."""
 
     updates_per_env_step: float = number(0.25, above=0.0, at_most=1000.0)
-    """Gradient steps for each environment step; they are what training costs."""
+    """Gradient steps for each environment step, on average; they are what training costs."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,7 +62,7 @@ class SAC(PolicyParameters):
         """Makes an agent that has learned nothing yet.
 
         Raises:
-            InvalidValueError: if the training takes no more steps than the random ones, or the network cannot take the
+            InvalidValueError: if the training takes too few steps to learn anything, or the network cannot take the
                 observations.
         """
         network = self.network.chosen_for(setup.observation_space)
@@ -71,6 +72,10 @@ class SAC(PolicyParameters):
                 f"agent.random_env_steps is {self.random_env_steps}, {n_random} for {self.num_envs} environments, but "
                 f"it must be below training.env_steps = {setup.total_env_steps}, or nothing is learned"
             )
+        n_collected = check_collection(self.env_steps_per_collection, self.num_envs, setup, random_env_steps=n_random)
+        check_updates(self.updates_per_env_step, setup, random_env_steps=n_random)
+        n_kept = kept_at_most(self.buffer_size, self.num_envs, setup)
+        check_batch(self.batch_size, n_kept, "which is all that training.env_steps leaves to draw from")
         builder = SACExperimentBuilder(
             SideBySideFactory(setup.make_envs),
             experiment_config(setup),
@@ -79,7 +84,7 @@ class SAC(PolicyParameters):
                 num_test_envs=1,
                 # Tianshou's own, which ours takes the place of.
                 buffer_size=self.num_envs,
-                collection_step_num_env_steps=rounded_up(self.env_steps_per_collection, self.num_envs),
+                collection_step_num_env_steps=n_collected,
                 update_step_num_gradient_steps_per_sample=self.updates_per_env_step,
                 batch_size=self.batch_size,
             ),
@@ -103,9 +108,7 @@ class SAC(PolicyParameters):
         builder.with_common_critic_factory(network.critic_factory())
         return TianshouLearner(
             builder.build(),
-            replay=replay_for(
-                setup.observation_space, min(self.buffer_size, setup.total_env_steps + self.num_envs), self.num_envs
-            ),
+            replay=replay_for(setup.observation_space, n_kept, self.num_envs),
             random_env_steps=n_random,
             final_lr_share=self.final_lr_share,
             setup=setup,

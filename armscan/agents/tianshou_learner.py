@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,12 @@ import torch
 from tianshou.data import Batch
 from tianshou.highlevel.experiment import Experiment, ExperimentConfig
 from tianshou.highlevel.persistence import PolicyPersistence
-from tianshou.trainer import Trainer
+from tianshou.trainer import OffPolicyTrainer
 
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
+from armscan.agents.steady_updates import SteadyTrainer
 from armscan.envs.actions import ActionBounds
 from armscan.envs.task import Observed
 from armscan.errors import CheckpointError, DivergedError
@@ -56,7 +56,10 @@ class TianshouLearner:
         assert world.training_collector is not None
         self._collector = world.training_collector
         self._collector.buffer = replay
-        trainer = _silenced(experiment.algorithm_factory.create_trainer(world, _NoPersistence()))
+        trainer: Any = experiment.algorithm_factory.create_trainer(world, _NoPersistence())
+        trainer.params.show_progress = False
+        if isinstance(trainer, OffPolicyTrainer):
+            trainer = SteadyTrainer(trainer.algorithm, trainer.params, random_env_steps)
         trainer.reset(reset_collectors=False)
         self._algorithm = world.algorithm
         self._trainer = trainer
@@ -73,6 +76,11 @@ class TianshouLearner:
     def n_env_steps(self) -> int:
         """Environment steps taken so far, the random ones included."""
         return int(self._collector.collect_step)
+
+    @property
+    def env_steps_at_once(self) -> int:
+        """Those of one collection."""
+        return int(self._trainer.params.collection_step_num_env_steps)
 
     def warm_up(self) -> None:
         """Fills the replay buffer with random steps."""
@@ -123,9 +131,10 @@ class TianshouLearner:
 
     def _check_weights(self, cause: ValueError | None = None) -> None:
         if not all(torch.isfinite(weights).all() for weights in self._algorithm.parameters()):
+            or_entropy = " or agent.entropy_lr" if _entropy_optimiser(self._algorithm) else ""
             raise DivergedError(
                 f"learning has diverged: after {self.n_env_steps} environment steps the networks' weights are not "
-                "finite any more; a smaller agent.lr or agent.entropy_lr may help"
+                f"finite any more; a smaller agent.lr{or_entropy} may help"
             ) from cause
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
@@ -181,11 +190,6 @@ def experiment_config(setup: AgentSetup) -> ExperimentConfig:
     return ExperimentConfig(seed=setup.seed, device=setup.compute.torch_device, watch=False, persistence_enabled=False)
 
 
-def rounded_up(n_env_steps: int, num_envs: int) -> int:
-    """Returns the next multiple of the number of environments, which Tianshou takes in any case."""
-    return -(-n_env_steps // num_envs) * num_envs
-
-
 def networks_of(algorithm: torch.nn.Module) -> list[torch.nn.Module]:
     """Returns the networks of an algorithm: its actor, its critics, and their lagging copies."""
     critics = [module for name, module in algorithm.named_children() if name.startswith("critic")]
@@ -202,19 +206,6 @@ def load_into(module: torch.nn.Module, weights: dict[str, Any]) -> None:
         module.load_state_dict(weights)
     except (RuntimeError, KeyError, ValueError) as error:
         raise CheckpointError(f"the checkpoint is another agent's or network's: {error}") from error
-
-
-def _silenced(trainer: Trainer[Any, Any]) -> Trainer[Any, Any]:
-    """Returns the trainer without progress bars; of many gradient steps it shows one whatever `show_progress` says."""
-
-    class Silenced(type(trainer)):  # type: ignore[misc]
-        @property
-        def _pbar(self) -> Callable[..., Any]:
-            make_bar = super()._pbar
-            return lambda *args, **options: make_bar(*args, **options | {"disable": True})
-
-    trainer.__class__ = Silenced
-    return trainer
 
 
 def _entropy_optimiser(algorithm: Any) -> torch.optim.Optimizer | None:

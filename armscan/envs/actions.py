@@ -79,11 +79,10 @@ def free_components(projection: str | Sequence[str]) -> tuple[int, ...]:
             )
         names: tuple[str, ...] = PROJECTIONS[projection]
     else:
-        names = tuple(projection) if isinstance(projection, Sequence) else (str(projection),)
-        names = tuple(map(str, names))
+        names = tuple(map(str, projection)) if isinstance(projection, Sequence) else ()
     if not names or len(set(names)) != len(names) or not set(names) <= set(COMPONENTS):
         raise InvalidValueError(
-            f"projection is {list(names)!r}, but it must be {listed(PROJECTIONS)}, "
+            f"projection is {list(names) or projection!r}, but it must be {listed(PROJECTIONS)}, "
             f"or a list of different ones of {listed(COMPONENTS)}"
         )
     return tuple(index for index, name in enumerate(COMPONENTS) if name in names)

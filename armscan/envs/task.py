@@ -21,7 +21,7 @@ from armscan.anatomy import (
     checked_tissues,
 )
 from armscan.checks import check_bool, check_choice, check_float, check_int, check_numbers
-from armscan.envs.actions import free_components
+from armscan.envs.actions import ActionBounds, free_components
 from armscan.envs.observations import Observation, View, observe_all, smallest_shape, with_action_reward
 from armscan.envs.scene import RandomTransform, Scene, SceneSampler, slice_geometry
 from armscan.envs.spaces import MultiBoxSpace, Parts, flat_space, flattened, in_order
@@ -103,6 +103,11 @@ class Task:
             np.array(places), np.array([matrix for matrix, _ in maps]), np.array([offset for _, offset in maps])
         )
         return [self._view(*seen) for seen in zip(scenes, slices, landmarks, strict=True)]
+
+    @property
+    def bounds(self) -> dict[str, ActionBounds]:
+        """What actions stand for on each volume, by its name."""
+        return {name: self._sampler.bounds(volume) for name, volume in self.volumes.items()}
 
     def draw_scenes(self, names: Sequence[str], rngs: Sequence[np.random.Generator]) -> list[Scene]:
         """Draws a scene of each named volume with the generator beside it, its optimal plane above -delta.

@@ -13,6 +13,11 @@ from armscan.errors import InvalidValueError
 from armscan.training.evaluation import Env
 from armscan.volumes import LabelVolume
 
+# The images that an observation may be made of by name, as `with_crops` has them in full.
+NAMED_IMAGES = {
+    "slice": "armscan.envs.SliceObservation",
+    "slice_channels": "armscan.envs.SliceChannelsObservation",
+}
 # By which share a size may lie outside the range of the training volumes without a word about it.
 USUAL_DIFFERENCE = 0.1
 Range = tuple[float, float]
@@ -109,18 +114,33 @@ def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> A
     other volumes. Images that are reduced to one shape anyway keep that rule where slices are smaller.
 
     Args:
-        rules: plain dictionaries and lists.
+        rules: plain dictionaries and lists, or the name of an observation.
         trained: the smallest slice of the training volumes, (across, depth) in pixels.
         here: that of the volumes that the agent is applied to.
 
     Raises:
         InvalidValueError: if images would have to be larger than the slices.
     """
+    return _cropped(_spelled_out(rules), trained, here)
+
+
+def _spelled_out(rules: Any) -> Any:
+    """Returns the configuration of an observation with images that are named in it written in full."""
+    if isinstance(rules, str) and rules in NAMED_IMAGES:
+        return {"_target_": NAMED_IMAGES[rules], "crop": None, "shape": None}
     if isinstance(rules, list):
-        return [with_crops(each, trained, here) for each in rules]
+        return [_spelled_out(each) for each in rules]
+    if isinstance(rules, dict) and "observations" in rules:
+        return rules | {"observations": _spelled_out(rules["observations"])}
+    return rules
+
+
+def _cropped(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> Any:
+    if isinstance(rules, list):
+        return [_cropped(each, trained, here) for each in rules]
     if not isinstance(rules, dict):
         return rules
-    changed = {name: with_crops(each, trained, here) for name, each in rules.items()}
+    changed = {name: _cropped(each, trained, here) for name, each in rules.items()}
     if not {"crop", "shape"} <= rules.keys() or rules["crop"] is not None:
         return changed
     if trained[0] <= here[0] and trained[1] <= here[1]:

@@ -50,8 +50,8 @@ class Budget:
     """How long to train, and how often to validate.
 
     Args:
-        env_steps: environment steps to take at most, all of them counted.
-        epoch_env_steps: environment steps between two validations.
+        env_steps: environment steps to take at most, all of them counted; rounded up to what the agent takes at once.
+        epoch_env_steps: environment steps between two validations, rounded up likewise.
         validation_episodes: episodes of a validation.
         solved: stop as soon as this holds; None to spend the whole budget.
     """

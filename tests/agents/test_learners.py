@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from armscan.agents import PPO, SAC, Learner
+from armscan.agents import PPO, SAC, Learner, Regression
 from armscan.errors import CheckpointError, DivergedError, InvalidValueError
 from armscan.training import load_checkpoint, save_checkpoint
 
-from .conftest import MAKERS, SMALL_SAC, setup_for
+from .conftest import ALGORITHMS, MAKERS, SMALL_SAC, setup_for
 
 by_reinforcement = pytest.mark.parametrize("algorithm", ["sac", "ppo"], indirect=True)
 
@@ -39,6 +39,9 @@ def test_learner_counts_every_environment_step(make_learner):
     learner.learn(40)
     assert first + 40 <= learner.n_env_steps <= first + 60
     assert learner.learn(7)["speed/env_steps_per_s"] > 0
+    before = learner.n_env_steps
+    learner.learn(1)
+    assert learner.n_env_steps - before == learner.env_steps_at_once
 
 
 @pytest.mark.parametrize("algorithm", ["sac"], indirect=True)
@@ -60,6 +63,32 @@ def test_learner_reports_episodes_losses_and_speed(make_learner):
     if metrics["train/episodes"]:
         assert 1 <= metrics["train/length"] <= 50
         assert -50 <= metrics["train/return"] <= 0
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "regression"], indirect=True)
+@pytest.mark.parametrize("share", [0.1, 0.26, 0.7, 2.0])
+def test_learner_takes_as_many_gradient_steps_as_are_asked_for_also_after_going_on(algorithm, phantom, share):
+    maker, network = MAKERS["vector"]
+    learners = [algorithm(network, updates_per_env_step=share).agent(setup_for(maker, phantom)) for _ in range(2)]
+    learners[0].warm_up()
+    first, last = learners
+    n_random = first.n_env_steps
+    n_taken = [n_gradient_steps(first)]
+    for n_env_steps in (12, 20):
+        first.learn(n_env_steps)
+        n_taken.append(n_gradient_steps(first))
+    last.load_state(first.state())
+    last.learn(48)
+    n_taken.append(n_gradient_steps(last))
+    assert last.n_env_steps - n_random == 80
+    np.testing.assert_allclose(np.array(n_taken), share * np.array([0, 12, 32, 80]), atol=1)
+
+
+def n_gradient_steps(learner):
+    """As the optimiser counts them."""
+    algorithm = getattr(learner, "_algorithm", None)
+    optimiser = algorithm.policy_optim._optim if algorithm else learner._optimiser
+    return int(max((state["step"] for state in optimiser.state.values()), default=0))
 
 
 def test_learner_acts_without_exploration(make_learner, env):
@@ -159,6 +188,14 @@ def test_algorithm_refuses_impossible_parameters(algorithm, changes, message):
         (SAC, {"updates_per_env_step": -1}, r"agent\.updates_per_env_step is -1"),
         (SAC, {"random_env_steps": 100}, r"agent\.random_env_steps is 100, .* must be below"),
         (SAC, {"random_env_steps": 1, "num_envs": 100}, r"agent\.random_env_steps is 1, 100 for 100 environments"),
+        (SAC, {"updates_per_env_step": 0.01}, r"agent\.updates_per_env_step is 0\.01, .* at least 0\.0125, or not one"),
+        (
+            SAC,
+            {"env_steps_per_collection": 10**4},
+            r"agent\.env_steps_per_collection is 10000, 10000 for 2 env.* at most 80 = training\.env_steps - 20",
+        ),
+        (SAC, {"random_env_steps": 1, "num_envs": 60}, r"collection is 4, 60 for 60 environments, .* at most 40 = "),
+        (SAC, {"batch_size": 200}, r"agent\.batch_size is 200, but it must be at most 102, which is all"),
         (SAC, {"buffer_size": 10}, r"agent\.batch_size is 16, but it must be at most agent\.buffer_size = 10"),
         (PPO, {"gamma": 1.5}, r"agent\.gamma is 1\.5"),
         (PPO, {"judged_by_sampling": "yes"}, r"agent\.judged_by_sampling is 'yes'"),
@@ -166,11 +203,29 @@ def test_algorithm_refuses_impossible_parameters(algorithm, changes, message):
         (PPO, {"initial_log_sigma": 5}, r"agent\.initial_log_sigma is 5"),
         (PPO, {"passes_per_collection": 0}, r"agent\.passes_per_collection is 0"),
         (PPO, {"conditioned_sigma": 1}, r"agent\.conditioned_sigma is 1"),
+        (
+            PPO,
+            {"env_steps_per_collection": 101},
+            r"is 101, 102 for 2 environments, .* at most 100 = training\.env_steps$",
+        ),
+        (
+            PPO,
+            {"batch_size": 21},
+            r"agent\.batch_size is 21, but it must be at most 20, the environment steps of a coll",
+        ),
+        (PPO, {"batch_size": 1}, r"agent\.batch_size is 1, .* at least 2 with agent\.normalise_advantage"),
+        (Regression, {"num_envs": 101}, r"agent\.num_envs is 101, but it must be at most training\.env_steps = 100"),
+        (Regression, {"batch_size": 103}, r"agent\.batch_size is 103, but it must be at most 102, which is all"),
+        (
+            Regression,
+            {"updates_per_env_step": 0.001},
+            r"agent\.updates_per_env_step is 0\.001, .* at least 0\.01, or not",
+        ),
     ],
 )
 def test_algorithm_refuses_its_own_impossible_parameters(phantom, kind, changes, message):
     maker, network = MAKERS["vector"]
-    small = SMALL_SAC if kind is SAC else {}
+    small = next(small for each, small in ALGORITHMS.values() if each is kind)
     with pytest.raises(InvalidValueError, match=message):
         kind(network=network, **small | changes).agent(setup_for(maker, phantom))
 
@@ -198,5 +253,6 @@ def test_learner_says_that_it_has_diverged(make_learner, part):
     learner.warm_up()
     for weights in learner._algorithm.get_submodule(part).parameters():
         weights.data.fill_(float("nan"))
-    with pytest.raises(DivergedError, match=r"learning has diverged: after \d+ environment steps"):
+    with pytest.raises(DivergedError, match=r"learning has diverged: after \d+ environment steps") as raised:
         learner.learn(60)
+    assert ("agent.entropy_lr" in str(raised.value)) == hasattr(learner._algorithm, "alpha")

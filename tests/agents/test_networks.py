@@ -51,6 +51,23 @@ def test_multimodal_refuses_images_too_small_with_the_smallest_size_that_works(p
         Multimodal().chosen_for(space)
 
 
+@pytest.mark.parametrize(
+    ("network", "observation"),
+    [
+        (MLP((16384, 16384)), "cluster"),
+        (Multimodal(head_sizes=(16384,)), "slice"),
+        (Multimodal(filters=(32, 4096, 4096)), SliceObservation(shape=(36, 36))),
+        (NetworkByObservation(vector=MLP((8192, 8193)), images=Multimodal()), "cluster"),
+    ],
+    ids=["mlp", "head", "filters", "by_observation"],
+)
+def test_network_of_too_many_weights_is_refused_before_it_is_made(phantom, network, observation):
+    with pytest.raises(
+        InvalidValueError, match=r"network is m\w+ with \d+ weights, but there must be at most 67108864"
+    ):
+        network.chosen_for(space_of(phantom, observation))
+
+
 def test_smallest_side_leaves_one_pixel_and_one_less_leaves_none():
     side = smallest_side_px()
     layers = [torch.nn.Conv2d(1, 1, kernel, stride) for kernel, stride in ((8, 4), (4, 2), (3, 1))]
@@ -85,7 +102,14 @@ def test_multimodal_brings_labels_to_0_to_1(phantom):
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"hidden_sizes": (0,)}, {"hidden_sizes": "64"}, {"hidden_sizes": 64}, {"activation": "step"}]
+    "arguments",
+    [
+        {"hidden_sizes": (0,)},
+        {"hidden_sizes": (16385,)},
+        {"hidden_sizes": "64"},
+        {"hidden_sizes": 64},
+        {"activation": "step"},
+    ],
 )
 def test_mlp_refuses_impossible_layers(arguments):
     with pytest.raises(InvalidValueError, match=next(iter(arguments))):

@@ -119,7 +119,9 @@ def test_regression_says_that_it_has_diverged(phantom):
 
 def test_regression_without_an_update_in_an_epoch_reports_no_loss(phantom):
     maker, network = MAKERS["vector"]
-    learner = Regression(network=network, num_envs=2, updates_per_env_step=0.01).agent(setup_for(maker, phantom))
+    learner = Regression(network=network, num_envs=2, batch_size=16, updates_per_env_step=0.01).agent(
+        setup_for(maker, phantom)
+    )
     metrics = learner.learn(10)
     assert "update/loss" not in metrics
     assert metrics["speed/updates_per_s"] == 0

@@ -40,6 +40,8 @@ def test_images_are_cropped_as_in_training():
     }
     cropped = with_crops(rules, (30, 20), (31, 20))
     assert cropped["observations"] == [{"crop": [30, 20], "shape": None}, {"crop": [9, 9], "shape": None}, "cluster"]
+    (named, _) = with_crops(["slice", "cluster"], (30, 20), (31, 20))
+    assert named == {"_target_": "armscan.envs.SliceObservation", "crop": [30, 20], "shape": None}
     with pytest.raises(InvalidValueError, match=r"trained on images of 30 x 20 pixels .* 29 x 40"):
         with_crops(rules, (30, 20), (29, 40))
     assert with_crops({"crop": None, "shape": [5, 5]}, (30, 20), (29, 40)) == {"crop": None, "shape": [5, 5]}
