@@ -30,6 +30,9 @@ class Parameters:
     lr: float = number(1e-3, above=0.0, at_most=1.0)
     """Learning rate of the networks."""
 
+    final_lr_share: float = number(1.0, at_least=0.0, at_most=1.0)
+    """What the learning rate has come down to at the training's end, as a share; below 1 what is learned settles."""
+
     batch_size: int = 256
     """Transitions, or slices, of one gradient step."""
 
@@ -52,8 +55,10 @@ class Parameters:
 class PolicyParameters(Parameters):
     """What every algorithm is told whose policy explores while it learns."""
 
-    final_lr_share: float = number(1.0, at_least=0.0, at_most=1.0)
-    """What the learning rate has come down to at the training's end, as a share; below 1 the policy settles."""
-
     judged_by_sampling: bool = False
     """Whether the policy is judged as it explores, by sampling, instead of by its mode."""
+
+
+def lr_share(final_share: float, n_env_steps: int, total_env_steps: int) -> float:
+    """Returns which share of the first learning rate holds after so many of a training's environment steps."""
+    return 1.0 - (1.0 - final_share) * min(1.0, n_env_steps / total_env_steps)

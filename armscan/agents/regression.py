@@ -12,10 +12,9 @@ from gymnasium.vector import VectorEnv
 from torch import nn
 
 from armscan.agents.budget import check_batch, check_updates, kept_at_most
-from armscan.agents.compute import Compute
 from armscan.agents.examples import Examples
 from armscan.agents.networks import Spread
-from armscan.agents.parameters import Parameters, number
+from armscan.agents.parameters import Parameters, lr_share, number
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.tianshou_envs import SideBySideFactory
 from armscan.agents.tianshou_learner import load_into
@@ -26,6 +25,9 @@ from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
 from armscan.errors import DivergedError, InvalidValueError
 from armscan.volumes.plane import FloatArray
 
+# Of normalised actions: 10 ** -2.5 is half a millimetre along an arm of 300 mm, or a third of a degree.
+LOG_SPREADS = (-2.5, -0.5)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Regression(Parameters):
@@ -33,7 +35,8 @@ class Regression(Parameters):
 
     It is taught with the optimal planes of the training volumes themselves, which no other agent is shown: what it
     reaches says how much of the task needs no search. The network is that of an actor, of the same size; only the mean
-    of its actions is used.
+    of its actions is used. With `own_planes_share` it learns from the planes that it would come to, as in DAgger (Ross
+    et al. 2011, arXiv:1011.0686).
 
     Raises:
         InvalidValueError: if a value is impossible.
@@ -44,6 +47,10 @@ class Regression(Parameters):
 
     updates_per_env_step: float = number(0.25, above=0.0, at_most=1000.0)
     """Gradient steps for each environment step."""
+
+    own_planes_share: float = number(0.0, at_least=0.0, at_most=1.0)
+    """Share of the planes to learn from that lie near those that the network itself would choose; the others are
+    random. Slices near the wanted plane, on which it has to be exact, are rare among random ones."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -73,11 +80,11 @@ class Regression(Parameters):
         torch.manual_seed(setup.seed)
         network = chosen.actor_factory(Spread(conditioned=False)).create_module(shapes, setup.compute.torch_device)
         examples = Examples(size, setup.observation_space, len(setup.action_names))
-        return RegressionLearner(self, envs, network, examples, seed=setup.seed, compute=setup.compute)
+        return RegressionLearner(self, envs, network, examples, setup)
 
 
 class RegressionLearner:
-    """Looks at random planes and fits a network to where the optimal ones lie.
+    """Looks at planes, random ones where nothing else is said, and fits a network to where the optimal ones lie.
 
     As in `TianshouLearner`, every epoch begins with new episodes and draws whatever it draws from `seed` and its own
     number, so that it goes on from its state bit for bit.
@@ -87,8 +94,7 @@ class RegressionLearner:
         envs: the training environments, without autoreset.
         network: gives mean and spread of actions, of which the mean is fitted.
         examples: what was seen.
-        seed: of everything that is drawn.
-        compute: how the network is computed.
+        setup: what the agent was given.
     """
 
     def __init__(
@@ -97,20 +103,18 @@ class RegressionLearner:
         envs: VectorEnv[Any, Any, Any],
         network: nn.Module,
         examples: Examples,
-        *,
-        seed: int,
-        compute: Compute,
+        setup: AgentSetup,
     ) -> None:
         self._regression = regression
         assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
         self._envs, self._teacher = envs, envs.unwrapped
         self._network = network
         self._examples = examples
-        self._seed = seed
-        self._device = compute.torch_device
+        self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
+        self._device = setup.compute.torch_device
         self._optimiser = torch.optim.Adam(network.parameters(), lr=regression.lr)
         self._n_env_steps = self._n_epochs = 0
-        compute.apply_to(network)
+        setup.compute.apply_to(network)
 
     @property
     def n_env_steps(self) -> int:
@@ -136,6 +140,9 @@ class RegressionLearner:
         torch.manual_seed(int(for_torch.generate_state(1)[0]))
         rng = np.random.default_rng(for_draws)
         seeds = [int(word) for word in for_envs.generate_state(self._envs.num_envs)]
+        share = lr_share(self._regression.final_lr_share, self._n_env_steps, self._total_env_steps)
+        for group in self._lr_groups():
+            group["lr"] = share * self._regression.lr
         observations, _ = reset_each(self._envs, seeds)
         n_before, losses, start_s = self._n_env_steps, [], time.perf_counter()
         while self._n_env_steps - n_before < n_env_steps:
@@ -151,20 +158,35 @@ class RegressionLearner:
             "replay_size": float(len(self._examples)),
         }
 
+    def _lr_groups(self) -> list[dict[str, Any]]:
+        return self._optimiser.param_groups
+
     @property
     def _n_updates(self) -> int:
         """Updates that are due after the steps taken so far."""
         return int(self._n_env_steps * self._regression.updates_per_env_step)
 
     def _step(self, observations: Observed, rng: np.random.Generator) -> Observed:
-        """Keeps what is seen, starts of episodes included; returns what is seen from random planes, the next."""
+        """Keeps what is seen, starts of episodes included; returns what is seen from the next planes."""
         self._examples.add(observations, self._teacher.optimal_actions)
-        actions = rng.uniform(-1.0, 1.0, self._envs.action_space.shape or ())
-        observations, _, terminated, truncated, _ = self._envs.step(actions)
+        observations, _, terminated, truncated, _ = self._envs.step(self._next_planes(observations, rng))
         self._n_env_steps += self._envs.num_envs
         if (has_ended := terminated | truncated).any():
             observations, _ = self._envs.reset(options={"reset_mask": has_ended})
         return observations
+
+    def _next_planes(self, observations: Observed, rng: np.random.Generator) -> FloatArray:
+        """Draws random planes, or such near its own choice, at distances of every order; shape (n, n_free)."""
+        planes = rng.uniform(-1.0, 1.0, self._envs.action_space.shape or ())
+        if not self._regression.own_planes_share:
+            return planes
+        with torch.no_grad():
+            chosen = self._predicted(observations).cpu().numpy()
+        if not np.isfinite(chosen).all():
+            raise self._diverged()
+        spread = 10.0 ** rng.uniform(*LOG_SPREADS, (len(planes), 1))
+        near = np.clip(rng.normal(chosen, spread), -1.0, 1.0)
+        return np.where(rng.random((len(planes), 1)) < self._regression.own_planes_share, near, planes)
 
     def _update(self, rng: np.random.Generator) -> torch.Tensor:
         observations, optima = self._examples.draw(self._regression.batch_size, rng)
@@ -181,10 +203,13 @@ class RegressionLearner:
 
     def _check_weights(self) -> None:
         if not all(torch.isfinite(weights).all() for weights in self._network.parameters()):
-            raise DivergedError(
-                f"learning has diverged: after {self.n_env_steps} environment steps the network's weights are not "
-                "finite any more; a smaller agent.lr may help"
-            )
+            raise self._diverged()
+
+    def _diverged(self) -> DivergedError:
+        return DivergedError(
+            f"learning has diverged: after {self.n_env_steps} environment steps the network's weights are not finite "
+            "any more; a smaller agent.lr may help"
+        )
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
         """Learns that an episode begins, in which nothing is drawn."""

@@ -13,6 +13,7 @@ from tianshou.highlevel.persistence import PolicyPersistence
 from tianshou.trainer import OffPolicyTrainer
 
 from armscan.agents.epoch_metrics import EpochMetrics
+from armscan.agents.parameters import lr_share
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
 from armscan.agents.steady_updates import SteadyTrainer
@@ -122,7 +123,7 @@ class TianshouLearner:
         self._replay.seed(int(for_replay.generate_state(1)[0]))
         self._collector.env.seed([int(word) for word in for_envs.generate_state(self._collector.env_num)])
         self._collector.reset_env()
-        share = 1.0 - (1.0 - self._final_lr_share) * min(1.0, self.n_env_steps / self._total_env_steps)
+        share = lr_share(self._final_lr_share, self.n_env_steps, self._total_env_steps)
         for group, first_lr in zip(self._lr_groups(), self._first_lrs, strict=True):
             group["lr"] = share * first_lr
 

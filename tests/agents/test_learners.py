@@ -230,7 +230,6 @@ def test_algorithm_refuses_its_own_impossible_parameters(phantom, kind, changes,
         kind(network=network, **small | changes).agent(setup_for(maker, phantom))
 
 
-@by_reinforcement
 def test_learning_rates_come_down_to_their_final_share(make_learner):
     learner = make_learner(final_lr_share=0.25)
     rates = []

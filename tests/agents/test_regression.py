@@ -44,7 +44,9 @@ def test_optimal_actions_are_told_to_no_agent(phantom):
 
 def test_regression_keeps_what_it_sees_with_the_optimum_of_that_episode(phantom):
     maker, network = MAKERS["vector"]
-    learner = Regression(network=network, **SMALL_REGRESSION | {"num_envs": 1}).agent(setup_for(maker, phantom))
+    learner = Regression(network=network, **SMALL_REGRESSION | {"num_envs": 1, "own_planes_share": 0.0}).agent(
+        setup_for(maker, phantom)
+    )
     learner.learn(40)
     state = learner.state()["examples"]
     observations, optima = next(iter(state["parts"].values())).numpy(), state["optima"].numpy()
@@ -96,6 +98,22 @@ def test_regression_learns_where_the_plane_lies_on_two_phantoms():
     assert last < first / 2
     assert after.success_rate >= 0.8 > before.success_rate
     assert after.metrics()["mean_distance_mm"] < 10
+
+
+def test_regression_learns_from_random_planes_and_those_near_its_own(phantom):
+    maker, network = MAKERS["vector"]
+    near = {}
+    for share in (0.0, 0.5, 1.0):
+        small = SMALL_REGRESSION | {"num_envs": 400, "own_planes_share": share}
+        learner = Regression(network=network, **small).agent(setup_for(maker, phantom, total_env_steps=1000))
+        observations, _ = learner._envs.reset(seed=0)
+        with torch.no_grad():
+            chosen = learner._predicted(observations).numpy().clip(-1, 1)
+        planes = learner._next_planes(observations, np.random.default_rng(0))
+        assert np.abs(planes).max() <= 1
+        near[share] = (np.abs(planes - chosen).max(axis=1) < 0.05).mean()
+    assert near[0.0] < 0.02
+    assert 0.2 < near[0.5] < 0.4 < near[1.0] < 0.8
 
 
 def test_regression_answers_the_same_observation_alike_whatever_came_before(phantom):
