@@ -60,6 +60,7 @@ def _presets() -> dict[str, Row]:
         "best_full_images": ("4-DoF, images alone, SAC", 0.97, 3.0, 60),
         "best_zy_published_observation": ("2-DoF, actions and rewards alone, SAC, sampling", 0.97, 6.0, 15),
         "best_full_distance": ("4-DoF, SAC, reward=agreement", None, None, None),
+        "best_full_taught": ("4-DoF, taught with labelled planes, reward=agreement", None, None, None),
     }
     return {name: Row(title, (f"experiment={name}",), *limits) for name, (title, *limits) in wanted.items()}
 

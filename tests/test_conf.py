@@ -43,7 +43,8 @@ WHOLE = [f"agent={agent}" for agent in choices("agent")] + [f"experiment={name}"
 @pytest.mark.parametrize("override", WHOLE)
 def test_conf_composes_every_agent_and_experiment(override):
     # The phantoms are few, so that this is quick; what an experiment says of them is said before.
-    few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
+    # A reward that is fitted to one wrist alone would not take the labelled plane of another.
+    few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1", "env.delta=0.5"]
     experiment = build(compose("config", overrides=[override, *few]))
     env = experiment.maker.one(experiment.split.test)
     observation, info = env.reset(seed=0)
