@@ -1,6 +1,6 @@
 """One run from beginning to end: built, tracked, trained, evaluated, and shown.
 
-No part of the configuration goes further than this module and `building.py`.
+No part of the configuration goes further than this module, `stage.py` and `building.py`.
 """
 
 from __future__ import annotations
@@ -10,19 +10,17 @@ import json
 import socket
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from operator import methodcaller
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-import torch
 import yaml
 from omegaconf import DictConfig
 
 import armscan
 from armscan.agents import Learner
-from armscan.building import Experiment, build, check_keys
+from armscan.building import check_keys
 from armscan.console import print_results, print_where_to_look, progress_reporter
 from armscan.files import (
     BEST_CHECKPOINT,
@@ -35,9 +33,9 @@ from armscan.files import (
     write_whole,
 )
 from armscan.invocation import Invocation
-from armscan.mistakes import quieten_libraries
 from armscan.multirun import JOB_TAG
 from armscan.settings import plain, resume_command
+from armscan.stage import Stage
 from armscan.tracking import FAMILIAR_TAG, TrackedRun, open_store
 from armscan.training import (
     TEST,
@@ -46,79 +44,17 @@ from armscan.training import (
     EpochReport,
     Evaluation,
     Familiar,
-    Fingerprints,
-    Origin,
     Split,
     TrainingResult,
     evaluate,
     film_episode,
     train,
 )
-from armscan.training.evaluation import Env
 
 MAX_TAG_CHARS = 5000
 CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")
 # First seeds of the episodes that are played for each purpose, so that none is played for two.
 VALIDATION_SEED, TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED, FILM_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stage:
-    """An experiment and the environments that its agent is judged in, made and so checked before anything is tracked.
-
-    Args:
-        experiment: what is run.
-        training_env: of the training volumes, for the final evaluation.
-        validation_env: for the validation after each epoch.
-        test_env: for the final evaluation.
-        film_env: for the film of an episode.
-    """
-
-    experiment: Experiment
-    training_env: Env
-    validation_env: Env
-    test_env: Env
-    film_env: Env
-
-    @classmethod
-    def built(cls, config: DictConfig) -> Self:
-        """Builds what a configuration describes.
-
-        Raises:
-            InvalidValueError: if something in it is not allowed.
-        """
-        quieten_libraries()
-        torch.set_num_threads(1)
-        experiment = build(config)
-        maker, split = experiment.maker, experiment.split
-        stage = cls(
-            experiment=experiment,
-            training_env=maker.one(split.training),
-            validation_env=maker.one(split.validation),
-            test_env=maker.one(split.test),
-            film_env=maker.one(split.test, render_mode="rgb_array"),
-        )
-        stage._check()
-        return stage
-
-    def _check(self) -> None:
-        """Raises `InvalidValueError` where the agent cannot act in one of the environments that it is judged in."""
-        envs = (self.training_env, self.validation_env, self.test_env)
-        for env in envs[1:]:
-            Familiar.of(self.training_env).check_observed(Familiar.of(env))
-        if not isinstance(self.experiment.agent, Learner):
-            # How many planes there are to go through depends on the sizes of the volumes.
-            for bounds in {bounds for env in envs for bounds in env.get_wrapper_attr("task").bounds.values()}:
-                self.experiment.agent.begin(seed=0, bounds=bounds)
-
-    def origin(self, run_id: str) -> Origin:
-        """Returns what the checkpoints of a run say that they come from."""
-        return Origin(run_id=run_id, volumes=self.fingerprints)
-
-    @cached_property
-    def fingerprints(self) -> Fingerprints:
-        """Of the volumes; once, because they take a second for a hundred of them."""
-        return self.experiment.split.fingerprints()
 
 
 def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict[str, float]]:
@@ -178,9 +114,7 @@ def start_tracking(config: DictConfig, invocation: Invocation, stage: Stage) -> 
 
 def volume_tags(split: Split) -> dict[str, str]:
     """Returns the names of the volumes, as tags of a run."""
-    return {
-        f"volumes.{part}": " ".join(getattr(split, part))[:MAX_TAG_CHARS] for part in ("training", "validation", "test")
-    }
+    return {f"volumes.{part}": " ".join(volumes)[:MAX_TAG_CHARS] for part, volumes in split.parts.items()}
 
 
 def place_tags(folder: Path) -> dict[str, str]:

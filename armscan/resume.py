@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 import armscan
 from armscan.agents import Learner
 from armscan.errors import InvalidValueError, ResumeError
-from armscan.experiment import Stage, carry_out, place_tags, volume_tags
+from armscan.experiment import carry_out, place_tags, volume_tags
 from armscan.files import (
     CONFIG_FILE,
     LAST_CHECKPOINT,
@@ -32,6 +32,7 @@ from armscan.files import (
     sum_of,
 )
 from armscan.settings import RESUME, TRACKING_URI, plain, usual_tracking
+from armscan.stage import Stage
 from armscan.tracking import TrackedRun, find_run, open_existing_store
 from armscan.training import Fingerprints, check_unchanged, take_up
 

@@ -131,7 +131,7 @@ def table() -> str:
         if name in kept:
             of_seeds = [kept[name][seed] for seed in sorted(kept[name])]
             cells = [
-                row.title,
+                f"{row.title} (`{name}`)",
                 _wanted(row, of_seeds),
                 _joined(of_seeds, "success", "{:.1f}", 100),
                 _joined(of_seeds, "mean_steps", "{:.2f}"),

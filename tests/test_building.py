@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import pytest
 from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf, open_dict
 
 from armscan.building import build
 from armscan.envs import SliceObservation
 from armscan.errors import InvalidValueError
-from armscan.experiment import Stage
+from armscan.stage import Stage
 from armscan.training import Split
 
 
@@ -31,12 +30,9 @@ class AsLargeAsTheSlice(SliceObservation):
 
 def config_of_sizes(phantom, monkeypatch, *overrides):
     """The configuration with volumes of which that of the test is narrower."""
-    monkeypatch.setattr("tests.test_building.PHANTOM", phantom, raising=False)
+    monkeypatch.setattr("armscan.training.phantom_data", lambda **_: split_of_sizes(phantom))
     with initialize_config_module("armscan.conf", version_base="1.3"):
-        config = compose("config", overrides=list(overrides))
-    with open_dict(config):
-        config.data = OmegaConf.create({"_target_": "tests.test_building.data"})
-    return config
+        return compose("config", overrides=list(overrides))
 
 
 @pytest.mark.parametrize(
@@ -63,7 +59,3 @@ def test_stage_refuses_volumes_that_an_observation_is_of_another_shape_on(phanto
     config = config_of_sizes(phantom, monkeypatch, own)
     with pytest.raises(InvalidValueError, match=r"part 'slice' has the shape \(360, 80\), but .* \(336, 80\)"):
         Stage.built(config)
-
-
-def data():
-    return split_of_sizes(PHANTOM)  # noqa: F821 - the test's fixture

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -70,16 +70,19 @@ class Multimodal:
                     f"the observation's {name} is {' x '.join(map(str, box.shape[-2:]))} pixels, but the convolutions "
                     f"of network=multimodal need at least {smallest} x {smallest}: change obs.shape or obs.crop"
                 )
-        n_weights = linear_weights(self.vector_sizes)
-        n_features = self.vector_sizes[-1]
-        for box in images.values():
+        check_weights(self, self._n_weights(images.values()))
+        return self
+
+    def _n_weights(self, images: Iterable[spaces.Box]) -> int:
+        """Counts the weights of one network before it is made, but for those of the vectors that come in."""
+        n_weights, n_features = linear_weights(self.vector_sizes), self.vector_sizes[-1]
+        for box in images:
             n_pixels, n_channels = np.array(box.shape[-2:]), int(np.prod(box.shape[:-2]))
             for n_filters, (kernel, stride) in zip(self.filters, CONVOLUTIONS, strict=True):
                 n_weights += n_channels * n_filters * kernel**2
                 n_pixels, n_channels = (n_pixels - kernel) // stride + 1, n_filters
             n_features += n_channels * int(np.prod(n_pixels))
-        check_weights(self, n_weights + linear_weights([n_features, *self.head_sizes]))
-        return self
+        return n_weights + linear_weights([n_features, *self.head_sizes])
 
     def actor_factory(self, spread: Spread) -> ActorFactory:
         """See `Network.actor_factory`."""

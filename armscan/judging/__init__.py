@@ -3,7 +3,8 @@
 from armscan.judging.report import Judgement, judgement_tables
 from armscan.judging.subject import Subject, subject_of_run, subject_of_words
 from armscan.judging.trial import Trial, prepare
-from armscan.judging.volumes import PARTS, TrainingVolumes, data_name, known_volumes, own_split, volume_groups
+from armscan.judging.volumes import TrainingVolumes, data_name, known_volumes, own_split, volume_groups
+from armscan.training import PARTS
 
 __all__ = [
     "PARTS",

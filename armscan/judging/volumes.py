@@ -11,12 +11,11 @@ from hydra.utils import instantiate
 from armscan.errors import InvalidValueError
 from armscan.judging.subject import Subject
 from armscan.mistakes import mistake_in_one_line
-from armscan.training import TEST, TRAINING, VALIDATION, Split, check_unchanged, fingerprint
+from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged, fingerprint
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 
 PHANTOMS = "phantoms"
-PARTS = ("training", "validation", "test")
 # No phantom of a run has these seeds: its test phantoms begin a million below.
 PHANTOMS_FIRST_SEED = 3_000_000
 Volumes = dict[str, LabelVolume]

@@ -4,7 +4,7 @@ from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from armscan.training.course import Origin, take_up
-from armscan.training.data import Split, mixed_data, nifti_data, phantom_data
+from armscan.training.data import PARTS, Split, mixed_data, nifti_data, phantom_data
 from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Evaluation, evaluate
 from armscan.training.familiar import Familiar
 from armscan.training.figures import Figures
@@ -15,6 +15,7 @@ from armscan.training.train import Budget, SolvedCriterion, TrainingResult, trai
 __all__ = [
     "BEST_CHECKPOINT",
     "LAST_CHECKPOINT",
+    "PARTS",
     "TEST",
     "TRAINING",
     "VALIDATION",

@@ -19,6 +19,8 @@ from armscan.volumes.dataset import SPLITS
 VALIDATION_FIRST_SEED, TEST_FIRST_SEED = 1_000_000, 2_000_000
 DEFAULT_SHARE = 0.25
 
+PARTS = ("training", "validation", "test")
+
 
 @dataclass(frozen=True)
 class Split:
@@ -38,27 +40,31 @@ class Split:
     test: dict[str, LabelVolume]
 
     def __post_init__(self) -> None:
-        parts = {part: getattr(self, part) for part in ("training", "validation", "test")}
-        for part, volumes in parts.items():
+        for part, volumes in self.parts.items():
             if not isinstance(volumes, dict) or not all(isinstance(each, LabelVolume) for each in volumes.values()):
                 raise InvalidValueError(f"the {part} volumes are {volumes!r}, but they must be volumes by name")
-        if not all(parts.values()):
+        if not all(self.parts.values()):
             raise InvalidValueError(
                 f"of {len(self.training)} volumes for training, {len(self.validation)} for validation and "
                 f"{len(self.test)} for the test, each must be at least 1: the volumes must be of three subjects or more"
             )
         seen: dict[str, str] = {}
-        for part, volumes in parts.items():
+        for part, volumes in self.parts.items():
             for name in volumes:
                 if name in seen:
                     raise InvalidValueError(f"{name} is in {seen[name]} and in {part}, but it must be in one split")
                 seen[name] = part
 
+    @property
+    def parts(self) -> dict[str, dict[str, LabelVolume]]:
+        """The volumes by split and name."""
+        return {part: getattr(self, part) for part in PARTS}
+
     def fingerprints(self) -> Fingerprints:
         """Returns a sum of each volume's contents, by split and name."""
         return {
-            part: {name: fingerprint(volume) for name, volume in getattr(self, part).items()}
-            for part in ("training", "validation", "test")
+            part: {name: fingerprint(volume) for name, volume in volumes.items()}
+            for part, volumes in self.parts.items()
         }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -9,15 +10,11 @@ from typing import Any, Self
 
 from gymnasium import spaces
 
+from armscan.envs.observations import named_observations
 from armscan.errors import InvalidValueError
 from armscan.training.evaluation import Env
 from armscan.volumes import LabelVolume
 
-# The images that an observation may be made of by name, as `with_crops` has them in full.
-NAMED_IMAGES = {
-    "slice": "armscan.envs.SliceObservation",
-    "slice_channels": "armscan.envs.SliceChannelsObservation",
-}
 # By which share a size may lie outside the range of the training volumes without a word about it.
 USUAL_DIFFERENCE = 0.1
 Range = tuple[float, float]
@@ -126,8 +123,9 @@ def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> A
 
 def _spelled_out(rules: Any) -> Any:
     """Returns the configuration of an observation with images that are named in it written in full."""
-    if isinstance(rules, str) and rules in NAMED_IMAGES:
-        return {"_target_": NAMED_IMAGES[rules], "crop": None, "shape": None}
+    named = named_observations().get(rules) if isinstance(rules, str) else None
+    if named and "crop" in inspect.signature(named).parameters:
+        return {"_target_": f"armscan.envs.{named.__name__}", "crop": None, "shape": None}
     if isinstance(rules, list):
         return [_spelled_out(each) for each in rules]
     if isinstance(rules, dict) and "observations" in rules:
