@@ -9,11 +9,13 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from armscan.multirun import INTERRUPTED, Outcome
 from armscan.training import TEST, Callback, EpochReport, Evaluation
 
+# Of a run's id, where there is no room for all of it.
+ID_CHARS = 8
 RESULT_ROWS = (
     ("success rate", "success_rate", "{:.1%}"),
     ("mean steps", "mean_steps", "{:.2f}"),
@@ -39,12 +41,13 @@ class ProgressBar:
     """A bar with steps, return, success rate and time left."""
 
     def __init__(self) -> None:
+        # Of a narrow terminal, the figures get what they need, and the bar what is left.
+        whole = Column(no_wrap=True)
         self._progress = Progress(
-            TextColumn("training"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("steps  {task.fields[figures]}"),
-            TimeRemainingColumn(),
+            BarColumn(bar_width=None, table_column=Column(ratio=1, min_width=4)),
+            *(MofNCompleteColumn(table_column=whole), TextColumn("{task.fields[figures]}", table_column=whole)),
+            TimeRemainingColumn(table_column=whole),
+            expand=True,
         )
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
@@ -96,7 +99,7 @@ def _figures(report: EpochReport) -> str:
     metrics = report.evaluation.metrics()
     return (
         f"return {metrics['mean_return']:6.2f}  success {metrics['success_rate']:4.0%}  "
-        f"{metrics['mean_steps']:5.2f} steps an episode"
+        f"length {metrics['mean_steps']:5.2f}"
     )
 
 
@@ -112,16 +115,21 @@ def print_results(title: str, evaluations: Mapping[str, Evaluation]) -> None:
     Console().print(table)
 
 
-def print_jobs(outcomes: Mapping[str, Outcome]) -> None:
-    """Prints the table of a multirun's jobs, by their numbers."""
+def print_jobs(outcomes: Mapping[str, Outcome], run_ids: Mapping[str, str]) -> None:
+    """Prints the table of a multirun's jobs.
+
+    Args:
+        outcomes: of the jobs, by their numbers.
+        run_ids: of those that got as far as a run, likewise.
+    """
     table = Table(title=f"jobs ({TEST})", title_justify="left")
-    for heading in ("job", "overrides", "outcome", "success rate", "mean steps"):
+    for heading in ("job", "run", "overrides", "outcome", "success rate", "mean steps"):
         table.add_column(heading)
     for number, outcome in outcomes.items():
         judged = outcome.figures.get(TEST, {})
         figures = [f"{judged['success_rate']:.1%}", f"{judged['mean_steps']:.2f}"] if judged else ["-", "-"]
         ended = {None: "done", INTERRUPTED: INTERRUPTED}.get(outcome.failure, "failed")
-        table.add_row(number, outcome.varied, ended, *figures)
+        table.add_row(number, run_ids.get(number, "-")[:ID_CHARS], outcome.varied, ended, *figures)
     Console().print(table)
 
 

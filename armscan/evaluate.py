@@ -2,14 +2,14 @@
 
     python -m armscan.evaluate run=ID                      a tracked run's agent, on the run's own volumes
     python -m armscan.evaluate run=ID data=FOLDER          ... on the volumes of a folder
-    python -m armscan.evaluate run=ID data=phantoms        ... on phantoms that no run trains on
+    python -m armscan.evaluate run=ID data=phantom         ... on phantoms that no run trains on
     python -m armscan.evaluate agent=NAME projection=zy    a baseline, with any key=value of armscan.run and
                                                            experiment=PRESET; not tracking.* and evaluation.*
 
 run=ID              the run's id, or its first four or more characters, as the UI shows them
 agent=NAME          instead of run: an agent that need not be trained
-data=FOLDER         volumes with their manifest; ./phantoms for a folder of that name
-phantoms=8          how many, with data=phantoms
+data=FOLDER         volumes with their manifest; ./phantom for a folder of that name
+phantoms=8          how many, with data=phantom
 episodes=200        for each split, in turn on its volumes
 seed=0              of the episodes; the same one gives every agent the same ones
 delta=0.01          end episodes above -delta; likewise max_steps=50, start=random, clustering=metric
@@ -36,8 +36,8 @@ from armscan.checks import check_int
 from armscan.errors import InvalidValueError
 from armscan.files import check_writable, write_whole
 from armscan.mistakes import mistake_in_one_line, quieten_libraries
-from armscan.request import PHANTOMS, Request, parse
-from armscan.settings import plain, usual_tracking
+from armscan.request import Request, parse
+from armscan.settings import PHANTOM, plain, usual_tracking
 from armscan.words import answered
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def evaluate(request: Request) -> Path:
     torch.set_num_threads(1)
     if request.folder and not Path(request.folder).is_dir():
         raise InvalidValueError(
-            f"data is {request.data!r}, but there is no such folder: it must be a folder of volumes, or {PHANTOMS}"
+            f"data is {request.data!r}, but there is no such folder: it must be a folder of volumes, or {PHANTOM}"
         )
     store = _store(request)
     if request.run is not None:

@@ -9,7 +9,7 @@ import contextlib
 import json
 import socket
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from operator import methodcaller
 from pathlib import Path
@@ -34,7 +34,7 @@ from armscan.files import (
 )
 from armscan.invocation import Invocation
 from armscan.multirun import JOB_TAG
-from armscan.settings import plain, resume_command
+from armscan.settings import evaluate_command, plain, resume_command
 from armscan.stage import Stage
 from armscan.tracking import FAMILIAR_TAG, TrackedRun, open_store
 from armscan.training import (
@@ -156,10 +156,12 @@ def carry_out(
     Returns:
         The figures of the final evaluations, by the name of their volumes.
     """
+    tell = partial(print, *([f"[{job_label}]"] if job_label else []), flush=True)
+    tell(f"run {tracked.run_id}: {tracked.name}")
     with _told_how_to_resume(tracked.run_id, tracking_uri, folder, is_told=job_label is None), tracked:
         result = None
         if isinstance(stage.experiment.agent, Learner):
-            _tell_of_longer_epochs(stage.experiment.agent, stage.experiment.budget, job_label)
+            _tell_of_longer_epochs(stage.experiment.agent, stage.experiment.budget, tell)
             budget, seed = stage.experiment.budget, VALIDATION_SEED + stage.experiment.seed
             result = train(
                 stage.experiment.agent,
@@ -176,6 +178,7 @@ def carry_out(
                 origin=stage.origin(tracked.run_id),
                 earlier=earlier,
             )
+        tell(f"playing {stage.experiment.n_episodes} episodes on the training volumes, and as many on the test volumes")
         evaluations = _judged(stage)
         film_episode(
             stage.experiment.agent, stage.film_env, folder / "episode.gif", seed=FILM_SEED + stage.experiment.seed
@@ -183,17 +186,16 @@ def carry_out(
         tracked.keep_results(result, evaluations, folder)
     if job_label is None:
         _show(result, evaluations, folder, tracking_uri)
+        print(f"judge it  {evaluate_command(tracked.run_id, tracking_uri)}")
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
 
 
-def _tell_of_longer_epochs(learner: Learner, budget: Budget, job_label: str | None) -> None:
-    """Says so where an epoch is longer than was asked for, because the agent takes more steps at once."""
+def _tell_of_longer_epochs(learner: Learner, budget: Budget, tell: Callable[[str], None]) -> None:
+    """Says so where an epoch is longer than the configuration has it, because the agent takes more steps at once."""
     if (n := learner.env_steps_at_once) > budget.epoch_env_steps:
-        label = f"[{job_label}] " if job_label else ""
-        print(
-            f"{label}validating every {n} environment steps, which the agent takes at once, instead of "
-            f"training.epoch_env_steps = {budget.epoch_env_steps}",
-            flush=True,
+        tell(
+            f"validating every {n} environment steps, which the agent takes at once "
+            f"(training.epoch_env_steps = {budget.epoch_env_steps} is less)"
         )
 
 

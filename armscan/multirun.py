@@ -159,7 +159,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     if outcomes:
         from armscan.console import print_jobs, print_where_to_look
 
-        print_jobs(outcomes)
+        print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
         if runs:
             print_where_to_look(Multirun.folder, word["tracking"]["uri"])
     for number, outcome in failed.items():

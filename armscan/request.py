@@ -9,7 +9,7 @@ from typing import Any
 
 from armscan.checks import check_int, check_seed
 from armscan.errors import InvalidValueError, listed
-from armscan.settings import CHANGES
+from armscan.settings import CHANGES, PHANTOM
 from armscan.words import read_words
 
 OWN = ("run", "data", "phantoms", "episodes", "seed", "out", "tracking", "tracking_experiment", *CHANGES)
@@ -20,7 +20,6 @@ SAID_OTHERWISE = {
     "tracking.experiment": "tracking_experiment=NAME",
     "evaluation.episodes": "episodes=NUMBER",
 }
-PHANTOMS = "phantoms"
 N_PHANTOMS, N_EPISODES = 8, 200
 
 
@@ -31,7 +30,7 @@ class Request:
     Args:
         run: the id of a tracked run, None for an agent without one.
         agent_words: what the configuration of an agent without a run is composed of.
-        data: a folder, `phantoms`, or None for the volumes of the agent's own configuration.
+        data: a folder, `phantom`, or None for the volumes of the agent's own configuration.
         n_phantoms: how many.
         n_episodes: for each split.
         seed: of the episodes.
@@ -55,7 +54,7 @@ class Request:
     @property
     def folder(self) -> str | None:
         """The folder of volumes, None for phantoms or the agent's own volumes."""
-        return None if self.data == PHANTOMS else self.data
+        return None if self.data == PHANTOM else self.data
 
     @property
     def config_words(self) -> list[str]:
@@ -79,8 +78,8 @@ def parse(words: Sequence[str]) -> Request:
         raise InvalidValueError("run and agent are both given, but a run has its agent: give one of them")
     if not with_agent and "run" not in values:
         raise InvalidValueError("run is not set, but it must be: give run=ID, or agent=NAME (--help explains)")
-    if "phantoms" in values and values.get("data") != PHANTOMS:
-        raise InvalidValueError(f"phantoms is {values['phantoms']!r}, but it is for data={PHANTOMS}")
+    if "phantoms" in values and values.get("data") != PHANTOM:
+        raise InvalidValueError(f"phantoms is {values['phantoms']!r}, but it is for data={PHANTOM}")
     if "tracking_experiment" in values and not with_agent:
         raise InvalidValueError(
             "tracking_experiment is for agent=NAME: the evaluation of a run is tracked in the run's own experiment"

@@ -33,7 +33,7 @@ from armscan.files import (
 )
 from armscan.settings import RESUME, TRACKING_URI, plain, usual_tracking
 from armscan.stage import Stage
-from armscan.tracking import TrackedRun, find_run, open_existing_store
+from armscan.tracking import TrackedRun, find_run, jobs_of, open_existing_store
 from armscan.training import Fingerprints, check_unchanged, take_up
 
 
@@ -96,8 +96,7 @@ def _folder_of(client: MlflowClient, run: Run) -> Path:
     """Returns the folder of a run that this version can go on with."""
     run_id, tags = run.info.run_id, run.data.tags
     if "folder" not in tags:
-        jobs = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run_id}'")
-        if jobs:
+        if jobs := jobs_of(client, run):
             cut_off = [job.info.run_id for job in jobs if job.info.status != "FINISHED"]
             which = ", ".join(cut_off) if cut_off else "all of them have finished"
             raise ResumeError(f"run {run_id} is the parent of a multirun, whose jobs are resumed one by one: {which}")

@@ -32,7 +32,8 @@ def run(config: DictConfig) -> None:
     if invocation.job is not None:
         start_job(config, invocation, invocation.job)
         return
-    print(f"preparing data={invocation.choices['data']}, agent={invocation.choices['agent']}", flush=True)
+    made = "" if invocation.choices["data"] == "nifti" else " (phantoms are made when first asked for, four a second)"
+    print(f"preparing data={invocation.choices['data']}, agent={invocation.choices['agent']}{made}", flush=True)
     try:
         # Deferred: a mistake on the command line should be answered before torch and the like are loaded.
         from armscan.experiment import run_experiment
@@ -77,6 +78,10 @@ def main() -> int:
             resume(sys.argv[1:])
         else:
             hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_MODULE}", config_name=CONFIG_NAME)(run)()
+    except BrokenPipeError:
+        # Whoever reads what --help prints may stop reading; nothing more can be written, not even on the way out.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except (KeyboardInterrupt, Exception) as error:
         # Raised inside compiled code, an interrupt can come out as any other error.
         if is_interruption(error):

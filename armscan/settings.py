@@ -20,6 +20,8 @@ CHANGES = {
     "device": "compute.device",
 }
 RESUME, TRACKING_URI = "resume", "tracking.uri"
+# The phantoms, where a command asks for volumes.
+PHANTOM = "phantom"
 
 
 def plain(config: DictConfig | ListConfig) -> dict[str, Any]:
@@ -39,5 +41,14 @@ def usual_tracking() -> dict[str, str]:
 
 def resume_command(run_id: str, tracking_uri: str) -> str:
     """Returns what one types to go on with a run that was cut off."""
-    store = [] if tracking_uri == usual_tracking()["uri"] else [f"{TRACKING_URI}={tracking_uri}"]
-    return shlex.join(["python", "-m", "armscan.run", f"{RESUME}={run_id}", *store])
+    return _command("armscan.run", f"{RESUME}={run_id}", TRACKING_URI, tracking_uri)
+
+
+def evaluate_command(run_id: str, tracking_uri: str) -> str:
+    """Returns what one types to judge a run's agent."""
+    return _command("armscan.evaluate", f"run={run_id}", "tracking", tracking_uri)
+
+
+def _command(module: str, of_run: str, key_of_store: str, tracking_uri: str) -> str:
+    store = [] if tracking_uri == usual_tracking()["uri"] else [f"{key_of_store}={tracking_uri}"]
+    return shlex.join(["python", "-m", module, of_run, *store])

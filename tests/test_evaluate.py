@@ -129,10 +129,10 @@ def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(answer,
     for word in (
         "success rate",
         "by Wilson",
-        "95th percentile",
+        "95th percentile of steps",
         "Dice, artery",
         "phantom-2000000",
-        "others than these",
+        "not started solved",
     ):
         assert word in printed
     contents = written(tmp_path)
@@ -201,7 +201,7 @@ def test_images_of_another_shape_are_refused_with_the_reason(answer, tmp_path, c
     assert code == 2
     assert "the agent was trained on images of" in errors
     assert "it cannot be applied to them" in errors
-    assert answer(f"run={run_id}", "data=phantoms", "phantoms=1", "episodes=1")[0] == 0
+    assert answer(f"run={run_id}", "data=phantom", "phantoms=1", "episodes=1")[0] == 0
 
 
 def test_run_that_has_not_kept_what_it_was_trained_on_is_refused_by_its_network(answer, tmp_path, coarse_folder):
@@ -296,16 +296,16 @@ def test_run_without_fingerprints_is_evaluated_with_a_note(answer, tmp_path):
     code, printed, _ = answer(f"run={run_id}", "episodes=1")
     assert code == 0
     assert "note: the run has not kept fingerprints of its volumes" in printed
-    code, printed, _ = answer(f"run={run_id}", "data=phantoms", "phantoms=1", "episodes=1")
+    code, printed, _ = answer(f"run={run_id}", "data=phantom", "phantoms=1", "episodes=1")
     assert code == 0
     assert "fingerprints" not in printed
 
 
 def test_baselines_are_evaluated_by_their_run_or_by_name(answer, tmp_path, phantom):
     run_id = tracked(tmp_path, "projection=zy", agent=GUESSER)
-    assert answer(f"run={run_id}", "data=phantoms", "phantoms=2", "episodes=2", "out=run.json")[0] == 0
+    assert answer(f"run={run_id}", "data=phantom", "phantoms=2", "episodes=2", "out=run.json")[0] == 0
     words = ["agent=sac", "~agent.network", "agent._target_=tests.test_evaluate.GuesserOfAnything", "projection=zy"]
-    code, _, errors = answer(*words, "data=phantoms", "phantoms=2", "episodes=2", "max_steps=50", "out=agent.json")
+    code, _, errors = answer(*words, "data=phantom", "phantoms=2", "episodes=2", "max_steps=50", "out=agent.json")
     assert (code, errors) == (0, "")
     by_name = json.loads((tmp_path / "agent.json").read_text())
     assert by_name["of"] == "sac"
@@ -317,7 +317,7 @@ def test_baseline_takes_a_preset_as_a_run_does_and_an_experiment_of_mlflow(answe
     words = [
         "agent=random",
         "experiment=best_full",
-        "data=phantoms",
+        "data=phantom",
         "phantoms=1",
         "episodes=1",
         "tracking_experiment=x",
@@ -328,6 +328,15 @@ def test_baseline_takes_a_preset_as_a_run_does_and_an_experiment_of_mlflow(answe
     (run,) = client.search_runs([client.get_experiment_by_name("x").experiment_id])
     assert run.data.params["projection"] == "full"
     assert run.data.params["agent._target_"] == "armscan.agents.Random"
+
+
+def test_evaluate_of_a_multirun_asks_for_one_of_its_jobs(answer, tmp_path):
+    job_id = tracked(tmp_path)
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    parent = client.create_run(client.get_run(job_id).info.experiment_id, run_name="multirun")
+    client.set_tag(job_id, "mlflow.parentRunId", parent.info.run_id)
+    _, _, errors = answer(f"run={parent.info.run_id}")
+    assert errors == f"error: run {parent.info.run_id} is the parent of a multirun: give one of its jobs, {job_id}"
 
 
 class GuesserOfAnything(Guesser):
@@ -347,7 +356,7 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         (["run=ffffffff"], "the run is 'ffffffff', but no run of sqlite:///"),
         ([f"run={run_id}", "tracking=sqlite:///no.db"], "tracking.uri is 'sqlite:///no.db', but there is no "),
         ([f"run={run_id}", "data=/nowhere"], "data is '/nowhere', but there is no such folder: it must be "),
-        (["agent=random", "data=phantom"], "data is 'phantom', but there is no such folder: it must be a folder of "),
+        (["agent=random", "data=phantoms"], "data is 'phantoms', but there is no such folder: it must be a folder of "),
         (
             ["agent=random", f"data={data_folder}", "data.n_test=1"],
             "there is no key 'n_test' in data, but only path, validation, test or split_seed",
@@ -355,10 +364,10 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         ([f"run={run_id}", "episodes=0"], "episodes is 0, but it must be a whole number of at least 1"),
         ([f"run={run_id}", f"data={data_folder}", "episodes=3"], "episodes, of which each of 4 volumes is to have one"),
         ([f"run={run_id}", "seed=-1"], "seed is -1, but it must be a whole number of at least 0"),
-        ([f"run={run_id}", "phantoms=3"], "phantoms is 3, but it is for data=phantoms"),
+        ([f"run={run_id}", "phantoms=3"], "phantoms is 3, but it is for data=phantom"),
         ([f"run={run_id}", "experiment=x"], "experiment is a preset, for agent=NAME"),
         (
-            ["agent=random", "experiment=best_zy", "data=phantoms"],
+            ["agent=random", "experiment=best_zy", "data=phantom"],
             "experiment sets agent.final_lr_share, but the agent",
         ),
         ([f"run={run_id}", "tracking_experiment=x"], "tracking_experiment is for agent=NAME"),

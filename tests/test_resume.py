@@ -168,10 +168,13 @@ def test_interrupted_run_says_how_to_go_on_and_only_one_process_may(tmp_path):
         assert process.poll() is None
         time.sleep(0.1)
     (run,) = runs_in(tmp_path)[1]
+    # Still at work, and not done before the other has started.
+    process.send_signal(signal.SIGSTOP)
     beside = armscan_run(f"resume={run.info.run_id}", cwd=tmp_path)
     assert beside.returncode == 2
     assert "another process is at work in this folder" in beside.stderr
     assert len(beside.stderr.splitlines()) == 1
+    process.send_signal(signal.SIGCONT)
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=60) == 130
     assert f"resume with: python -m armscan.run resume={run.info.run_id}\n" in (tmp_path / "printed").read_text()
@@ -187,10 +190,18 @@ def test_interrupted_run_says_how_to_go_on_and_only_one_process_may(tmp_path):
 
 @pytest.mark.slow
 def test_killed_job_of_a_multirun_is_resumed_by_its_own_id(tmp_path):
-    command = [sys.executable, *COMMAND, "-m", "seed=0,1", *LONGER, "training.env_steps=2000"]
+    command = [
+        sys.executable,
+        *COMMAND,
+        "-m",
+        "seed=0,1",
+        "hydra.launcher.n_jobs=2",
+        *LONGER,
+        "training.env_steps=2000",
+    ]
     with (tmp_path / "printed").open("w") as printed:
         process = subprocess.Popen(command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT)
-    while (tmp_path / "printed").read_text().count("[0 seed=0] ") < 3:
+    while (tmp_path / "printed").read_text().count("[0 seed=0] ") < 4:
         assert process.poll() is None
         time.sleep(0.1)
     os.kill(job_process_ids(process.pid)[0], signal.SIGKILL)

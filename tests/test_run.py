@@ -54,6 +54,8 @@ def test_run_trains_evaluates_and_tracks(tmp_path):
     for word in ("400/400 steps", "return", "success", "left", "test volumes", "mlflow ui", "episode.gif"):
         assert word in ended.stdout
     client, (tracked,) = runs_in(tmp_path)
+    assert f"run {tracked.info.run_id}: sac-cluster-y-phantom-seed3" in ended.stdout
+    assert f"python -m armscan.evaluate run={tracked.info.run_id}" in ended.stdout
     assert tracked.info.status == "FINISHED"
     assert tracked.data.params["network.hidden_sizes"] == "[16]"
     assert tracked.data.params["env.transform.rz_deg"] == "10.0"
@@ -90,7 +92,7 @@ def test_run_says_when_it_validates_where_the_agent_takes_more_steps_at_once_tha
     words = [word for word in SMALL if not word.startswith("agent.random")]
     ended = armscan_run(*words, "agent=ppo", "agent.env_steps_per_collection=250", cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
-    assert "validating every 256 environment steps, which the agent takes at once, instead of" in ended.stdout
+    assert "validating every 256 environment steps, which the agent takes at once" in ended.stdout
     assert "training.epoch_env_steps = 200" in ended.stdout
     assert "512/400 steps" in ended.stdout
 
@@ -110,6 +112,8 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     assert parent.data.tags["failure.1"].startswith("obs=cluster env.delta=7: delta is 7")
     assert [child.data.tags["mlflow.parentRunId"] for child in children] == [parent.info.run_id] * 2
     assert {child.info.status for child in children} == {"FINISHED"}
+    table = ended.stdout[ended.stdout.index("jobs (") :]
+    assert all(child.info.run_id[:8] in table for child in children)
     assert {child.data.tags["choice.obs"] for child in children} == {"cluster", "action_reward"}
     assert len(list((tmp_path / "multirun").glob("*/*/*/best.pt"))) == 2
 
@@ -236,7 +240,7 @@ def test_run_works_from_the_wheel_without_the_repository(tmp_path):
     assert (installed / "armscan" / "run.py").is_file()
 
 
-@pytest.mark.parametrize("multirun", [[], ["-m", "seed=0,1"]], ids=["single", "multirun"])
+@pytest.mark.parametrize("multirun", [[], ["-m", "seed=0,1", "hydra.launcher.n_jobs=2"]], ids=["single", "multirun"])
 def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
     command = [sys.executable, "-m", "armscan.run", *multirun, *SMALL, "training.env_steps=500000"]
     with (tmp_path / "printed").open("w") as printed:
@@ -266,7 +270,16 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
     ids=lambda value: getattr(value, "name", ""),
 )
 def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
-    command = [sys.executable, "-m", "armscan.run", "-m", "seed=0,1", *SMALL, "training.env_steps=8000"]
+    command = [
+        sys.executable,
+        "-m",
+        "armscan.run",
+        "-m",
+        "seed=0,1",
+        "hydra.launcher.n_jobs=2",
+        *SMALL,
+        "training.env_steps=8000",
+    ]
     with (tmp_path / "printed").open("w") as printed:
         process = subprocess.Popen(command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT)
     deadline_s = time.monotonic() + 240
@@ -286,7 +299,10 @@ def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
 
 
 def job_process_ids(launcher_pid):
-    """The processes of a multirun's jobs: the grandchildren of the launcher."""
-    listing = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True, check=True).stdout
-    parents = dict(map(int, line.split()) for line in listing.splitlines())
-    return [pid for pid, parent in parents.items() if parents.get(parent) == launcher_pid]
+    """The processes of a multirun's jobs: children of the launcher's workers, or of itself where one core is had."""
+    listing = subprocess.run(["ps", "-ewwo", "pid=,ppid=,args="], capture_output=True, text=True, check=True).stdout
+    # Of a program in several lines, ps makes one.
+    processes = [line.split(maxsplit=2) for line in listing.splitlines()]
+    parents = {int(pid): int(parent) for pid, parent, *_ in processes}
+    jobs = [int(pid) for pid, _, *program in processes if "run_job()" in " ".join(program)]
+    return [pid for pid in jobs if launcher_pid in (parents[pid], parents.get(parents[pid]))]

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
@@ -21,10 +22,9 @@ TOTAL = "all volumes"
 REFUSED_BY_MLFLOW = re.compile(r"[^A-Za-z0-9_\-. /:]")
 SUMMARY_ROWS = (
     ("success rate", "success_rate", "{:.1%}"),
-    ("  by Wilson", "success_rate_wilson", "{:.1%}"),
     ("mean steps", "mean_steps", "{:.2f}"),
     ("median steps", "median_steps", "{:.1f}"),
-    ("95th percentile", "p95_steps", "{:.1f}"),
+    ("95th percentile of steps", "p95_steps", "{:.1f}"),
     ("mean final reward", "mean_final_reward", "{:.3f}"),
     ("mean best reward", "mean_best_reward", "{:.3f}"),
     ("mean distance (mm)", "mean_distance_mm", "{:.1f}"),
@@ -130,18 +130,21 @@ def _summary(figures: Mapping[str, Figures]) -> Table:
     for text, key, form in SUMMARY_ROWS:
         times = SHOWN_TIMES.get(key, 1.0)
         table.add_row(text, *(_cell(each.estimates[key], form, times=times, apart=apart) for each in figures.values()))
+        if key == "success_rate":
+            wilson = (each.estimates["success_rate_wilson"] for each in figures.values())
+            table.add_row("  its interval by Wilson", *(_interval(estimate, form) for estimate in wilson))
     table.add_section()
     for text, count in (("volumes", "n_volumes"), ("episodes", "n_episodes"), ("started solved", "n_started_solved")):
         table.add_row(text, *(str(getattr(each, count)) for each in figures.values()))
     table.add_section()
-    table.add_row("others than these:")
+    table.add_row("those not started solved:")
     for text, key, form in ROWS_OF_THE_OTHERS:
         table.add_row(f"  {text}", *(_cell(each.estimates[key], form, apart=apart) for each in figures.values()))
     return table
 
 
 def _by_volume(label: str, volumes: Mapping[str, Figures]) -> Table:
-    table = Table(title=f"{label}, each", title_justify="left")
+    table = Table(title=f"{label}, each", title_justify="left", box=SIMPLE_HEAD)
     table.add_column("volume", overflow="fold")
     table.add_column("n", justify="right")
     for heading, _, _ in VOLUME_COLUMNS:
@@ -155,10 +158,14 @@ def _by_volume(label: str, volumes: Mapping[str, Figures]) -> Table:
 def _cell(estimate: Estimate, form: str, *, times: float = 1.0, apart: str) -> str:
     if math.isnan(estimate.value):
         return "-"
-    value, low, high = (form.format(number * times) for number in estimate)
+    return f"{form.format(estimate.value * times)}{apart}{_interval(estimate, form, times=times)}"
+
+
+def _interval(estimate: Estimate, form: str, *, times: float = 1.0) -> str:
+    low, high = (form.format(number * times) for number in (estimate.low, estimate.high))
     # Of two percentages, one sign is enough; a dash between numbers below zero would be read as another minus.
     between = " to " if estimate.low < 0 else "–"
-    return f"{value}{apart}{low.removesuffix('%')}{between}{high}"
+    return f"{low.removesuffix('%')}{between}{high}"
 
 
 def _plain(figures: Figures) -> dict[str, Any]:

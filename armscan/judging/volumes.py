@@ -11,11 +11,11 @@ from hydra.utils import instantiate
 from armscan.errors import InvalidValueError
 from armscan.judging.subject import Subject
 from armscan.mistakes import mistake_in_one_line
+from armscan.settings import PHANTOM
 from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged, fingerprint
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 
-PHANTOMS = "phantoms"
 # No phantom of a run has these seeds: its test phantoms begin a million below.
 PHANTOMS_FIRST_SEED = 3_000_000
 Volumes = dict[str, LabelVolume]
@@ -54,14 +54,14 @@ def volume_groups(data: str | None, n_phantoms: int, own: Callable[[], Split]) -
     """Returns the volumes to judge on, by what they are called.
 
     Args:
-        data: a folder, `phantoms` for phantoms that no run trains on, None for the agent's own volumes.
+        data: a folder, `phantom` for phantoms that no run trains on, None for the agent's own volumes.
         n_phantoms: how many phantoms.
         own: reads the agent's own volumes.
     """
     if data is None:
         split = own()
         return {TRAINING: split.training, VALIDATION: split.validation, TEST: split.test}
-    if data == PHANTOMS:
+    if data == PHANTOM:
         return {"new phantoms": load_phantoms(range(PHANTOMS_FIRST_SEED, PHANTOMS_FIRST_SEED + n_phantoms), None)}
     dataset = open_dataset(data)
     groups = {f"{split} split": dataset.volumes_of(split) for split in SPLITS}

@@ -1,6 +1,6 @@
 """MLflow: the store, its runs, and the pictures that go there."""
 
-from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, find_run, found_run
+from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, find_run, found_run, jobs_of
 from armscan.tracking.pictures import draw_learning_curve
 from armscan.tracking.run import TrackedRun
 from armscan.tracking.source import source_tags
@@ -14,6 +14,7 @@ __all__ = [
     "draw_learning_curve",
     "find_run",
     "found_run",
+    "jobs_of",
     "open_existing_store",
     "open_store",
     "source_tags",

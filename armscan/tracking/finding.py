@@ -84,7 +84,7 @@ class FoundRun:
         if file not in self.files:
             raise TrackingError(
                 f"run {self.run_id} has no {file} among its artifacts, as each run of armscan.run has from its start: "
-                "it was removed, or this is the parent of a multirun, or something else"
+                "it was removed, or this is something else"
             )
         contents = self._fetched(file, folder).read_bytes()
         if sum_of(contents) != self.tags.get(SUM_TAGS[file], sum_of(contents)):
@@ -111,7 +111,11 @@ def found_run(uri: str, run_id: str) -> FoundRun:
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     client = open_existing_store(uri)
     with usable_store(uri):
-        return _found(client, uri, find_run(client, run_id))
+        run = find_run(client, run_id)
+        if jobs := jobs_of(client, run):
+            ids = listed([job.info.run_id for job in jobs])
+            raise TrackingError(f"run {run.info.run_id} is the parent of a multirun: give one of its jobs, {ids}")
+        return _found(client, uri, run)
 
 
 def find_run(client: MlflowClient, run_id: str) -> Run:
@@ -140,6 +144,12 @@ def find_run(client: MlflowClient, run_id: str) -> Run:
         ids = [run.info.run_id for run in found[:N_SHOWN]] + (["others"] if len(found) > N_SHOWN else [])
         raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the id")
     return found[0]
+
+
+def jobs_of(client: MlflowClient, run: Run) -> list[Run]:
+    """Returns the runs of a multirun's jobs, by its parent run; none where the run is another."""
+    children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
+    return [child for child in children if EVALUATED_TAG not in child.data.tags]
 
 
 def _found(client: MlflowClient, uri: str, run: Run) -> FoundRun:
