@@ -23,12 +23,14 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from benchmarks.runs import finished_run
 
 HERE = Path(__file__).parent
 PICTURE = HERE.parent / "docs" / "images" / "published.png"
 LENGTHS = (10, 5, 2)
+TICKS = (1, 2, 5, 10, 20, 50, 100)
 N_SMOOTHED = 5
 
 
@@ -160,6 +162,8 @@ def draw(found: dict[str, dict[str, Curve]], path: Path) -> None:
         panel.axhline(at_random, color="black", linestyle=":", linewidth=0.8, label="published, random planes")
         panel.set(title=EXPERIMENTS[name].title, xscale="log", yscale="log", xlabel="environment steps")
         panel.set_ylabel("mean steps an episode")
+        panel.set_yticks(TICKS, [str(tick) for tick in TICKS])
+        panel.yaxis.set_minor_formatter(NullFormatter())
         panel.grid(alpha=0.3, which="both")
         panel.legend(fontsize=7)
     for panel in panels[len(found) :]:
