@@ -57,8 +57,12 @@ class Experiment:
     smallest_slice_px: tuple[int, int]
 
 
-def build(config: DictConfig) -> Experiment:
+def build(config: DictConfig, split: Split | None = None) -> Experiment:
     """Builds an experiment from its composed configuration.
+
+    Args:
+        config: all of it.
+        split: its volumes, where they have been read already.
 
     Raises:
         InvalidValueError: if something in it is not allowed.
@@ -66,7 +70,8 @@ def build(config: DictConfig) -> Experiment:
     check_sections(config)
     seed = check_seed("seed", config.seed)
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
-    split, budget = instantiate(config.data, _convert_="object"), instantiate(config.training, _convert_="object")
+    split = split or instantiate(config.data, _convert_="object")
+    budget = instantiate(config.training, _convert_="object")
     smallest = smallest_slice([*split.training.values(), *split.validation.values(), *split.test.values()])
     maker = make_maker(with_one_crop(config, smallest, smallest), split.training)
     agent = make_agent(config, maker, split.training, total_env_steps=budget.env_steps, seed=seed)

@@ -68,6 +68,10 @@ class TrackingError(ArmscanError, RuntimeError):
     """The tracking store cannot be reached or used."""
 
 
+class StudyError(ArmscanError, RuntimeError):
+    """A study cannot be started or gone on with."""
+
+
 def is_interruption(error: BaseException | None) -> bool:
     """Whether an error is an interrupt, or came of one: raised inside compiled code, it can come out as any other."""
     while error is not None:

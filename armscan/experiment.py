@@ -41,6 +41,7 @@ from armscan.training import (
     TEST,
     TRAINING,
     Budget,
+    Callback,
     EpochReport,
     Evaluation,
     Familiar,
@@ -162,24 +163,10 @@ def carry_out(
         result = None
         if isinstance(stage.experiment.agent, Learner):
             _tell_of_longer_epochs(stage.experiment.agent, stage.experiment.budget, tell)
-            budget, seed = stage.experiment.budget, VALIDATION_SEED + stage.experiment.seed
-            result = train(
-                stage.experiment.agent,
-                budget,
-                partial(
-                    evaluate,
-                    stage.experiment.agent,
-                    stage.validation_env,
-                    n_episodes=budget.validation_episodes,
-                    seed=seed,
-                ),
-                folder,
-                callbacks=[progress_reporter(job_label), tracked],
-                origin=stage.origin(tracked.run_id),
-                earlier=earlier,
-            )
+            callbacks = [progress_reporter(job_label), tracked]
+            result = learned(stage, folder, callbacks, run_id=tracked.run_id, earlier=earlier)
         tell(f"playing {stage.experiment.n_episodes} episodes on the training volumes, and as many on the test volumes")
-        evaluations = _judged(stage)
+        evaluations = judged(stage)
         film_episode(
             stage.experiment.agent, stage.film_env, folder / "episode.gif", seed=FILM_SEED + stage.experiment.seed
         )
@@ -188,6 +175,17 @@ def carry_out(
         _show(result, evaluations, folder, tracking_uri)
         print(f"judge it  {evaluate_command(tracked.run_id, tracking_uri)}")
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
+
+
+def learned(
+    stage: Stage, folder: Path, callbacks: Sequence[Callback], *, run_id: str, earlier: Sequence[EpochReport] = ()
+) -> TrainingResult:
+    """Trains the agent of a stage, which is one that learns, and returns the course of it; see `train`."""
+    agent, budget = stage.experiment.agent, stage.experiment.budget
+    assert isinstance(agent, Learner)
+    seed = VALIDATION_SEED + stage.experiment.seed
+    validate = partial(evaluate, agent, stage.validation_env, n_episodes=budget.validation_episodes, seed=seed)
+    return train(agent, budget, validate, folder, callbacks, origin=stage.origin(run_id), earlier=earlier)
 
 
 def _tell_of_longer_epochs(learner: Learner, budget: Budget, tell: Callable[[str], None]) -> None:
@@ -199,7 +197,8 @@ def _tell_of_longer_epochs(learner: Learner, budget: Budget, tell: Callable[[str
         )
 
 
-def _judged(stage: Stage) -> dict[str, Evaluation]:
+def judged(stage: Stage) -> dict[str, Evaluation]:
+    """Returns the final evaluations of a stage's agent, on the training and on the test volumes, by their names."""
     agent, n_episodes, seed = stage.experiment.agent, stage.experiment.n_episodes, stage.experiment.seed
     return {
         TRAINING: evaluate(agent, stage.training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),

@@ -64,6 +64,7 @@ def quieten_libraries() -> None:
     """Keeps warnings of libraries that a user can do nothing about off the screen."""
     for message in (
         "Gym has been unmaintained",
+        ".*is an experimental feature.*",
         ".*Deprecat.*",
         ".*is not divisible by the number of test environments.*",
     ):

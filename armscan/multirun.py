@@ -78,6 +78,9 @@ class Multirun(Callback):
     def _start(config: DictConfig) -> None:
         from armscan.tracking import open_store, source_tags
 
+        if config.get("study") is not None:
+            # It has a run of its own, which outlives many starts of workers.
+            return
         folder = Path(config.hydra.sweep.dir)
         if not isinstance(config.tracking, DictConfig):
             raise InvalidValueError(f"tracking is {config.tracking!r}, but it must be a section, such as its default")

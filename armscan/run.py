@@ -11,9 +11,12 @@ for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", 
 
 import signal
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NoReturn
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from armscan.errors import is_interruption
@@ -27,7 +30,14 @@ WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
 
 
 def run(config: DictConfig) -> None:
-    """What Hydra calls: a single run, or one job of a multirun."""
+    """What Hydra calls: a single run, one job of a multirun, or one worker of a study."""
+    if config.get("study") is not None:
+        # Deferred, because only studies need Optuna.
+        from armscan.sweeps.command import run_worker
+
+        hydra_config = HydraConfig.get()
+        run_worker(config, list(hydra_config.overrides.task), Path(hydra_config.sweep.dir))
+        return
     invocation = Invocation.current()
     if invocation.job is not None:
         start_job(config, invocation, invocation.job)
@@ -59,6 +69,12 @@ def raise_or_exit(error: BaseException) -> NoReturn:
     raise SystemExit(2)
 
 
+def launched(words: Sequence[str]) -> None:
+    """Runs the command with Hydra, as if these words had been typed."""
+    sys.argv[1:] = words
+    hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_MODULE}", config_name=CONFIG_NAME)(run)()
+
+
 def main() -> int:
     """Runs what the command line asks for; returns the exit code."""
     if os.environ.get("HYDRA_FULL_ERROR") == "1":
@@ -76,8 +92,12 @@ def main() -> int:
             from armscan.resume import resume
 
             resume(sys.argv[1:])
+        elif any(word.startswith("sweeps=") for word in sys.argv[1:]):
+            from armscan.sweeps.command import run_study
+
+            return run_study(sys.argv[1:], launched)
         else:
-            hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_MODULE}", config_name=CONFIG_NAME)(run)()
+            launched(sys.argv[1:])
     except BrokenPipeError:
         # Whoever reads what --help prints may stop reading; nothing more can be written, not even on the way out.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -2,7 +2,7 @@
 
 from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, find_run, found_run, jobs_of
 from armscan.tracking.pictures import draw_learning_curve
-from armscan.tracking.run import TrackedRun
+from armscan.tracking.run import TrackedRun, flattened
 from armscan.tracking.source import source_tags
 from armscan.tracking.store import open_existing_store, open_store
 
@@ -13,6 +13,7 @@ __all__ = [
     "TrackedRun",
     "draw_learning_curve",
     "find_run",
+    "flattened",
     "found_run",
     "jobs_of",
     "open_existing_store",

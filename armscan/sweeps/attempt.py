@@ -1,0 +1,143 @@
+"""One attempt at a trial: what it tries, what it reports, and what ties it to its tracked run and its folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import optuna
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf, open_dict
+from optuna.trial import Trial
+
+from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
+from armscan.sweeps.ledger import ENV_STEPS, RETRY_OF, SEEDS
+from armscan.sweeps.space import Value, overrides_of
+from armscan.tracking import TrackedRun
+
+# User attributes of a trial.
+RUN, FOLDER, CONFIG_SUM = "mlflow_run", "folder", "config_sha256"
+TRIAL_DIGITS = 4
+
+
+@dataclass
+class Attempt:
+    """One attempt at a trial.
+
+    Args:
+        trial: as it stands in the storage.
+        chosen: its values by name.
+        words: of the command line, that its configuration is composed of, but for these.
+        seeds: it is run with, one after another.
+        study_folder: of the study.
+        run_id: of its tracked run.
+        objective: the figure that is reported while it runs; None where it is not.
+        tell_progress: takes what is known of how far it is.
+        opened: takes the tracked run of a training while it goes on, and None when it has ended.
+    """
+
+    trial: Trial
+    chosen: Mapping[str, Value]
+    words: Sequence[str]
+    seeds: tuple[int, ...]
+    study_folder: Path
+    run_id: str
+    objective: str | None
+    tell_progress: Callable[[dict[str, Any]], None]
+    opened: Callable[[TrackedRun | None], None]
+    env_steps: int = field(default=0, init=False)
+    _reported: set[int] = field(default_factory=set, init=False)
+
+    @property
+    def folder(self) -> Path:
+        """Where it leaves its files."""
+        return trial_folder(self.study_folder, self.trial.number)
+
+    @property
+    def folder_before(self) -> Path | None:
+        """That of the attempt whose place it takes; None where it is the first."""
+        number = self.trial.user_attrs.get(RETRY_OF)
+        return None if number is None else trial_folder(self.study_folder, number)
+
+    @property
+    def overrides(self) -> list[str]:
+        """What tells its configuration from that of other trials."""
+        return overrides_of(self.chosen)
+
+    def config(self, seed: int) -> tuple[DictConfig, dict[str, str]]:
+        """Returns the configuration of one of its trainings, and what was chosen of each group."""
+        return composed([*self.words, *self.overrides, f"seed={seed}"])
+
+    @property
+    def seeds_done(self) -> dict[int, dict[str, float]]:
+        """The figures of the seeds that have been run to their end, also by an attempt before."""
+        return {int(seed): figures for seed, figures in self.trial.user_attrs.get(SEEDS, {}).items()}
+
+    def keep_seed(self, seed: int, figures: Mapping[str, float]) -> None:
+        """Notes the figures of a seed that has been run to its end."""
+        self.trial.set_user_attr(SEEDS, {str(each): one for each, one in (self.seeds_done | {seed: figures}).items()})
+
+    def report(self, figures: Mapping[str, float], *, seed: int, n_env_steps: int, grid: int, total: int) -> None:
+        """Reports how a training is going.
+
+        Args:
+            figures: of the last validation.
+            seed: of the training.
+            n_env_steps: it has taken.
+            grid: environment steps between two reports: trials are compared at the same step, whatever theirs are.
+            total: environment steps of a whole training.
+
+        Raises:
+            optuna.TrialPruned: if the trial is not worth going on with.
+        """
+        done = [one for each, one in self.seeds_done.items() if each in self.seeds]
+        self.env_steps = sum(int(one[ENV_STEPS]) for one in done) + n_env_steps
+        self.tell_progress({"seed": seed, ENV_STEPS: self.env_steps, "return": figures["mean_return"]})
+        if self.objective is None or self.objective not in figures:
+            return
+        step = self.seeds.index(seed) * total + n_env_steps // grid * grid
+        if step in self._reported:
+            return
+        self._reported.add(step)
+        values = [one[self.objective] for one in done] + [figures[self.objective]]
+        self.trial.report(sum(values) / len(values), step)
+        if self.trial.should_prune():
+            raise optuna.TrialPruned
+
+
+def trial_folder(study_folder: Path, number: int) -> Path:
+    """Returns the folder of a trial."""
+    return study_folder / "trials" / f"{number:0{TRIAL_DIGITS}}"
+
+
+def composed(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+    """Returns the configuration of a run, without the section of the study, and what was chosen of each group."""
+    GlobalHydra.instance().clear()
+    with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
+        config = compose(CONFIG_NAME, list(words), return_hydra_config=True)
+    choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
+    with open_dict(config):
+        for section in ("study", "hydra"):
+            config.pop(section, None)
+    return config, choices
+
+
+def study_section(words: Sequence[str]) -> dict[str, Any]:
+    """Returns the section `study` of a configuration as plain values."""
+    GlobalHydra.instance().clear()
+    with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
+        section = compose(CONFIG_NAME, list(words)).get("study")
+    plain = OmegaConf.to_container(section, resolve=True, throw_on_missing=True) if section is not None else {}
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def sum_of_config(config: Mapping[str, Any]) -> str:
+    """Returns a sum of a configuration's values, but for the seed, which the runs of one trial differ by."""
+    values = {key: value for key, value in config.items() if key != "seed"}
+    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()

@@ -1,0 +1,39 @@
+"""Whether every value of a search space is one that a run can be built with, before anything is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from armscan.errors import ArmscanError, InvalidValueError
+from armscan.mistakes import mistake_in_one_line
+from armscan.sweeps.attempt import composed
+from armscan.sweeps.settings import StudySettings
+from armscan.sweeps.space import overrides_of
+from armscan.sweeps.tasks import Task
+
+
+def check_space(settings: StudySettings, task: Task, words: Sequence[str], config: DictConfig) -> None:
+    """Builds what is run as it is without the space, then with each choice and both ends of each range.
+
+    Args:
+        settings: of the study.
+        task: what its trials do.
+        words: of the command line.
+        config: that they are composed to.
+
+    Raises:
+        InvalidValueError: if a key is unknown, or a value not allowed.
+    """
+    task.check(config)
+    for chosen in settings.space.extremes():
+        overrides = overrides_of(chosen)
+        try:
+            with_it, _ = composed([*words, *overrides])
+            task.check(with_it)
+        except (ArmscanError, HydraException, OmegaConfBaseException) as error:
+            line = mistake_in_one_line(error, [*words, *overrides]) or str(error)
+            raise InvalidValueError(f"study.space: {' '.join(overrides)} is not allowed: {line}") from error

@@ -1,0 +1,166 @@
+"""Signs of life: a worker renews the lease of its trial, and takes over the trials of those who no longer do."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from optuna.trial import FrozenTrial, Trial
+
+from armscan.sweeps.ledger import LEASE, Ledger
+
+BEAT_S, TICK_S = 10.0, 0.25
+# Missed beats before a worker counts as dead: a busy storage may hold up some.
+DEAD_AFTER_S = 40.0
+
+
+def process_start(pid: int) -> str:
+    """Returns when a process of this machine was started, as the system counts, so that its id is no other's.
+
+    An empty text where there is no such process, or nothing but its exit code is left of it.
+    """
+    try:
+        # The name before it, in brackets, may hold anything.
+        state, *others = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return "" if state == "Z" else others[18]
+    except (OSError, ValueError, IndexError):
+        return ""
+
+
+class LimitReachedError(Exception):
+    """The study's time or environment steps are spent: what is at hand is not gone on with."""
+
+
+class Witness:
+    """Tells the dead from the living, by its own clock: clocks of machines differ."""
+
+    def __init__(self) -> None:
+        self._seen: dict[int, tuple[Any, float]] = {}
+        self._host = socket.gethostname()
+
+    def is_dead(self, trial: FrozenTrial) -> bool:
+        """Whether the worker of a running trial is: its process is gone, or its lease has not been renewed for long."""
+        lease = trial.user_attrs.get(LEASE, {})
+        if lease.get("host") == self._host and Path("/proc/self/stat").exists():
+            return process_start(lease["pid"]) != str(lease["started"])
+        sign = lease.get("worker"), lease.get("beat")
+        before, since_s = self._seen.get(trial.number, (None, 0.0))
+        if before != sign:
+            since_s = time.monotonic()
+            self._seen[trial.number] = sign, since_s
+        return time.monotonic() - since_s > DEAD_AFTER_S
+
+
+class Keeper:
+    """Renews the lease of the trial that is at hand, looks after dead workers, and leaves when told to.
+
+    Args:
+        ledger: of the study.
+        worker: what this worker is called.
+        is_told_to_leave: asked several times a second.
+        leave: called, in another thread than the worker's, to end the process; what is at hand is handed back then.
+        on_death: told of each trial whose worker had died.
+    """
+
+    def __init__(
+        self,
+        ledger: Ledger,
+        worker: str,
+        *,
+        is_told_to_leave: Callable[[], bool],
+        leave: Callable[[], None],
+        on_death: Callable[[FrozenTrial], None],
+    ) -> None:
+        pid = os.getpid()
+        self._lease: dict[str, Any] = {
+            "worker": worker,
+            "host": socket.gethostname(),
+            "pid": pid,
+            "started": process_start(pid),
+            "beat": 0,
+        }
+        self._ledger, self._witness = ledger, Witness()
+        self._is_told_to_leave, self._leave, self._on_death = is_told_to_leave, leave, on_death
+        self._trial: Trial | None = None
+        self._close: Callable[[], None] | None = None
+        self._spent: str | None = None
+        # Held while a trial changes hands, so that none is forgotten by who leaves in the middle of it.
+        self._changing = threading.Lock()
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._keep, daemon=True)
+
+    @contextmanager
+    def at_work(self) -> Iterator[None]:
+        """Keeps watch as long as it lasts."""
+        self._thread.start()
+        try:
+            yield
+        finally:
+            self._stopped.set()
+            self._thread.join()
+
+    def claim(self) -> Trial | None:
+        """Takes a trial, as `Ledger.claim` does, and holds it from then on."""
+        with self._changing:
+            self._trial = self._ledger.claim(self._lease)
+            self._lease = {key: self._lease[key] for key in ("worker", "host", "pid", "started", "beat")}
+            return self._trial
+
+    def closing(self, close: Callable[[], None] | None) -> None:
+        """Says how to close what the trial has open, where the process is told to leave."""
+        self._close = close
+
+    def tell_progress(self, figures: dict[str, Any]) -> None:
+        """Notes how far the trial is, for the next renewal of the lease.
+
+        Raises:
+            LimitReachedError: if no trial is to be gone on with.
+        """
+        self._lease = self._lease | figures
+        if self._spent is not None:
+            raise LimitReachedError(self._spent)
+
+    def hand_back(self) -> None:
+        """Leaves the trial, if one is held, for another to go on with."""
+        with self._changing:
+            if self._trial is not None:
+                self._ledger.hand_back(self._trial, self._lease)
+            if self._close is not None:
+                self._close()
+            self._trial = self._close = None
+
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """What a trial is ended in: afterwards it is not held any more."""
+        with self._changing:
+            yield
+            self._trial = self._close = None
+
+    def _keep(self) -> None:
+        next_beat_s = time.monotonic()
+        while not self._stopped.wait(TICK_S):
+            if self._is_told_to_leave():
+                self.hand_back()
+                self._leave()
+            if time.monotonic() >= next_beat_s:
+                next_beat_s = time.monotonic() + BEAT_S
+                try:
+                    self._beat()
+                # Whatever a storage raises that is away for a while: the next beat may find it there again.
+                except Exception as error:
+                    print(f"no sign of life could be given: {error!r}", flush=True)
+
+    def _beat(self) -> None:
+        with self._changing:
+            if self._trial is not None:
+                self._lease = self._lease | {"beat": self._lease["beat"] + 1}
+                self._ledger.renew(self._trial, self._lease)
+        for trial in self._ledger.reclaim(self._witness.is_dead):
+            self._on_death(trial)
+        self._spent = self._ledger.spent(self._ledger.tally())

@@ -1,0 +1,242 @@
+"""Who runs which trial: what is claimed, handed back, taken up again after a death, and when there is enough.
+
+All of it is decided from what stands in the storage, by one process at a time; nothing is kept in memory that a worker
+could take with it when it dies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Self
+
+import optuna
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.trial import FrozenTrial, Trial, TrialState
+
+from armscan.sweeps.storage import Storage
+
+# User attributes of a trial.
+LEASE, ENV_STEPS, FIGURES, FAILURE = "lease", "env_steps", "figures", "failure"
+RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
+# Of those, what a retry has from the attempt before: the seeds that are done, and what it is to be judged for.
+JUDGED, JUDGED_SEED = "judged", "judged_seed"
+KEPT_BY_RETRY = (SEEDS, JUDGED, JUDGED_SEED)
+FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+# After this many failures, with no trial that got anywhere, the fault is in the configuration and not in a trial.
+FAILURES_AT_ONCE = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """When a study has enough.
+
+    Args:
+        n_trials: that finish.
+        max_failures: trials that may fail for good.
+        max_retries: of a trial whose worker died.
+        hours: wall time in which trials run; None for no limit.
+        env_steps: of all trials; None for no limit.
+    """
+
+    n_trials: int
+    max_failures: int = 10
+    max_retries: int = 1
+    hours: float | None = None
+    env_steps: int | None = None
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How a study stands.
+
+    Args:
+        finished: trials that ran to their end or were pruned.
+        running: trials that somebody runs.
+        waiting: trials that were handed back, or are to be taken up again.
+        failed: trials that raised, or whose workers died too often.
+        retried: attempts whose worker died, and that another took the place of.
+    """
+
+    finished: tuple[FrozenTrial, ...]
+    running: tuple[FrozenTrial, ...]
+    waiting: tuple[FrozenTrial, ...]
+    failed: tuple[FrozenTrial, ...]
+    retried: tuple[FrozenTrial, ...]
+
+    @classmethod
+    def of(cls, trials: Sequence[FrozenTrial]) -> Self:
+        """Sorts trials."""
+        ended = [trial for trial in trials if trial.state == TrialState.FAIL]
+        return cls(
+            finished=tuple(trial for trial in trials if trial.state in FINISHED),
+            running=tuple(trial for trial in trials if trial.state == TrialState.RUNNING),
+            waiting=tuple(trial for trial in trials if trial.state == TrialState.WAITING),
+            failed=tuple(trial for trial in ended if RETRIED not in trial.user_attrs),
+            retried=tuple(trial for trial in ended if RETRIED in trial.user_attrs),
+        )
+
+    @property
+    def all(self) -> tuple[FrozenTrial, ...]:
+        """All trials."""
+        return self.finished + self.running + self.waiting + self.failed + self.retried
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps that all trials have taken; those of running ones as far as was heard."""
+        # What a dead attempt has taken is part of the one that takes its place.
+        return sum(env_steps_of(trial) for trial in self.all if RETRIED not in trial.user_attrs)
+
+    @property
+    def busy_hours(self) -> float:
+        """Wall time in which at least one trial ran."""
+        now, busy_s, until = datetime.now(), 0.0, datetime.min
+        spans = [(trial.datetime_start, trial.datetime_complete or now) for trial in self.all if trial.datetime_start]
+        for start, end in sorted(spans):
+            if end > until:
+                busy_s += (end - max(start, until)).total_seconds()
+                until = end
+        return busy_s / 3600
+
+
+def env_steps_of(trial: FrozenTrial) -> int:
+    """Returns the environment steps that a trial has taken, as far as was heard."""
+    told = (trial.user_attrs.get(ENV_STEPS, 0), trial.user_attrs.get(LEASE, {}).get(ENV_STEPS, 0))
+    return int(max(told))
+
+
+class Ledger:
+    """The books of a study.
+
+    Args:
+        study: in its storage.
+        storage: the same.
+        limits: when it has enough.
+        is_open: whether trials are made as they are wanted; otherwise only those are run that wait already.
+    """
+
+    def __init__(self, study: optuna.Study, storage: Storage, limits: Limits, *, is_open: bool = True) -> None:
+        self.study = study
+        self._storage = storage
+        self._limits = limits
+        self._is_open = is_open
+
+    def tally(self) -> Tally:
+        """Returns how the study stands."""
+        return Tally.of(self.study.get_trials(deepcopy=False))
+
+    def claim(self, lease: Mapping[str, Any]) -> Trial | None:
+        """Takes a trial to run, one that waits before a new one.
+
+        Args:
+            lease: who takes it.
+
+        Returns:
+            The trial, or None where there is none to be had now: those that run may be enough, or the study is over.
+        """
+        with self._storage.alone():
+            tally = self.tally()
+            enough = len(tally.finished) + len(tally.running) >= self._limits.n_trials
+            if enough or self.end(tally) is not None or not (self._is_open or tally.waiting):
+                return None
+            trial = self.study.ask()
+            trial.set_user_attr(LEASE, dict(lease))
+            return trial
+
+    def end(self, tally: Tally) -> str | None:
+        """Returns why no further trial is to be begun; None where some are."""
+        limits = self._limits
+        if len(tally.finished) >= limits.n_trials:
+            return f"{len(tally.finished)} trials have finished"
+        if broken := self.broken(tally):
+            return broken
+        if not self._is_open and not tally.waiting:
+            return f"{len(tally.finished)} trials have finished, {len(tally.failed)} failed"
+        return self.spent(tally)
+
+    def spent(self, tally: Tally) -> str | None:
+        """Returns why no trial is to be gone on with, for time or environment steps; None where there are some left."""
+        limits = self._limits
+        if limits.hours is not None and tally.busy_hours >= limits.hours:
+            return f"the {limits.hours:g} hours of study.hours are over"
+        if limits.env_steps is not None and tally.env_steps >= limits.env_steps:
+            return f"the {limits.env_steps} environment steps of study.env_steps are taken"
+        return None
+
+    def broken(self, tally: Tally) -> str | None:
+        """Returns why so many trials have failed that the study ends; None where they are few enough."""
+        limits, failed = self._limits, tally.failed
+        if len(failed) > limits.max_failures:
+            return f"{len(failed)} trials have failed, and at most {limits.max_failures} may: {_reason(failed[-1])}"
+        got_nowhere = not tally.finished and not any(trial.intermediate_values for trial in tally.all)
+        if len(failed) >= FAILURES_AT_ONCE and got_nowhere:
+            return f"the first {len(failed)} trials failed before they reported anything: {_reason(failed[0])}"
+        return None
+
+    def hand_back(self, trial: Trial, lease: Mapping[str, Any]) -> None:
+        """Leaves a trial of one's own for another to go on with; the lease says how far it is."""
+        self.renew(trial, lease)
+        try:
+            self.study._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+        except UpdateFinishedTrialError:
+            # Somebody has taken this worker for dead in the meantime.
+            return
+
+    def renew(self, trial: Trial, lease: Mapping[str, Any]) -> None:
+        """Says that the worker of a trial of one's own is alive, and how far it is."""
+        try:
+            self.study._storage.set_trial_user_attr(trial._trial_id, LEASE, dict(lease))
+        except UpdateFinishedTrialError:
+            return
+
+    def fail(self, trial: Trial, reason: str) -> None:
+        """Ends a trial of one's own that raised."""
+        with self._storage.alone():
+            self._fail(trial._trial_id, {FAILURE: reason})
+
+    def reclaim(self, is_dead: Callable[[FrozenTrial], bool]) -> list[FrozenTrial]:
+        """Fails the trials of workers that have died, and lets each be taken up again where it may be.
+
+        Args:
+            is_dead: whether the worker of a running trial is.
+
+        Returns:
+            The trials that were failed.
+        """
+
+        def is_lost(trial: FrozenTrial) -> bool:
+            # Who claims a trial gives it its lease before anybody else may look.
+            return LEASE not in trial.user_attrs or is_dead(trial)
+
+        # First without keeping others out: hardly ever is one lost.
+        if not any(map(is_lost, self.tally().running)):
+            return []
+        with self._storage.alone():
+            tally = self.tally()
+            return [trial for trial in tally.running if is_lost(trial) and self._reclaimed(trial, tally)]
+
+    def _reclaimed(self, trial: FrozenTrial, tally: Tally) -> bool:
+        attempt = trial.user_attrs.get(ATTEMPT, 0)
+        lease = trial.user_attrs.get(LEASE, {})
+        reason = f"its worker died: {lease.get('worker', 'unknown')} on {lease.get('host', 'an unknown host')}"
+        is_retried = attempt < self._limits.max_retries
+        # First, so that a death between the two loses nothing; whoever comes next finds it there.
+        if is_retried and not any(other.user_attrs.get(RETRY_OF) == trial.number for other in tally.all):
+            kept = {name: value for name, value in trial.user_attrs.items() if name in KEPT_BY_RETRY}
+            self.study.enqueue_trial(trial.params, user_attrs=kept | {RETRY_OF: trial.number, ATTEMPT: attempt + 1})
+        attributes: dict[str, Any] = {FAILURE: reason, ENV_STEPS: env_steps_of(trial)}
+        return self._fail(trial._trial_id, attributes | ({RETRIED: True} if is_retried else {}))
+
+    def _fail(self, trial_id: int, attributes: Mapping[str, Any]) -> bool:
+        storage = self.study._storage
+        try:
+            for name, value in attributes.items():
+                storage.set_trial_user_attr(trial_id, name, value)
+            return storage.set_trial_state_values(trial_id, TrialState.FAIL)
+        except UpdateFinishedTrialError:
+            return False
+
+
+def _reason(trial: FrozenTrial) -> str:
+    return f"trial {trial.number}: {trial.user_attrs.get(FAILURE, 'no reason is known')}"

@@ -1,0 +1,159 @@
+"""A study as its workers and its launcher see it: settings, storage, tracked run and phases, from the same words."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import instantiate
+from mlflow import MlflowClient
+from omegaconf import DictConfig
+
+from armscan.errors import InvalidValueError, listed
+from armscan.settings import plain
+from armscan.sweeps.attempt import composed, study_section
+from armscan.sweeps.judging import JUDGING_OBJECTIVES, SUFFIX, make_judging_study, seed_of_judged
+from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.phases import Phase
+from armscan.sweeps.settings import StudySettings
+from armscan.sweeps.storage import Storage, open_storage
+from armscan.sweeps.study import STUDY_RUN, make_study, open_study
+from armscan.sweeps.tasks import Task
+from armscan.tracking import open_store, source_tags
+
+# Keys of the command line that are the study's own.
+OWN_SECTIONS = ("study", "sweeps", "hydra")
+NO_END = 10**9
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenStudy:
+    """A study, ready to be worked at.
+
+    Args:
+        settings: what it is asked to do.
+        task: what its trials do.
+        config: of its trials, without what they try.
+        words: that this was composed of.
+        storage: that it is kept in.
+        client: of the tracking store.
+        experiment_id: of its tracked runs.
+        run_id: of its own tracked run.
+    """
+
+    settings: StudySettings
+    task: Task
+    config: DictConfig
+    words: tuple[str, ...]
+    storage: Storage
+    client: MlflowClient
+    experiment_id: str
+    run_id: str
+
+    @property
+    def tracking(self) -> dict[str, Any]:
+        """The section of the configuration."""
+        return plain(self.config.tracking)
+
+    @property
+    def folder(self) -> Path:
+        """Of the study."""
+        return Path(self.settings.folder)
+
+    def searching(self) -> Phase:
+        """The phase in which configurations are searched."""
+        settings = self.settings
+        limits = Limits(
+            n_trials=settings.n_trials,
+            max_failures=settings.max_failures,
+            max_retries=settings.max_retries,
+            hours=settings.hours,
+            env_steps=settings.env_steps,
+        )
+        objectives = tuple(settings.objectives)
+        return Phase(
+            name=settings.name,
+            ledger=Ledger(open_study(self.storage, settings), self.storage, limits),
+            space=settings.space,
+            objectives=objectives,
+            reported=objectives[0] if len(objectives) == 1 else None,
+            run=self.task.run,
+            seeds_of=lambda _: settings.seeds,
+            sampler=settings.sampler,
+            seed=settings.seed,
+            folder=self.folder,
+            storage_uri=self.storage.uri,
+            client=self.client,
+            experiment_id=self.experiment_id,
+            run_id=self.run_id,
+        )
+
+    def judging(self) -> Phase:
+        """The phase in which the best configurations are judged; begun when the searching is over."""
+        searching = self.searching()
+        study = make_judging_study(self.storage, self.settings, searching.ledger.study)
+        limits = Limits(n_trials=NO_END, max_failures=self.settings.max_failures, max_retries=self.settings.max_retries)
+        return dataclasses.replace(
+            searching,
+            name=self.settings.name + SUFFIX,
+            ledger=Ledger(study, self.storage, limits, is_open=False),
+            objectives=JUDGING_OBJECTIVES,
+            reported=None,
+            run=self.task.judge,
+            seeds_of=seed_of_judged,
+            folder=self.folder / "judged",
+        )
+
+
+def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig]:
+    """Returns what a command line asks of a study, what a trial does, and its configuration without what it tries.
+
+    Raises:
+        InvalidValueError: if something is not allowed.
+    """
+    fixed = {word.lstrip("+~").partition("=")[0]: word for word in words}
+    section = study_section(words)
+    if not section:
+        raise InvalidValueError("there is no study: give sweeps=NAME")
+    settings = StudySettings.read(section, fixed)
+    task = instantiate(settings.task)
+    if missing := [name for name in ("figures", "check", "run", "judge") if not hasattr(task, name)]:
+        raise InvalidValueError(f"study.task is {task!r}, but it must have what a Task has, {missing[0]} first")
+    for name in settings.objectives:
+        if name not in task.figures:
+            raise InvalidValueError(f"study.objectives names {name!r}, but a trial returns only {listed(task.figures)}")
+    return settings, task, composed(words)[0]
+
+
+def open_for_work(words: Sequence[str]) -> OpenStudy:
+    """Opens a study, and makes it where there is none.
+
+    Raises:
+        InvalidValueError: if something in the words is not allowed.
+        StudyError: if the storage cannot be used, or the study that exists is another.
+        TrackingError: if the tracking store cannot be used.
+    """
+    settings, task, config = read_settings(words)
+    storage = open_storage(settings.storage)
+    study = make_study(storage, settings, plain(config))
+    client, experiment_id = open_store(**plain(config.tracking))
+    with storage.alone():
+        run_id = study.user_attrs.get(STUDY_RUN)
+        if run_id is None:
+            tags = {**source_tags(), "study": settings.name, "study.storage": storage.uri, "overrides": " ".join(words)}
+            run = client.create_run(experiment_id, run_name=f"study {settings.name}", tags=tags)
+            run_id = run.info.run_id
+            study.set_user_attr(STUDY_RUN, run_id)
+    return OpenStudy(
+        settings=settings,
+        task=task,
+        config=config,
+        words=tuple(words),
+        storage=storage,
+        client=client,
+        experiment_id=experiment_id,
+        run_id=str(run_id),
+    )

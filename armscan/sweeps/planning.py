@@ -1,0 +1,85 @@
+"""What a study would do, without doing it: what is searched, how far it is, and what the rest will take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import optuna
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from armscan.sweeps.ledger import Tally
+from armscan.sweeps.settings import StudySettings
+from armscan.sweeps.space import Parameter
+from armscan.sweeps.storage import open_storage
+from armscan.sweeps.study import open_study
+
+BYTES_A_MIB = 2**20
+
+
+def print_plan(settings: StudySettings) -> None:
+    """Prints the space, how far the study is and what it has cost, and from that what the rest will take."""
+    console = Console()
+    table = Table(title=f"study {settings.name}: what is searched", title_justify="left")
+    for heading in ("key", "values", "where"):
+        table.add_column(heading)
+    for parameter in settings.space.parameters:
+        table.add_row(*map(Text, (parameter.name, _values(parameter), _conditions(parameter))))
+    console.print(table)
+    objectives = ", ".join(f"{direction} {name}" for name, direction in settings.objectives.items())
+    limits = [f"{settings.n_trials} trials"]
+    limits += [f"{settings.hours:g} hours"] if settings.hours is not None else []
+    limits += [f"{settings.env_steps:,} environment steps"] if settings.env_steps is not None else []
+    n_judging = settings.judging.best * settings.judging.seeds
+    console.print(f"objective  {objectives}, over the seeds {', '.join(map(str, settings.seeds))}")
+    console.print(f"limits     {', '.join(limits)}; {settings.workers} workers; then {n_judging} trainings that judge")
+    tally = _tally(settings)
+    done = len(tally.finished) if tally else 0
+    console.print(f"done       {done} trials" + (f", {len(tally.failed)} failed" if tally and tally.failed else ""))
+    if not tally or not done:
+        console.print("cost       not known before the first trial has finished")
+        return
+    seconds = [trial.duration.total_seconds() for trial in tally.finished if trial.duration is not None]
+    mean_s, spent_mib = sum(seconds) / len(seconds), _mib(Path(settings.folder))
+    left = max(0, settings.n_trials - done)
+    hours = (left + n_judging / max(1, len(settings.seeds))) * mean_s / settings.workers / 3600
+    console.print(
+        f"cost       {sum(seconds) / 3600:.2f} hours of workers, {tally.busy_hours:.2f} hours in all, "
+        f"{tally.env_steps:,} environment steps, {spent_mib:.0f} MiB"
+    )
+    console.print(
+        f"the rest   {left} trials and the judging, about {hours:.2f} hours and {spent_mib / done * left:.0f} MiB "
+        f"({mean_s:.0f} s a trial so far)"
+    )
+
+
+def _tally(settings: StudySettings) -> Tally | None:
+    if "://" not in settings.storage and not Path(settings.storage).exists():
+        return None
+    storage = open_storage(settings.storage)
+    if settings.name not in optuna.get_all_study_names(storage.optuna):
+        return None
+    return Tally.of(open_study(storage, settings).get_trials(deepcopy=False))
+
+
+def _values(parameter: Parameter) -> str:
+    distribution = parameter.distribution
+    if isinstance(distribution, CategoricalDistribution):
+        return ", ".join(map(str, distribution.choices))
+    assert isinstance(distribution, FloatDistribution | IntDistribution)
+    spacing = ", log" if distribution.log else ""
+    if distribution.step is not None and distribution.step != 1:
+        spacing += f", in steps of {distribution.step:g}"
+    whole = ", whole" if isinstance(distribution, IntDistribution) else ""
+    return f"{distribution.low:g} to {distribution.high:g}{whole}{spacing}"
+
+
+def _conditions(parameter: Parameter) -> str:
+    return ", ".join(f"{name} is {' or '.join(map(str, values))}" for name, values in parameter.when.items())
+
+
+def _mib(folder: Path) -> float:
+    files = folder.rglob("*") if folder.is_dir() else ()
+    return sum(file.stat().st_size for file in files if file.is_file()) / BYTES_A_MIB

@@ -1,0 +1,155 @@
+"""What a person sees of a study: one live table on a terminal, a line a trial elsewhere, the result at the end."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import optuna
+from optuna.trial import FrozenTrial, TrialState
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from armscan.sweeps.judging import JUDGING_OBJECTIVES, SUFFIX, best_trials
+from armscan.sweeps.ledger import ENV_STEPS, FAILURE, LEASE, RETRIED, Ledger, Tally
+from armscan.sweeps.opening import OpenStudy
+from armscan.sweeps.settings import StudySettings
+from armscan.sweeps.space import overrides_of
+
+REFRESH_S = 2.0
+
+
+class Screen:
+    """Shows how a study is going, from what stands in its storage, while it lasts.
+
+    Args:
+        opened: the study.
+        folder: of the workers of this start.
+    """
+
+    def __init__(self, opened: OpenStudy, folder: Path) -> None:
+        self._opened, self._ledger = opened, opened.searching().ledger
+        self._told = {(trial.number, is_judging) for trial, is_judging in self._ended()}
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._show, daemon=True)
+        print(f"study {opened.settings.name} in {opened.storage.uri}, run {opened.run_id}", flush=True)
+        print(f"the workers write into {folder}", flush=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def _show(self) -> None:
+        if not sys.stdout.isatty():
+            while not self._stopped.wait(REFRESH_S):
+                self._tell()
+            self._tell()
+            return
+        with Live(self._table(), refresh_per_second=1) as live:
+            while not self._stopped.wait(REFRESH_S):
+                live.update(self._table())
+            live.update(self._table())
+
+    def _ended(self) -> list[tuple[FrozenTrial, bool]]:
+        """The trials that have ended, and whether they judge."""
+        studies = [(self._ledger.study, False)]
+        if (judging := judging_study(self._opened)) is not None:
+            studies.append((judging, True))
+        return [
+            (trial, is_judging)
+            for study, is_judging in studies
+            for trial in study.get_trials(deepcopy=False)
+            if trial.state.is_finished()
+        ]
+
+    def _tell(self) -> None:
+        for trial, is_judging in self._ended():
+            if (trial.number, is_judging) not in self._told:
+                self._told.add((trial.number, is_judging))
+                names = JUDGING_OBJECTIVES if is_judging else tuple(self._opened.settings.objectives)
+                print(f"{'judging ' if is_judging else ''}{sentence(trial, names)}", flush=True)
+
+    def _table(self) -> Table:
+        tally, settings = self._ledger.tally(), self._opened.settings
+        table = Table(title=Text(summary(self._ledger, tally, settings)), title_justify="left")
+        for heading in ("worker", "trial", "seed", "environment steps", "return"):
+            table.add_column(heading, justify="left" if heading == "worker" else "right")
+        judging = judging_study(self._opened)
+        running = [("", trial) for trial in tally.running]
+        if judging is not None:
+            running += [("judging ", trial) for trial in Tally.of(judging.get_trials(deepcopy=False)).running]
+        for what, trial in running:
+            lease = trial.user_attrs.get(LEASE, {})
+            shown = (lease.get("seed", "-"), lease.get(ENV_STEPS, "-"), f"{lease.get('return', float('nan')):.2f}")
+            table.add_row(lease.get("worker", "?").rpartition("/")[2], f"{what}{trial.number}", *map(str, shown))
+        return table
+
+
+def judging_study(opened: OpenStudy) -> optuna.Study | None:
+    """Returns the study of the trainings that judge, None where it has not been begun."""
+    name = opened.settings.name + SUFFIX
+    if name not in optuna.get_all_study_names(opened.storage.optuna):
+        return None
+    return optuna.load_study(study_name=name, storage=opened.storage.optuna)
+
+
+def summary(ledger: Ledger, tally: Tally, settings: StudySettings) -> str:
+    """Returns how a study stands, in one line."""
+    n_pruned = sum(trial.state == TrialState.PRUNED for trial in tally.finished)
+    parts = [
+        f"study {settings.name}: {len(tally.finished)} of {settings.n_trials} trials done, {n_pruned} of them pruned"
+    ]
+    parts += [f"{len(tally.running)} running, {len(tally.failed)} failed, {len(tally.retried)} taken up again"]
+    if best := best_trials(ledger.study, 1):
+        parts.append(f"best {_values(best[0], tuple(settings.objectives))} (trial {best[0].number})")
+    durations = [trial.duration.total_seconds() for trial in tally.finished if trial.duration is not None]
+    if durations:
+        left_s = (settings.n_trials - len(tally.finished)) * sum(durations) / len(durations) / settings.workers
+        parts.append(f"{left_s // 60:.0f} min left")
+    return "; ".join(parts)
+
+
+def sentence(trial: FrozenTrial, objectives: Sequence[str]) -> str:
+    """Returns what became of a trial, whose values are those of these objectives, in one line."""
+    tried = " ".join(overrides_of(trial.params))
+    if trial.state == TrialState.FAIL:
+        again = ", taken up again" if RETRIED in trial.user_attrs else ""
+        return f"trial {trial.number} failed{again}: {trial.user_attrs.get(FAILURE)} [{tried}]"
+    if trial.state == TrialState.PRUNED:
+        return f"trial {trial.number} pruned after {trial.user_attrs.get(ENV_STEPS)} environment steps [{tried}]"
+    return f"trial {trial.number} done: {_values(trial, objectives)} [{tried}]"
+
+
+def print_result(opened: OpenStudy) -> int:
+    """Prints what a study has found; returns the exit code."""
+    ledger, settings = opened.searching().ledger, opened.settings
+    tally = ledger.tally()
+    print(summary(ledger, tally, settings))
+    if broken := ledger.broken(tally):
+        print(f"error: {broken}", file=sys.stderr)
+        return 1
+    table = Table(title="best while searching", title_justify="left")
+    for heading in ("trial", *settings.objectives, "values"):
+        table.add_column(heading)
+    for trial in best_trials(ledger.study, max(1, settings.judging.best)):
+        table.add_row(
+            str(trial.number), *(f"{value:.4g}" for value in trial.values), " ".join(overrides_of(trial.params))
+        )
+    Console().print(table)
+    return 0
+
+
+def _values(trial: FrozenTrial, objectives: Sequence[str]) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in zip(objectives, trial.values, strict=True))

@@ -1,0 +1,165 @@
+"""What a study is asked to do: the section `study` of the configuration, checked."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+from armscan.checks import check_bool, check_float, check_int, check_ints
+from armscan.errors import InvalidValueError, listed
+from armscan.sweeps.space import Space
+
+NAME = re.compile(r"\w[\w\-.]*")
+# For the command: whether to show only what would be run, and which worker it is.
+NOT_READ = ("plan", "worker")
+DIRECTIONS, NO_PRUNER = ("minimize", "maximize"), "optuna.pruners.NopPruner"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judging:
+    """How the best configurations are judged when the study is done.
+
+    Args:
+        best: how many of them; 0 for none.
+        seeds: how many trainings of each, none of them with a seed that it was chosen by.
+    """
+
+    best: int
+    seeds: int
+
+    def __post_init__(self) -> None:
+        check_int("study.judging.best", self.best, at_least=0)
+        check_int("study.judging.seeds", self.seeds, at_least=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudySettings:
+    """What a study is asked to do.
+
+    Args:
+        name: of the study, in its storage and of its folder.
+        storage: where it is kept, as `open_storage` takes it.
+        folder: of its trials.
+        task: what makes a `Task`, as Hydra would instantiate it.
+        space: what is searched.
+        objectives: direction by the name of each figure.
+        sampler: what makes an Optuna sampler of a seed, as Hydra would instantiate it.
+        pruner: an Optuna pruner, likewise.
+        n_trials: that are to finish.
+        max_failures: trials that may raise or die for good before the study ends.
+        max_retries: how often a trial is taken up again whose worker died.
+        hours: wall time in which trials run, for the whole study; None for no limit.
+        env_steps: of all trials together; None for no limit.
+        workers: trials at a time, of this start.
+        seed: of the samplers.
+        seeds: that each trial is run with, one after another.
+        judging: of the best at the end.
+        accept_changes: whether to go on although the fixed configuration has changed.
+    """
+
+    name: str
+    storage: str
+    folder: str
+    task: Mapping[str, Any]
+    space: Space
+    objectives: Mapping[str, str]
+    sampler: Mapping[str, Any]
+    pruner: Mapping[str, Any]
+    n_trials: int
+    max_failures: int
+    max_retries: int
+    hours: float | None
+    env_steps: int | None
+    workers: int
+    seed: int
+    seeds: tuple[int, ...]
+    judging: Judging
+    accept_changes: bool
+
+    @classmethod
+    def read(cls, section: Mapping[str, Any], fixed: Mapping[str, Any]) -> Self:
+        """Returns the settings of a configuration's section.
+
+        Args:
+            section: with plain values.
+            fixed: keys of the configuration that somebody gave a value, which are not searched.
+
+        Raises:
+            InvalidValueError: if a key is unknown, missing or has a value that is not allowed.
+        """
+        known = {*cls.__dataclass_fields__, *NOT_READ}
+        if unknown := [key for key in section if key not in known]:
+            raise InvalidValueError(f"there is no key {unknown[0]!r} in study, but only {listed(sorted(known))}")
+        values = {key: value for key, value in section.items() if key not in NOT_READ}
+        if missing := [key for key in cls.__dataclass_fields__ if key not in values]:
+            raise InvalidValueError(f"study.{missing[0]} is not set, but it must be")
+        judging = values["judging"]
+        if not isinstance(judging, Mapping) or judging.keys() != {"best", "seeds"}:
+            raise InvalidValueError(f"study.judging is {judging!r}, but it must have best and seeds")
+        space = Space.read(values["space"]).without(fixed)
+        if not space.parameters:
+            raise InvalidValueError("nothing is left to search: each key of study.space is given a value")
+        read = {
+            "space": space,
+            "judging": Judging(**judging),
+            "seeds": _seeds(values["seeds"]),
+            "objectives": _objectives(values["objectives"]),
+        }
+        return cls(**values | read)
+
+    def __post_init__(self) -> None:
+        for name in ("name", "storage", "folder"):
+            if not isinstance(getattr(self, name), str):
+                raise InvalidValueError(f"study.{name} is {getattr(self, name)!r}, but it must be a text")
+        if not NAME.fullmatch(self.name):
+            raise InvalidValueError(f"study.name is {self.name!r}, but it must be of letters, digits, _, - and .")
+        for name, made in (("task", self.task), ("sampler", self.sampler), ("pruner", self.pruner)):
+            if not isinstance(made, Mapping) or "." not in str(made.get("_target_")):
+                raise InvalidValueError(f"study.{name} is {made!r}, but it must have a _target_, the name of a class")
+        if len(self.objectives) > 1 and self.pruner["_target_"] != NO_PRUNER:
+            raise InvalidValueError(
+                f"study.pruner is {self.pruner['_target_']}, but trials of several objectives cannot be pruned: give "
+                "study/pruner=none"
+            )
+        check_int("study.n_trials", self.n_trials, at_least=1)
+        check_int("study.max_failures", self.max_failures, at_least=0)
+        check_int("study.max_retries", self.max_retries, at_least=0)
+        check_int("study.seed", self.seed, at_least=0)
+        check_int("study.workers", self.workers, at_least=1)
+        if self.hours is not None:
+            check_float("study.hours", self.hours, above=0.0)
+        if self.env_steps is not None:
+            check_int("study.env_steps", self.env_steps, at_least=1)
+        check_bool("study.accept_changes", self.accept_changes)
+
+    def check_workers(self, n_cores: int) -> None:
+        """Raises `InvalidValueError` where the workers' compute threads would be more than the cores of one machine."""
+        n_threads = int(os.environ.get("OMP_NUM_THREADS", "1"))
+        if self.workers * n_threads > n_cores:
+            each = "" if n_threads == 1 else f" of {n_threads} compute threads each (OMP_NUM_THREADS)"
+            raise InvalidValueError(
+                f"study.workers is {self.workers}{each}, but this machine has {n_cores} cores: give at most "
+                f"{max(1, n_cores // n_threads)}"
+            )
+
+
+def _objectives(objectives: Any) -> dict[str, str]:
+    """Returns the direction of each figure, of texts such as `minimize mean_steps`."""
+    pairs = [str(each).split() for each in objectives] if isinstance(objectives, Sequence) else []
+    if not pairs or any(len(pair) != 2 or pair[0] not in DIRECTIONS for pair in pairs):
+        raise InvalidValueError(
+            f"study.objectives is {objectives!r}, but it must be a list such as [minimize mean_steps, maximize solved]"
+        )
+    return {name: direction for direction, name in pairs}
+
+
+def _seeds(seeds: Any) -> tuple[int, ...]:
+    if isinstance(seeds, Sequence) and not seeds:
+        raise InvalidValueError("study.seeds is [], but a trial needs at least one seed")
+    checked = check_ints("study.seeds", seeds, None, "seeds", at_least=0)
+    if len(set(checked)) < len(checked):
+        raise InvalidValueError(f"study.seeds is {list(checked)}, but no seed may be there twice")
+    return checked

@@ -1,0 +1,210 @@
+"""What a study searches: keys and groups of the configuration, each with its range or its choices."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+    distribution_to_json,
+)
+from optuna.trial import BaseTrial
+
+from armscan.checks import check_bool, check_float, check_int
+from armscan.errors import InvalidValueError, listed
+
+RANGE_KEYS, CHOICE_KEYS = ("low", "high", "log", "step", "when"), ("choices", "when")
+KEY = re.compile(r"[A-Za-z_][\w/]*(\.\w+)*")
+PLAIN_TEXT = re.compile(r"[A-Za-z_][\w./\-]*")
+Value = bool | int | float | str | None
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One dimension of a search space.
+
+    Args:
+        name: the key or group of the configuration.
+        distribution: its range or its choices.
+        when: the choices of parameters before it that it needs, by their names; it is searched only where all hold.
+    """
+
+    name: str
+    distribution: BaseDistribution
+    when: Mapping[str, tuple[Value, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, name: str, described: Any) -> Self:
+        """Returns the parameter of a description such as `{low: 1e-4, high: 1e-2, log: true}` or `{choices: [a, b]}`.
+
+        Raises:
+            InvalidValueError: if it describes none.
+        """
+        where = f"study.space.{name}"
+        if not KEY.fullmatch(name):
+            raise InvalidValueError(f"{where}: {name!r} is no key of the configuration, such as agent.lr")
+        if not isinstance(described, Mapping) or not ({"low", "high"} <= described.keys() or "choices" in described):
+            raise InvalidValueError(f"{where} is {described!r}, but it must have low and high, or choices")
+        allowed = CHOICE_KEYS if "choices" in described else RANGE_KEYS
+        if unknown := [key for key in described if key not in allowed]:
+            raise InvalidValueError(f"there is no key {unknown[0]!r} in {where}, but only {listed(allowed)}")
+        read = _choices if "choices" in described else _range
+        return cls(name, read(where, described), _conditions(where, described.get("when")))
+
+    def applies(self, chosen: Mapping[str, Value]) -> bool:
+        """Whether it is searched where these values were chosen before."""
+        return all(name in chosen and chosen[name] in values for name, values in self.when.items())
+
+    def suggest(self, trial: BaseTrial) -> Value:
+        """Returns the value of a trial."""
+        distribution = self.distribution
+        if isinstance(distribution, CategoricalDistribution):
+            choice: Value = trial.suggest_categorical(self.name, distribution.choices)
+            return choice
+        if isinstance(distribution, IntDistribution):
+            return trial.suggest_int(
+                self.name, distribution.low, distribution.high, log=distribution.log, step=distribution.step
+            )
+        assert isinstance(distribution, FloatDistribution)
+        return trial.suggest_float(
+            self.name, distribution.low, distribution.high, log=distribution.log, step=distribution.step
+        )
+
+    def extremes(self) -> tuple[Value, ...]:
+        """Returns the values that have to be allowed for all of them to be."""
+        distribution = self.distribution
+        if isinstance(distribution, CategoricalDistribution):
+            return tuple(distribution.choices)
+        assert isinstance(distribution, FloatDistribution | IntDistribution)
+        return distribution.low, distribution.high
+
+
+@dataclass(frozen=True)
+class Space:
+    """A search space.
+
+    Args:
+        parameters: in the order in which they are chosen.
+    """
+
+    parameters: tuple[Parameter, ...]
+
+    @classmethod
+    def read(cls, described: Any) -> Self:
+        """Returns the space of a mapping from keys of the configuration to descriptions.
+
+        Raises:
+            InvalidValueError: if it describes none.
+        """
+        if not isinstance(described, Mapping) or not described:
+            raise InvalidValueError(f"study.space is {described!r}, but it must have at least one key to search")
+        parameters = tuple(Parameter.read(str(name), each) for name, each in described.items())
+        before: dict[str, tuple[Value, ...]] = {}
+        for parameter in parameters:
+            for name, values in parameter.when.items():
+                if name not in before:
+                    raise InvalidValueError(
+                        f"study.space.{parameter.name}.when names {name!r}, but it must be a key with choices above it"
+                        + (f": {listed(before)}" if before else "")
+                    )
+                if wrong := [value for value in values if value not in before[name]]:
+                    where = f"study.space.{parameter.name}.when.{name}"
+                    raise InvalidValueError(f"{where} is {wrong[0]!r}, but it must be {listed(before[name])}")
+            if isinstance(parameter.distribution, CategoricalDistribution):
+                before[parameter.name] = tuple(parameter.distribution.choices)
+        return cls(parameters)
+
+    def suggest(self, trial: BaseTrial) -> dict[str, Value]:
+        """Returns the values of a trial by name."""
+        chosen: dict[str, Value] = {}
+        for parameter in self.parameters:
+            if parameter.applies(chosen):
+                chosen[parameter.name] = parameter.suggest(trial)
+        return chosen
+
+    def extremes(self) -> Iterator[dict[str, Value]]:
+        """Yields values by name that between them have every choice and both ends of every range.
+
+        Where a parameter needs choices of others, these stand with it.
+        """
+        for parameter in self.parameters:
+            needed = {name: values[0] for name, values in parameter.when.items()}
+            for value in parameter.extremes():
+                yield needed | {parameter.name: value}
+
+    def without(self, fixed: Mapping[str, Any]) -> Space:
+        """Returns the space without keys that somebody has fixed, and without what needs these."""
+        kept = (each for each in self.parameters if each.name not in fixed and not fixed.keys() & each.when.keys())
+        return Space(tuple(kept))
+
+    def plain(self) -> dict[str, str]:
+        """Returns the space in a form that can be compared and kept."""
+        return {
+            each.name: distribution_to_json(each.distribution) + (f" when {dict(each.when)}" if each.when else "")
+            for each in self.parameters
+        }
+
+
+def overrides_of(chosen: Mapping[str, Value]) -> list[str]:
+    """Returns values as they are written on the command line."""
+    return [f"{name}={written(value)}" for name, value in chosen.items()]
+
+
+def written(value: Any) -> str:
+    """Returns a value as Hydra reads it on the command line."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(written, value))}]"
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{written(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, str) and not PLAIN_TEXT.fullmatch(value) and not value.startswith(("[", "{")):
+        escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+        return f"'{escaped}'"
+    return str(value)
+
+
+def _choices(where: str, described: Mapping[str, Any]) -> CategoricalDistribution:
+    choices = described["choices"]
+    if not isinstance(choices, list | tuple) or not choices:
+        raise InvalidValueError(f"{where}.choices is {choices!r}, but it must be a list of at least one value")
+    # Optuna keeps numbers and texts; of a list it keeps how it is written.
+    texts = [written(each) if isinstance(each, list | tuple | Mapping) else each for each in choices]
+    if len(set(map(repr, texts))) < len(texts):
+        raise InvalidValueError(f"{where}.choices is {choices!r}, but no value may be there twice")
+    return CategoricalDistribution(texts)
+
+
+def _range(where: str, described: Mapping[str, Any]) -> BaseDistribution:
+    low, high, step = described["low"], described["high"], described.get("step")
+    log = check_bool(f"{where}.log", described.get("log", False))
+    is_whole = all(isinstance(each, int) and not isinstance(each, bool) for each in (low, high))
+    low, high = check_float(f"{where}.low", low), check_float(f"{where}.high", high)
+    if low >= high:
+        raise InvalidValueError(f"{where}.low is {low:g}, but it must be below high, {high:g}")
+    if log and low <= 0:
+        raise InvalidValueError(f"{where}.low is {low:g}, but it must be above 0 where log is true")
+    if log and step is not None:
+        raise InvalidValueError(f"{where}.step is {step!r}, but a range with log has no step")
+    if is_whole:
+        size = 1 if step is None else check_int(f"{where}.step", step, at_least=1, at_most=int(high - low))
+        return IntDistribution(int(low), int(high), log=log, step=size)
+    size_of_step = None if step is None else check_float(f"{where}.step", step, above=0.0, at_most=high - low)
+    return FloatDistribution(low, high, log=log, step=size_of_step)
+
+
+def _conditions(where: str, when: Any) -> dict[str, tuple[Value, ...]]:
+    if when is None:
+        return {}
+    if not isinstance(when, Mapping) or not when:
+        raise InvalidValueError(f"{where}.when is {when!r}, but it must say which choice of which key is needed")
+    several = {name: values if isinstance(values, list | tuple) else [values] for name, values in when.items()}
+    return {str(name): tuple(values) for name, values in several.items()}

@@ -1,0 +1,120 @@
+"""A worker's process, and the one above it, which starts another in its place when it dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Self
+
+from armscan.files import write_whole
+from armscan.sweeps.lease import process_start
+
+LAUNCHER_FILE, STOP_FILE = "launcher.json", "stop"
+LEFT = 130
+# A worker that dies again and again does no work; its trials have long been given up by then.
+MAX_RESTARTS = 100
+WORKER_PROGRAM = """
+try:
+    from armscan.sweeps.supervising import worker_main
+    worker_main()
+except KeyboardInterrupt:
+    raise SystemExit(130)
+"""
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process, for others to know whether it is still there.
+
+    Args:
+        host: that it runs on.
+        pid: its process.
+        started: see `process_start`.
+    """
+
+    host: str
+    pid: int
+    started: str
+
+    @classmethod
+    def current(cls) -> Self:
+        """This process."""
+        return cls(socket.gethostname(), os.getpid(), process_start(os.getpid()))
+
+    @classmethod
+    def read(cls, file: Path) -> Self:
+        """Returns the one that has left word of itself in a file."""
+        return cls(**json.loads(file.read_text()))
+
+    def write(self, file: Path) -> None:
+        """Leaves word of it."""
+        write_whole(file, lambda opened: opened.write(json.dumps(asdict(self)).encode()))
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether it has ended, as far as can be seen from here: not from another machine."""
+        is_here = self.host == socket.gethostname() and self.started != ""
+        return is_here and process_start(self.pid) != self.started
+
+
+def local_workers(folder: Path) -> list[Process]:
+    """Returns the workers of a start that are at work on this machine."""
+    workers = [Process.read(file) for file in folder.glob("worker-*.json")]
+    here = socket.gethostname()
+    return [each for each in workers if each.host == here and process_start(each.pid) == each.started]
+
+
+def supervise(words: Sequence[str], number: int, folder: Path) -> None:
+    """Runs a worker, and another in its place when it is killed, until one ends by itself.
+
+    Args:
+        words: of the study.
+        number: of the worker.
+        folder: of the workers of one start; each writes its log there.
+    """
+    launcher = Process.read(folder / LAUNCHER_FILE)
+    if os.getpid() != launcher.pid:
+        # A Ctrl-C reaches all processes of a terminal, but it is the launcher that asks the workers to leave.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with (folder / f"worker-{number}.log").open("ab") as log:
+        for _ in range(MAX_RESTARTS):
+            if launcher.is_gone or (folder / STOP_FILE).exists():
+                return
+            handed_over = pickle.dumps((list(words), number, str(folder)))
+            ended = subprocess.run(
+                [sys.executable, "-c", WORKER_PROGRAM],
+                input=handed_over,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                check=False,
+            )
+            if ended.returncode >= 0:
+                return
+
+
+def worker_main() -> None:
+    """The process of a worker, which is told on standard input what to work at."""
+    words, number, folder_name = pickle.load(sys.stdin.buffer)
+    folder, parent_pid = Path(folder_name), os.getppid()
+    Process.current().write(folder / f"worker-{number}.json")
+    launcher, is_asked = Process.read(folder / LAUNCHER_FILE), threading.Event()
+    for asking in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(asking, lambda *_: is_asked.set())
+
+    def is_told_to_leave() -> bool:
+        is_alone = os.getppid() != parent_pid or launcher.is_gone
+        return is_asked.is_set() or is_alone or (folder / STOP_FILE).exists()
+
+    from armscan.sweeps.working import work
+
+    work(words, f"{folder.name}/{number}", is_told_to_leave, leave=lambda: os._exit(LEFT))

@@ -1,0 +1,205 @@
+"""A worker of a study: it takes a trial, runs it, tells what came of it, and takes the next, until there are enough."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Sequence
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+from hydra.utils import instantiate
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.trial import FrozenTrial, Trial, TrialState
+
+from armscan.files import CONFIG_FILE, SUM_TAGS
+from armscan.mistakes import mistake_in_one_line
+from armscan.settings import plain
+from armscan.sweeps.attempt import CONFIG_SUM, FOLDER, RUN, Attempt, composed, sum_of_config, trial_folder
+from armscan.sweeps.lease import Keeper, LimitReachedError
+from armscan.sweeps.ledger import ENV_STEPS, FIGURES, RETRY_OF
+from armscan.sweeps.phases import Phase
+from armscan.sweeps.space import overrides_of
+from armscan.tracking import TrackedRun
+
+WAIT_S = 1.0
+MAX_REASON_CHARS = 2000
+
+
+class Worker:
+    """Runs trials of one phase of a study, one after another.
+
+    Args:
+        phase: of the study.
+        words: of the command line, which a trial's configuration is composed of, but for what it tries.
+        keeper: holds the trial that is at hand.
+        tracking: the section of the configuration.
+    """
+
+    def __init__(self, phase: Phase, words: Sequence[str], keeper: Keeper, tracking: dict[str, Any]) -> None:
+        self._phase, self._words, self._keeper, self._tracking = phase, words, keeper, tracking
+        self._tracked: TrackedRun | None = None
+
+    def work(self) -> str:
+        """Runs trials until no further one is to be begun, and those that others run have ended; returns why."""
+        ledger = self._phase.ledger
+        while True:
+            trial = self._keeper.claim()
+            if trial is not None:
+                self._run(trial)
+                continue
+            tally = ledger.tally()
+            reason = ledger.end(tally)
+            # A trial that somebody runs may yet have to be taken up again.
+            if reason is not None and not tally.running:
+                return reason
+            time.sleep(WAIT_S)
+
+    def _run(self, trial: Trial) -> None:
+        say(f"trial {trial.number} begins")
+        try:
+            figures = self._figures(trial)
+            values = [figures[name] for name in self._phase.objectives]
+        except optuna.TrialPruned:
+            self._tell(trial, TrialState.PRUNED)
+        except UpdateFinishedTrialError:
+            # Somebody has taken this worker for dead: the trial is theirs.
+            self._let_go(trial)
+        except LimitReachedError as limit:
+            say(f"trial {trial.number} is handed back: {limit}")
+            self._keeper.hand_back()
+            self._tracked = None
+        # Whatever a trial raises is the trial's, and not the study's.
+        except Exception as error:
+            line = mistake_in_one_line(error)
+            if line is None:
+                traceback.print_exc()
+            self._fail(trial, line or repr(error))
+        else:
+            if wrong := [name for name in self._phase.objectives if figures[name] != figures[name]]:
+                self._fail(trial, f"its {wrong[0]} is not a number")
+            else:
+                trial.set_user_attr(FIGURES, figures)
+                self._tell(trial, TrialState.COMPLETE, values)
+
+    def _figures(self, trial: Trial) -> dict[str, float]:
+        phase = self._phase
+        # By the number of the trial: workers side by side draw other points, and one alone the same ones again.
+        seed = np.random.SeedSequence((phase.seed, trial.number)).generate_state(1)[0]
+        trial.study.sampler = instantiate(phase.sampler, seed=int(seed))
+        chosen = phase.space.suggest(trial)
+        config, _ = composed([*self._words, *overrides_of(chosen)])
+        folder = trial_folder(phase.folder, trial.number)
+        folder.mkdir(parents=True, exist_ok=True)
+        config_sum = sum_of_config(plain(config))
+        self._tracked = self._begun(trial, chosen, folder, config_sum)
+        for name, value in ((FOLDER, str(folder)), (CONFIG_SUM, config_sum)):
+            if trial.user_attrs.get(name) != value:
+                trial.set_user_attr(name, value)
+        attempt = Attempt(
+            trial=trial,
+            chosen=chosen,
+            words=self._words,
+            seeds=phase.seeds_of(trial),
+            study_folder=phase.folder,
+            run_id=self._tracked.run_id,
+            objective=phase.reported,
+            tell_progress=self._keeper.tell_progress,
+            opened=self._opened,
+        )
+        try:
+            return phase.run(attempt)
+        finally:
+            trial.set_user_attr(ENV_STEPS, attempt.env_steps)
+
+    def _begun(self, trial: Trial, chosen: dict[str, Any], folder: Path, config_sum: str) -> TrackedRun:
+        """Opens the tracked run of a trial, anew or where it was handed back."""
+        phase, attributes = self._phase, trial.user_attrs
+        tags = {
+            "study": phase.name,
+            "study.storage": phase.storage_uri,
+            "trial": str(trial.number),
+            SUM_TAGS[CONFIG_FILE]: config_sum,
+            "folder": str(folder.resolve()),
+            "overrides": " ".join(overrides_of(chosen)),
+        }
+        if RETRY_OF in attributes:
+            tags["trial.retry_of"] = str(attributes[RETRY_OF])
+        if RUN in attributes:
+            tracked = TrackedRun.go_on(phase.client, attributes[RUN], config={}, tags=tags)
+        else:
+            tracked = TrackedRun.start(
+                phase.client,
+                phase.experiment_id,
+                name=f"{phase.name}-{trial.number:04d}",
+                config=chosen,
+                tags=tags,
+                parent_id=phase.run_id,
+            )
+            trial.set_user_attr(RUN, tracked.run_id)
+        self._opened(None)
+        return tracked
+
+    def _opened(self, training: TrackedRun | None) -> None:
+        open_runs = [run for run in (training, self._tracked) if run is not None]
+        self._keeper.closing(partial(_close, open_runs))
+
+    def _tell(self, trial: Trial, state: TrialState, values: Sequence[float] | None = None) -> None:
+        with self._keeper.ending():
+            try:
+                trial.study.tell(trial, values, state)
+            # Its own error, and that of a trial which is not running any more.
+            except (UpdateFinishedTrialError, ValueError):
+                self._let_go(trial)
+                return
+        named = dict(zip(self._phase.objectives, values or (), strict=False))
+        shown = ", ".join(f"{name} {value:.4g}" for name, value in named.items())
+        say(f"trial {trial.number} {state.name.lower()} {shown}".rstrip())
+        if self._tracked is not None:
+            self._tracked.log_figures(named, n_env_steps=0)
+            if state == TrialState.PRUNED:
+                self._phase.client.set_tag(self._tracked.run_id, "pruned", "true")
+            self._tracked.end("FINISHED")
+        self._tracked = None
+
+    def _fail(self, trial: Trial, reason: str) -> None:
+        say(f"trial {trial.number} failed: {reason}")
+        with self._keeper.ending():
+            self._phase.ledger.fail(trial, reason[:MAX_REASON_CHARS])
+        if self._tracked is not None:
+            self._tracked.end("FAILED", reason=reason)
+        self._tracked = None
+
+    def _let_go(self, trial: Trial) -> None:
+        say(f"trial {trial.number} was taken over by another worker")
+        if self._tracked is not None:
+            self._tracked.end("FAILED", reason="taken over by another worker")
+        self._tracked = None
+
+
+def close_runs_of(trial: FrozenTrial, phase: Phase) -> None:
+    """Closes what a dead worker has left open in the tracking store."""
+    run_id = trial.user_attrs.get(RUN)
+    if run_id is None:
+        return
+    client, reason = phase.client, "its worker died"
+    children = client.search_runs(
+        [phase.experiment_id], f"tags.mlflow.parentRunId = '{run_id}' AND attributes.status = 'RUNNING'"
+    )
+    for each in (*(child.info.run_id for child in children), run_id):
+        client.set_tag(each, "failure", reason)
+        client.set_terminated(each, "FAILED")
+
+
+def say(text: str) -> None:
+    """Writes a line into the worker's log."""
+    print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
+
+
+def _close(runs: Sequence[TrackedRun]) -> None:
+    for run in runs:
+        run.end("KILLED", reason="handed back")

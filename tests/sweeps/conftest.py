@@ -1,0 +1,25 @@
+"""Storages of every kind, and studies in them that train nothing."""
+
+import optuna
+import pytest
+
+from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.storage import open_storage
+
+
+@pytest.fixture(params=["journal", "sqlite"])
+def storage_uri(request, tmp_path):
+    return {"journal": str(tmp_path / "a.journal"), "sqlite": f"sqlite:///{tmp_path}/a.db"}[request.param]
+
+
+@pytest.fixture
+def make_ledger(storage_uri):
+    """Opens the same study again and again, as workers do."""
+
+    def make(**limits):
+        storage = open_storage(storage_uri)
+        study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
+        is_open = limits.pop("is_open", True)
+        return Ledger(study, storage, Limits(**{"n_trials": 5} | limits), is_open=is_open)
+
+    return make

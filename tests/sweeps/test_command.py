@@ -1,0 +1,210 @@
+"""Studies as a person starts them: real workers, killed and interrupted, on phantoms."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import optuna
+import pytest
+from hydra.errors import HydraException
+from mlflow import MlflowClient
+
+from armscan.errors import ArmscanError
+from armscan.mistakes import mistake_in_one_line
+from armscan.sweeps.command import run_study
+from armscan.sweeps.storage import open_storage
+
+TINY = [
+    *("-m", "sweeps=sac_y", "data.n_training=1", "data.n_validation=1", "data.n_test=1", "training.env_steps=400"),
+    *("training.epoch_env_steps=200", "training.validation_episodes=2", "evaluation.episodes=3", "env.max_steps=8"),
+    *("agent.random_env_steps=100", "agent.batch_size=32", "network.vector.hidden_sizes=[16]", "study/pruner=none"),
+    *("study.judging.best=1", "study.judging.seeds=1"),
+]
+COMMAND = [sys.executable, "-m", "armscan.run"]
+
+
+def run(*words, cwd):
+    return subprocess.run([*COMMAND, *words], cwd=cwd, capture_output=True, text=True, check=False, timeout=400)
+
+
+def started(*words, cwd):
+    printed = (cwd / "printed").open("ab")
+    # Whatever this process was started by, a Ctrl-C reaches the study.
+    return subprocess.Popen(
+        [*COMMAND, *words],
+        cwd=cwd,
+        stdout=printed,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+
+
+def trials_of(folder, name="sac_y"):
+    storage = open_storage(str(folder / "optuna.journal"))
+    if name not in optuna.get_all_study_names(storage.optuna):
+        return []
+    return optuna.load_study(study_name=name, storage=storage.optuna).trials
+
+
+def wait_for(moment, process, timeout_s=240):
+    until_s = time.monotonic() + timeout_s
+    while not moment():
+        assert process.poll() is None
+        assert time.monotonic() < until_s
+        time.sleep(0.1)
+
+
+def processes_in(folder):
+    """The processes whose working folder this is."""
+    listing = subprocess.run(["ps", "-eo", "pid="], capture_output=True, text=True, check=True).stdout.split()
+    found = []
+    for pid in listing:
+        try:
+            if Path(f"/proc/{pid}/cwd").readlink() == folder:
+                found.append(int(pid))
+        except OSError:
+            continue
+    return found
+
+
+def workers_in(folder):
+    files = folder.glob("studies/sac_y/workers/*/worker-*.json")
+    return [json.loads(file.read_text())["pid"] for file in files]
+
+
+def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_more(tmp_path):
+    ended = run(*TINY, "study.n_trials=2", cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr == ""
+    assert ended.stdout.count("\ntrial ") == 2
+    assert "judging trial 0 done: test/mean_steps" in ended.stdout
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
+    by_id = {each.info.run_id: each for each in runs}
+    assert {each.info.status for each in runs} == {"FINISHED"}
+    (study_run,) = [each for each in runs if each.info.run_name == "study sac_y"]
+    for trial in trials_of(tmp_path):
+        # Trial, run, folder and configuration know each other.
+        tracked = by_id[trial.user_attrs["mlflow_run"]]
+        assert tracked.data.tags["mlflow.parentRunId"] == study_run.info.run_id
+        assert tracked.data.tags["trial"] == str(trial.number)
+        assert tracked.data.tags["folder"] == str(tmp_path / trial.user_attrs["folder"])
+        assert tracked.data.tags["config.sha256"] == trial.user_attrs["config_sha256"]
+        assert tracked.data.metrics["mean_steps"] == trial.value
+        assert float(tracked.data.params["agent.lr"]) == trial.params["agent.lr"]
+        (training,) = [each for each in runs if each.data.tags.get("mlflow.parentRunId") == tracked.info.run_id]
+        assert float(training.data.params["agent.lr"]) == trial.params["agent.lr"]
+        assert training.data.tags["folder"].startswith(tracked.data.tags["folder"])
+        assert trial.intermediate_values.keys() == {200, 400}
+    assert len({trial.params["agent.lr"] for trial in trials_of(tmp_path)}) == 2
+    again = run(*TINY, "study.n_trials=3", "study.judging.best=0", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert [trial.state.name for trial in trials_of(tmp_path)] == ["COMPLETE"] * 3
+    other = run(*TINY, "study.n_trials=4", "training.validation_episodes=3", cwd=tmp_path)
+    assert other.returncode == 2
+    assert "training.validation_episodes was 2, is 3; study.accept_changes=true goes on" in other.stderr
+    assert len(trials_of(tmp_path)) == 3
+
+
+def test_study_goes_on_from_the_checkpoint_of_a_worker_that_was_killed(tmp_path):
+    words = [*TINY, "study.n_trials=1", "study.workers=1", "study.judging.best=0", "training.env_steps=30000"]
+    process = started(*words, cwd=tmp_path)
+    wait_for(lambda: any(len(trial.intermediate_values) > 3 for trial in trials_of(tmp_path)), process)
+    (pid,) = workers_in(tmp_path)
+    os.kill(pid, signal.SIGKILL)
+    wait_for(lambda: len(trials_of(tmp_path)) > 1 and len(trials_of(tmp_path)[1].intermediate_values) > 3, process)
+    dead, retry = trials_of(tmp_path)
+    assert dead.state.name == "FAIL"
+    assert "its worker died" in dead.user_attrs["failure"]
+    assert retry.user_attrs["retry_of"] == dead.number
+    assert retry.params == dead.params
+    # What the first attempt has reported, the second has from its checkpoint.
+    common = dead.intermediate_values.keys() & retry.intermediate_values.keys()
+    assert len(common) > 3
+    assert all(retry.intermediate_values[step] == dead.intermediate_values[step] for step in common)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=30) == 130
+
+
+def test_interrupted_study_hands_its_trials_back_and_leaves_no_process(tmp_path):
+    words = [*TINY, "study.n_trials=2", "study.judging.best=0", "training.env_steps=200000"]
+    process = started(*words, cwd=tmp_path)
+    wait_for(lambda: len(trials_of(tmp_path)) == 2 and trials_of(tmp_path)[1].intermediate_values, process)
+    at_s = time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=30) == 130
+    assert time.monotonic() - at_s < 15
+    assert processes_in(tmp_path) == []
+    assert [trial.state.name for trial in trials_of(tmp_path)] == ["WAITING", "WAITING"]
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
+    assert {each.info.status for each in runs} == {"KILLED"}
+    assert (tmp_path / "printed").read_text().endswith("interrupted\n")
+    values = [trial.params for trial in trials_of(tmp_path)]
+    again = run(*words, "study.env_steps=1", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert [trial.params for trial in trials_of(tmp_path)] == values
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["sweeps=sac_y"], "a study has many runs, which needs -m: python -m armscan.run -m sweeps=sac_y"),
+        (["-m", "sweeps=foo"], "sweeps is 'foo', but it must be base"),
+        (["-m", "sweeps=sac_y", "agent.lr=1,2"], "'agent.lr=1,2' gives several values, but those of a study come"),
+        (["-m", "sweeps=sac_y", "+study.foo=1"], "there is no key 'foo' in study, but only "),
+        (
+            ["-m", "sweeps=sac_y", "study.n_trials=0"],
+            "study.n_trials is 0, but it must be",
+        ),
+        (
+            ["-m", "sweeps=sac_y", "study.objectives=[minimize foo]"],
+            "study.objectives names 'foo', but a trial",
+        ),
+        (
+            ["-m", "sweeps=sac_y", "study.objectives=[up mean_steps]"],
+            "study.objectives is ['up mean_steps'], but",
+        ),
+        (["-m", "sweeps=sac_y", "study.seeds=[1,1]"], "study.seeds is [1, 1], but no seed may be there twice"),
+        (["-m", "sweeps=sac_y", "study.judging=3"], "study.judging is 3, but it must have best and seeds"),
+        (["-m", "sweeps=sac_y", "study.pruner=median"], "study.pruner is 'median', but it must have a _target_"),
+        (
+            ["-m", "sweeps=sac_y", "study.objectives=[minimize mean_steps,maximize success_rate]"],
+            "study.pruner is optuna.pruners.MedianPruner, but trials of several objectives cannot be pruned",
+        ),
+        (["-m", "sweeps=sac_y", "study/sampler=best"], "study/sampler is 'best', but it must be cmaes, "),
+        (["-m", "sweeps=sac_y", "study.name=a/b"], "study.name is 'a/b', but it must be of letters, digits"),
+        (["-m", "sweeps=sac_y", "study.workers=999"], "study.workers is 999, but this machine has "),
+        (
+            ["-m", "sweeps=sac_y", "study.storage=postgresql://me:secret@127.0.0.1:1/db"],
+            "study.storage is 'postgresql://me@127.0.0.1:1/db', but this storage cannot be used",
+        ),
+        (
+            ["-m", "sweeps=sac_y", "+study.space={agent.lrr:{choices:[1]}}"],
+            "study.space: agent.lrr=1 is not allowed: there is no key 'lrr' in agent, but only ",
+        ),
+        (
+            ["-m", "sweeps=sac_y", "+study.space={agent.tau:{low:0.5,high:7.0}}"],
+            "study.space: agent.tau=7.0 is not allowed: agent.tau is 7.0, but it must be",
+        ),
+        (["-m", "sweeps=sac_y", "agent=random"], "but the trials of this study need one that learns"),
+        (["-m", "sweeps=sac_y", "training.env_steps=-1"], "training.env_steps is -1, but it must be a whole number"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_study_answers_mistakes_in_one_line_before_anything_is_there(tmp_path, monkeypatch, words, line):
+    monkeypatch.chdir(tmp_path)
+    few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
+    with pytest.raises((ArmscanError, HydraException)) as raised:
+        run_study([*words, *few], launch=lambda _: pytest.fail("workers were launched"))
+    answer = mistake_in_one_line(raised.value, words)
+    assert answer is not None
+    assert line in answer
+    assert "\n" not in answer
+    assert "secret" not in answer
+    assert list(tmp_path.iterdir()) == []
