@@ -36,7 +36,8 @@ def run(config: DictConfig) -> None:
         from armscan.sweeps.command import run_worker
 
         hydra_config = HydraConfig.get()
-        run_worker(config, list(hydra_config.overrides.task), Path(hydra_config.sweep.dir))
+        words = [*hydra_config.overrides.task, *hydra_config.overrides.hydra]
+        run_worker(config, words, Path(hydra_config.sweep.dir))
         return
     invocation = Invocation.current()
     if invocation.job is not None:

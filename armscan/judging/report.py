@@ -78,14 +78,10 @@ class Judgement:
     @cached_property
     def volume_figures(self) -> dict[str, dict[str, Figures]]:
         """By what the volumes are called, then by the volume's name."""
-        by_label: dict[str, dict[str, Figures]] = {}
-        for label, evaluation in self.evaluations.items():
-            names = dict.fromkeys(episode.volume for episode in evaluation.episodes)
-            by_label[label] = {
-                name: Figures.of(Evaluation(tuple(each for each in evaluation.episodes if each.volume == name)))
-                for name in names
-            }
-        return by_label
+        return {
+            label: {name: Figures.of(each) for name, each in evaluation.by_volume().items()}
+            for label, evaluation in self.evaluations.items()
+        }
 
     def to_dict(self) -> dict[str, Any]:
         """Returns everything, ready for JSON; what was not measured is None."""

@@ -25,7 +25,7 @@ from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import Screen, print_result
 from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, local_workers, supervise
 
-WORKER_KEY = "study.worker"
+WORKER_KEY, SEARCH_PATH = "study.worker", "hydra.searchpath"
 MULTIRUN, PLAN = ("-m", "--multirun"), "--plan"
 LAUNCHERS_ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
 LEAVE_S = 4.0
@@ -56,7 +56,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
         raise InvalidValueError("a study has many runs, which needs -m: python -m armscan.run -m " + " ".join(own))
     _check_single_values(own)
     quieten_libraries()
-    of_study = [word for word in own if not word.lstrip("+~").startswith("hydra")]
+    of_study = _words_of_study(own)
     settings, task, config = read_settings(of_study)
     check_space(settings, task, of_study, config)
     if PLAN in words or _is_planned(of_study):
@@ -87,8 +87,16 @@ def run_worker(config: DictConfig, words: Sequence[str], folder: Path) -> None:
         words: of the worker's job.
         folder: of the workers of this start.
     """
-    of_study = [word for word in words if not word.startswith(f"{WORKER_KEY}=")]
-    supervise(of_study, int(config.study.worker), folder)
+    supervise(_words_of_study(words), int(config.study.worker), folder)
+
+
+def _words_of_study(words: Sequence[str]) -> list[str]:
+    """Returns the words that the configuration of a trial is composed of.
+
+    Those of Hydra itself are for the launching of workers, but for the one that says where configurations are found.
+    """
+    others = ("hydra", f"{WORKER_KEY}=")
+    return [word for word in words if not word.lstrip("+~").startswith(others) or word.startswith(SEARCH_PATH)]
 
 
 @contextlib.contextmanager

@@ -12,7 +12,6 @@ from armscan.sweeps.settings import StudySettings
 from armscan.sweeps.storage import Storage
 
 SUFFIX = "-judged"
-JUDGING_OBJECTIVES = ("test/mean_steps",)
 # A seed that judges is this much above all those that choose.
 FIRST_SEED_ABOVE = 1000
 

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from armscan.errors import InvalidValueError, listed
 from armscan.settings import plain
 from armscan.sweeps.attempt import composed, study_section
-from armscan.sweeps.judging import JUDGING_OBJECTIVES, SUFFIX, make_judging_study, seed_of_judged
+from armscan.sweeps.judging import SUFFIX, make_judging_study, seed_of_judged
 from armscan.sweeps.ledger import Ledger, Limits
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.settings import StudySettings
@@ -100,7 +100,7 @@ class OpenStudy:
             searching,
             name=self.settings.name + SUFFIX,
             ledger=Ledger(study, self.storage, limits, is_open=False),
-            objectives=JUDGING_OBJECTIVES,
+            objectives=(self.task.judged,),
             reported=None,
             run=self.task.judge,
             seeds_of=seed_of_judged,
@@ -120,7 +120,7 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
         raise InvalidValueError("there is no study: give sweeps=NAME")
     settings = StudySettings.read(section, fixed)
     task = instantiate(settings.task)
-    if missing := [name for name in ("figures", "check", "run", "judge") if not hasattr(task, name)]:
+    if missing := [name for name in ("figures", "judged", "check", "run", "judge") if not hasattr(task, name)]:
         raise InvalidValueError(f"study.task is {task!r}, but it must have what a Task has, {missing[0]} first")
     for name in settings.objectives:
         if name not in task.figures:

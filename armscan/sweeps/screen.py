@@ -16,11 +16,13 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from armscan.sweeps.judging import JUDGING_OBJECTIVES, SUFFIX, best_trials
+from armscan.console import print_where_to_look
+from armscan.sweeps.judging import SUFFIX, best_trials
 from armscan.sweeps.ledger import ENV_STEPS, FAILURE, LEASE, RETRIED, Ledger, Tally
 from armscan.sweeps.opening import OpenStudy
 from armscan.sweeps.settings import StudySettings
 from armscan.sweeps.space import overrides_of
+from armscan.sweeps.verdict import SHOWN, verdicts
 
 REFRESH_S = 2.0
 
@@ -78,7 +80,7 @@ class Screen:
         for trial, is_judging in self._ended():
             if (trial.number, is_judging) not in self._told:
                 self._told.add((trial.number, is_judging))
-                names = JUDGING_OBJECTIVES if is_judging else tuple(self._opened.settings.objectives)
+                names = (self._opened.task.judged,) if is_judging else tuple(self._opened.settings.objectives)
                 print(f"{'judging ' if is_judging else ''}{sentence(trial, names)}", flush=True)
 
     def _table(self) -> Table:
@@ -148,7 +150,31 @@ def print_result(opened: OpenStudy) -> int:
             str(trial.number), *(f"{value:.4g}" for value in trial.values), " ".join(overrides_of(trial.params))
         )
     Console().print(table)
+    _print_verdicts(opened)
+    print_where_to_look(opened.folder, opened.tracking["uri"])
     return 0
+
+
+def _print_verdicts(opened: OpenStudy) -> None:
+    """Prints the table that is the result of a study, where anything was judged."""
+    study = judging_study(opened)
+    judged = verdicts(study.get_trials(deepcopy=False)) if study is not None else []
+    if not judged:
+        return
+    n_seeds = ", ".join(sorted({str(verdict.n_seeds) for verdict in judged}))
+    title = f"result: trained again with {n_seeds} other seeds, on the test volumes (95 % intervals)"
+    table = Table(title=title, title_justify="left")
+    names = [name for name in SHOWN if name in judged[0].means] or list(judged[0].means)
+    for heading in ("trial", *(name.removeprefix("test/").replace("_", " ") for name in names)):
+        table.add_column(heading)
+    for verdict in judged:
+        table.add_row(str(verdict.number), *(_with_interval(verdict.means[name]) for name in names))
+    Console().print(table)
+
+
+def _with_interval(mean: tuple[float, float, float]) -> str:
+    value, low, high = (f"{round(number, 3):g}" for number in mean)
+    return value if low == "nan" else f"{value}\n{low} to {high}"
 
 
 def _values(trial: FrozenTrial, objectives: Sequence[str]) -> str:

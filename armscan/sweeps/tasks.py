@@ -17,6 +17,10 @@ class Task(Protocol):
     def figures(self) -> tuple[str, ...]:
         """The names of the figures that `run` returns, which a study may have as objectives."""
 
+    @property
+    def judged(self) -> str:
+        """Of the figures that `judge` returns, the name of the one that says most."""
+
     def check(self, config: DictConfig) -> None:
         """Checks that a trial with this configuration could begin; called for many before the first trial.
 

@@ -90,6 +90,11 @@ class Training:
         """Those of the best validation, and those of the training."""
         return (*Evaluation(()).metrics(), *TRAINING_FIGURES)
 
+    @property
+    def judged(self) -> str:
+        """The mean steps of an episode."""
+        return "test/mean_steps"
+
     def check(self, config: DictConfig) -> None:
         """See `Task.check`; volumes are read once for all configurations that have the same ones."""
         check_keys(config)
@@ -122,7 +127,10 @@ def _concluded(stage: Stage, result: TrainingResult, folder: Path) -> dict[str, 
     (folder / EPISODES_FILE).write_text(json.dumps(contents, indent=1))
     agent, seed = stage.experiment.agent, FILM_SEED + stage.experiment.seed
     film_episode(agent, stage.film_env, folder / FILM_FILE, seed=seed)
-    return {f"test/{name}": value for name, value in evaluations[TEST].metrics().items()}
+    figures = {f"test/{name}": value for name, value in evaluations[TEST].metrics().items()}
+    for volume, evaluation in evaluations[TEST].by_volume().items():
+        figures |= {f"test/volume/{volume}/{name}": value for name, value in evaluation.metrics().items()}
+    return figures
 
 
 def trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:

@@ -104,6 +104,11 @@ class Evaluation:
             "mean_steps_not_started_solved": unsolved.mean_steps,
         }
 
+    def by_volume(self) -> dict[str, Evaluation]:
+        """Returns the episodes of each volume."""
+        names = dict.fromkeys(episode.volume for episode in self.episodes)
+        return {name: Evaluation(tuple(each for each in self.episodes if each.volume == name)) for name in names}
+
     def to_dict(self) -> dict[str, Any]:
         """Returns the figures and every episode, ready for JSON."""
         return {"metrics": self.metrics(), "episodes": [asdict(episode) for episode in self.episodes]}

@@ -1,0 +1,77 @@
+"""The result of a study: its best configurations on the test volumes, over seeds that did not choose them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from optuna.trial import FrozenTrial, TrialState
+
+from armscan.sweeps.ledger import FIGURES, JUDGED
+
+N_RESAMPLES = 2000
+OF_VOLUME = re.compile(r"test/volume/(.+)/(\w+)")
+SHOWN = ("test/success_rate", "test/mean_steps", "test/mean_distance_mm", "test/mean_distance_deg")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One configuration, judged.
+
+    Args:
+        number: of the trial that it was found by.
+        n_seeds: trainings that it was judged by.
+        means: by figure: its mean over the seeds, lower and upper end of the mean's 95 % interval.
+    """
+
+    number: int
+    n_seeds: int
+    means: Mapping[str, tuple[float, float, float]]
+
+
+def verdicts(judged: Sequence[FrozenTrial], *, seed: int = 0) -> list[Verdict]:
+    """Returns what the trainings that judge say of each configuration.
+
+    The interquartile mean over seeds and test volumes (of success rates the mean, where every failure counts), with an
+    interval by stratified bootstrap of the seeds, as Agarwal et al. 2021 (arXiv:2108.13264) recommend.
+
+    Args:
+        judged: trials of the study that judges; those that have not finished are left out.
+        seed: of the resamples: the same trials give the same intervals.
+    """
+    of_number: dict[int, list[dict[str, float]]] = {}
+    for trial in judged:
+        if trial.state == TrialState.COMPLETE:
+            of_number.setdefault(int(trial.user_attrs[JUDGED]), []).append(trial.user_attrs[FIGURES])
+    return [_verdict(number, of_seeds, seed) for number, of_seeds in of_number.items()]
+
+
+def _verdict(number: int, of_seeds: Sequence[Mapping[str, float]], seed: int) -> Verdict:
+    names = [name for name in of_seeds[0] if name.startswith("test/") and not OF_VOLUME.fullmatch(name)]
+    return Verdict(number, len(of_seeds), {name: _interval(name, _scores(name, of_seeds), seed) for name in names})
+
+
+def _scores(name: str, of_seeds: Sequence[Mapping[str, float]]) -> NDArray[np.float64]:
+    """Returns a figure of shape (seeds, test volumes), or (seeds, 1) where it is not known of each volume."""
+    figure = name.removeprefix("test/")
+    volumes = [key for key in of_seeds[0] if (found := OF_VOLUME.fullmatch(key)) and found[2] == figure]
+    return np.array([[figures[key] for key in volumes or [name]] for figures in of_seeds])
+
+
+def _interval(name: str, scores: NDArray[np.float64], seed: int) -> tuple[float, float, float]:
+    # Deferred: it takes a second, and only who judges needs it.
+    from rliable import library, metrics
+
+    mean = metrics.aggregate_mean if "success_rate" in name else metrics.aggregate_iqm
+    if len(scores) < 2 or np.isnan(scores).any():
+        return float(mean(scores)), float("nan"), float("nan")
+    points, ends = library.get_interval_estimates(
+        {"it": scores},
+        lambda each: np.array([mean(each)]),
+        reps=N_RESAMPLES,
+        random_state=np.random.RandomState(seed),
+    )
+    return float(points["it"][0]), float(ends["it"][0, 0]), float(ends["it"][1, 0])

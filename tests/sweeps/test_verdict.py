@@ -1,0 +1,45 @@
+"""What the trainings that judge say of a configuration."""
+
+import numpy as np
+import pytest
+from optuna.trial import TrialState, create_trial
+from rliable.metrics import aggregate_iqm
+
+from armscan.sweeps.ledger import FIGURES, JUDGED
+from armscan.sweeps.verdict import verdicts
+
+
+def judged(number, figures, state=TrialState.COMPLETE):
+    value = 0.0 if state == TrialState.COMPLETE else None
+    return create_trial(state=state, value=value, user_attrs={JUDGED: number, FIGURES: figures})
+
+
+def figures_of(of_volumes):
+    figures = {"mean_steps": 1.0, "test/mean_steps": float(np.mean(of_volumes)), "test/success_rate": 1.0}
+    return figures | {f"test/volume/v{i}/mean_steps": value for i, value in enumerate(of_volumes)}
+
+
+def test_verdict_is_over_seeds_and_test_volumes():
+    scores = np.random.default_rng(0).gamma(2.0, 2.0, (5, 8))
+    (verdict,) = verdicts([judged(7, figures_of(list(of_seed))) for of_seed in scores])
+    assert (verdict.number, verdict.n_seeds) == (7, 5)
+    assert verdict.means.keys() == {"test/mean_steps", "test/success_rate"}
+    mean, low, high = verdict.means["test/mean_steps"]
+    assert mean == pytest.approx(aggregate_iqm(scores))
+    assert low < mean < high
+    assert verdict.means["test/success_rate"] == (1.0, 1.0, 1.0)
+
+
+def test_verdict_of_the_same_trials_is_the_same_and_lacks_those_that_have_not_finished():
+    trials = [judged(number, figures_of([number, seed, 3.0])) for number in (1, 2) for seed in range(3)]
+    trials.append(judged(2, figures_of([0.0]), TrialState.FAIL))
+    first, second = verdicts(trials), verdicts(trials)
+    assert first == second
+    assert [verdict.n_seeds for verdict in first] == [3, 3]
+
+
+def test_verdict_of_one_seed_has_no_interval():
+    (verdict,) = verdicts([judged(0, figures_of([2.0]))])
+    mean, low, high = verdict.means["test/mean_steps"]
+    assert mean == 2.0
+    assert np.isnan([low, high]).all()
