@@ -81,15 +81,12 @@ def start_tracking(config: DictConfig, invocation: Invocation, stage: Stage) -> 
     resolved = plain(config)
     client, experiment_id = open_store(**resolved["tracking"])
     choices, job = invocation.choices, invocation.job
-    started_with = {
-        CONFIG_FILE: yaml.safe_dump(resolved, sort_keys=False).encode(),
-        VOLUMES_FILE: json.dumps(stage.fingerprints, indent=1).encode(),
-    }
+    files = started_with(resolved, stage)
     # Another run's, left in a folder that somebody named: they would be taken for this one's.
     for stale in (LAST_CHECKPOINT, BEST_CHECKPOINT):
         (invocation.folder / stale).unlink(missing_ok=True)
     # Before the run is there: whenever it is killed, it can be resumed.
-    for name, contents in started_with.items():
+    for name, contents in files.items():
         write_whole(invocation.folder / name, methodcaller("write", contents))
     tracked = TrackedRun.start(
         client,
@@ -104,13 +101,21 @@ def start_tracking(config: DictConfig, invocation: Invocation, stage: Stage) -> 
             FAMILIAR_TAG: Familiar.of(stage.training_env, stage.experiment.smallest_slice_px).to_json(),
             **place_tags(invocation.folder),
             "working_folder": str(Path.cwd()),
-            **{SUM_TAGS[name]: sum_of(contents) for name, contents in started_with.items()},
+            **{SUM_TAGS[name]: sum_of(contents) for name, contents in files.items()},
             **({JOB_TAG: str(job.number)} if job else {}),
         },
         parent_id=job.parent_run_id if job else None,
     )
-    tracked.log_files(*(invocation.folder / name for name in started_with))
+    tracked.log_files(*(invocation.folder / name for name in files))
     return tracked
+
+
+def started_with(config: dict[str, Any], stage: Stage) -> dict[str, bytes]:
+    """Returns the files that say what a run was started with, by their names: its configuration and its volumes."""
+    return {
+        CONFIG_FILE: yaml.safe_dump(config, sort_keys=False).encode(),
+        VOLUMES_FILE: json.dumps(stage.fingerprints, indent=1).encode(),
+    }
 
 
 def volume_tags(split: Split) -> dict[str, str]:

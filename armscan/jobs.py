@@ -52,9 +52,14 @@ def run_job() -> None:
     for ending in (signal.SIGINT, signal.SIGTERM):
         signal.signal(ending, leave)
     try:
-        from armscan.experiment import run_experiment
+        if job.is_repeated:
+            from armscan.repeating import run_again
 
-        figures = run_experiment(config, invocation)
+            figures = run_again(config, invocation, job)
+        else:
+            from armscan.experiment import run_experiment
+
+            figures = run_experiment(config, invocation)
     except Exception as error:
         line = mistake_in_one_line(error)
         if line is None:

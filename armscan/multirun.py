@@ -64,6 +64,8 @@ class Multirun(Callback):
     """
 
     folder: Path | None = None
+    # Whether what has finished of an earlier one is not run again.
+    is_repeated = False
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Opens the store, starts the parent run, and leaves word of it for the jobs."""
@@ -92,6 +94,7 @@ class Multirun(Callback):
         tags = {**source_tags(), "overrides": command}
         parent = client.create_run(experiment_id, run_name=f"multirun {command}"[:250], tags=tags)
         word = {"run_id": parent.info.run_id, "tracking": tracking, "overrides": overrides}
+        word["is_repeated"] = Multirun.is_repeated
         (folder / PARENT_FILE).write_text(json.dumps(word))
         Multirun.folder = folder
 
@@ -106,6 +109,7 @@ class Job:
         varied: those among them that tell it from the other jobs.
         parent_run_id: the run that its run is a child of.
         folder: of the multirun.
+        is_repeated: whether it need not run where it has finished before.
     """
 
     number: int
@@ -113,6 +117,7 @@ class Job:
     varied: str
     parent_run_id: str
     folder: Path
+    is_repeated: bool = False
 
     @classmethod
     def current(cls) -> Self | None:
@@ -124,7 +129,14 @@ class Job:
         word = json.loads((folder / PARENT_FILE).read_text())
         overrides = list(hydra_config.overrides.task)
         varied = [override for override in overrides if override not in word["overrides"]]
-        return cls(hydra_config.job.num, shlex.join(overrides), " ".join(varied), word["run_id"], folder)
+        return cls(
+            hydra_config.job.num,
+            shlex.join(overrides),
+            " ".join(varied),
+            word["run_id"],
+            folder,
+            is_repeated=word["is_repeated"],
+        )
 
     @property
     def label(self) -> str:

@@ -56,7 +56,17 @@ def resume(words: Sequence[str]) -> dict[str, dict[str, float]]:
     """
     wanted, uri = _read(words)
     client = open_existing_store(uri)
-    run_id = find_run(client, wanted).info.run_id
+    return go_on(client, find_run(client, wanted).info.run_id)
+
+
+def go_on(client: MlflowClient, run_id: str, *, job_label: str | None = None) -> dict[str, dict[str, float]]:
+    """Goes on with a run; see `resume`.
+
+    Args:
+        client: of the store that it is in.
+        run_id: of the run.
+        job_label: what stands before the lines of one job of several, None for a single run.
+    """
     folder = _folder_of(client, client.get_run(run_id))
     with held(folder):
         # It may have ended just before the folder was free.
@@ -73,7 +83,7 @@ def resume(words: Sequence[str]) -> dict[str, dict[str, float]]:
         agent, split = stage.experiment.agent, stage.experiment.split
         earlier = take_up(agent, folder, stage.origin(run_id)) if isinstance(agent, Learner) else []
         tracked = TrackedRun.go_on(client, run_id, config=plain(config), tags=volume_tags(split) | place_tags(folder))
-        return carry_out(stage, tracked, folder, client.tracking_uri, earlier=earlier)
+        return carry_out(stage, tracked, folder, client.tracking_uri, job_label=job_label, earlier=earlier)
 
 
 def _read(words: Sequence[str]) -> tuple[str, str]:

@@ -23,10 +23,11 @@ from armscan.errors import is_interruption
 from armscan.invocation import Invocation
 from armscan.jobs import start_job
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME, mistake_in_one_line, quieten_libraries
-from armscan.multirun import INTERRUPTED, end_multirun, remove_if_untracked
+from armscan.multirun import INTERRUPTED, Multirun, end_multirun, remove_if_untracked
 from armscan.settings import RESUME
 
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
+MULTIRUN, REPEATED = ("-m", "--multirun"), f"{RESUME}=true"
 
 
 def run(config: DictConfig) -> None:
@@ -86,8 +87,11 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     quieten_libraries()
     # Hydra reads its options only before the first override, and people write them anywhere.
-    sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in ("-m", "--multirun"))
+    sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in MULTIRUN)
     try:
+        if REPEATED in sys.argv[1:] and sys.argv[1] in MULTIRUN:
+            sys.argv.remove(REPEATED)
+            Multirun.is_repeated = True
         if any(word.startswith(f"{RESUME}=") for word in sys.argv[1:]):
             # Before Hydra composes a configuration, and makes a folder: a run that goes on has both.
             from armscan.resume import resume

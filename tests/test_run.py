@@ -116,6 +116,19 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     assert all(child.info.run_id[:8] in table for child in children)
     assert {child.data.tags["choice.obs"] for child in children} == {"cluster", "action_reward"}
     assert len(list((tmp_path / "multirun").glob("*/*/*/best.pt"))) == 2
+    again = armscan_run(*varied, "projection=zy", "stack=2", "memory=1", *SMALL, "resume=true", cwd=tmp_path)
+    assert again.returncode == 1
+    # What has finished is not run again; what failed is.
+    assert again.stdout.count("has finished before: run") == 2
+    assert again.stdout.count("again alone") + again.stderr.count("again alone") == 2
+    runs = runs_in(tmp_path)[1]
+    parents = [each for each in runs if each.info.run_name.startswith("multirun")]
+    assert len(runs) == len(parents) + 2 == 4
+    new_parent = next(each for each in parents if each.info.run_id != parent.info.run_id)
+    adopted = [each.data.tags["mlflow.parentRunId"] for each in runs if each not in parents]
+    assert adopted == [new_parent.info.run_id] * 2
+    for child in children:
+        assert f"{child.data.metrics['test_volumes/mean_steps']:.2f}" in again.stdout
 
 
 def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_path):
