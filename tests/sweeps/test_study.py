@@ -1,0 +1,80 @@
+"""A study in its storage: the same one goes on, another is refused with what differs."""
+
+import pytest
+
+from armscan.errors import StudyError
+from armscan.sweeps.settings import Judging, StudySettings
+from armscan.sweeps.space import Space
+from armscan.sweeps.storage import open_storage
+from armscan.sweeps.study import make_study
+
+FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
+
+
+def settings(**changes):
+    values = {
+        "name": "a",
+        "storage": "optuna.journal",
+        "folder": "studies/a",
+        "task": {"_target_": "armscan.sweeps.training.Training"},
+        "space": Space.read({"agent.lr": {"low": 1e-4, "high": 1e-2}}),
+        "objectives": {"mean_steps": "minimize"},
+        "sampler": {"_target_": "optuna.samplers.RandomSampler"},
+        "pruner": {"_target_": "optuna.pruners.NopPruner"},
+        "n_trials": 5,
+        "max_failures": 1,
+        "max_retries": 1,
+        "hours": None,
+        "env_steps": None,
+        "workers": 1,
+        "seed": 0,
+        "seeds": (0,),
+        "judging": Judging(best=0, seeds=1),
+        "accept_changes": False,
+    }
+    return StudySettings(**values | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "fixed"),
+    [
+        ({"n_trials": 50, "workers": 2, "hours": 3.0}, {}),
+        ({}, {"seed": 4, "device": "cuda", "tracking": {"uri": "b"}}),
+        ({}, {"agent": {"lr": 5.0, "gamma": 0.9}}),
+    ],
+    ids=["budgets", "where and how it is computed", "what is searched"],
+)
+def test_study_goes_on_where_what_its_trials_do_is_the_same(storage_uri, changes, fixed):
+    study = make_study(open_storage(storage_uri), settings(), FIXED)
+    study.tell(study.ask(), 1.0)
+    assert len(make_study(open_storage(storage_uri), settings(**changes), FIXED | fixed).trials) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "fixed", "line"),
+    [
+        (
+            {},
+            {"agent": {"lr": 1e-3, "gamma": 0.5}},
+            "with another configuration: agent.gamma was 0.9, is 0.5",
+        ),
+        ({}, {"stack": 4}, "stack was not there, is 4; study.accept_changes=true goes on all the same"),
+        ({"seeds": (0, 1)}, {}, "study.seeds was [0], is [0, 1]"),
+        ({"objectives": {"solved": "maximize"}}, {}, "has other objectives: mean_steps was minimize, is not there"),
+        ({"space": Space.read({"agent.tau": {"low": 0.1, "high": 0.2}})}, {}, "searches another space: agent.lr was {"),
+    ],
+    ids=lambda value: "",
+)
+def test_study_that_has_changed_is_refused_with_what_differs(storage_uri, changes, fixed, line):
+    make_study(open_storage(storage_uri), settings(), FIXED)
+    with pytest.raises(StudyError) as error:
+        make_study(open_storage(storage_uri), settings(**changes), FIXED | fixed)
+    assert line in str(error.value)
+
+
+def test_study_that_has_changed_goes_on_where_that_is_accepted_from_then_on(storage_uri):
+    make_study(open_storage(storage_uri), settings(), FIXED)
+    make_study(open_storage(storage_uri), settings(accept_changes=True), FIXED | {"stack": 4})
+    make_study(open_storage(storage_uri), settings(), FIXED | {"stack": 4})
+    with pytest.raises(StudyError, match="stack was 4, is not there"):
+        make_study(open_storage(storage_uri), settings(), FIXED)
