@@ -111,6 +111,7 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     assert len(trials_of(tmp_path)) == 3
 
 
+@pytest.mark.slow
 def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_interrupted(tmp_path):
     words = [*TINY, "study.n_trials=2", "study.judging.best=0", "training.env_steps=200000"]
     process = started(*words, cwd=tmp_path)
