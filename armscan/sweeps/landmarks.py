@@ -13,9 +13,8 @@ from armscan.anatomy import Judge
 from armscan.anatomy.tissues import Tissues, checked_tissues
 from armscan.building import check_keys
 from armscan.errors import InvalidValueError
-from armscan.settings import plain
 from armscan.sweeps.attempt import Attempt
-from armscan.training import Split
+from armscan.sweeps.tasks import VolumesInMemory
 from armscan.volumes import LabelVolume
 from armscan.volumes.plane import ManipulatorAction
 
@@ -31,7 +30,7 @@ class Landmarks:
     """
 
     def __init__(self) -> None:
-        self._volumes: tuple[str, Split] | None = None
+        self._volumes = VolumesInMemory()
 
     @property
     def figures(self) -> tuple[str, ...]:
@@ -51,17 +50,17 @@ class Landmarks:
                 f"env.clustering is {config.env.clustering!r}, but this study searches its parts: write it in full"
             )
         self._tissues(config)
-        self._split(config)
+        self._volumes.of(config)
 
     def run(self, attempt: Attempt) -> dict[str, float]:
         """Looks at the training volumes. See `Task.run`."""
         config, _ = attempt.config(attempt.seeds[0])
-        return self._figures(config, self._split(config).training)
+        return self._figures(config, self._volumes.of(config).training)
 
     def judge(self, attempt: Attempt) -> dict[str, float]:
         """Looks at the test volumes. See `Task.judge`."""
         config, _ = attempt.config(attempt.seeds[0])
-        figures = self._figures(config, self._split(config).test)
+        figures = self._figures(config, self._volumes.of(config).test)
         return {f"test/{name}": value for name, value in figures.items()}
 
     def _figures(self, config: DictConfig, volumes: Mapping[str, LabelVolume]) -> dict[str, float]:
@@ -82,9 +81,3 @@ class Landmarks:
 
     def _tissues(self, config: DictConfig) -> Tissues:
         return checked_tissues(instantiate(config.env.clustering, _convert_="object"))
-
-    def _split(self, config: DictConfig) -> Split:
-        data = str(plain(config.data))
-        if self._volumes is None or self._volumes[0] != data:
-            self._volumes = data, instantiate(config.data, _convert_="object")
-        return self._volumes[1]

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol
 
+from hydra.utils import instantiate
 from omegaconf import DictConfig
+
+from armscan.settings import plain
+from armscan.training import Split
 
 if TYPE_CHECKING:
     from armscan.sweeps.attempt import Attempt
@@ -40,3 +44,18 @@ class Task(Protocol):
 
         Their names begin with `test/`.
         """
+
+
+class VolumesInMemory:
+    """The volumes of one configuration after the other, read anew only where they are others."""
+
+    def __init__(self) -> None:
+        self._data: str | None = None
+
+    def of(self, config: DictConfig) -> Split:
+        """Returns the volumes of a configuration."""
+        data = str(plain(config.data))
+        if self._data != data:
+            self._split: Split = instantiate(config.data, _convert_="object")
+            self._data = data
+        return self._split

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import optuna
-from hydra.utils import instantiate
 from omegaconf import DictConfig
 from scipy.stats import trim_mean
 
@@ -24,8 +23,9 @@ from armscan.settings import plain
 from armscan.stage import Stage
 from armscan.sweeps.attempt import Attempt
 from armscan.sweeps.ledger import ENV_STEPS
+from armscan.sweeps.tasks import VolumesInMemory
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store
-from armscan.training import TEST, EpochReport, Evaluation, Split, TrainingResult, film_episode, take_up
+from armscan.training import TEST, EpochReport, Evaluation, TrainingResult, film_episode, take_up
 
 # Of each training, beside the figures of its best validation.
 TRAINING_FIGURES = (ENV_STEPS, "training_s", "solved")
@@ -83,7 +83,7 @@ class Training:
     """The task of training an agent, with each of a trial's seeds."""
 
     def __init__(self) -> None:
-        self._volumes: tuple[str, Split] | None = None
+        self._volumes = VolumesInMemory()
 
     @property
     def figures(self) -> tuple[str, ...]:
@@ -96,12 +96,9 @@ class Training:
         return "test/mean_steps"
 
     def check(self, config: DictConfig) -> None:
-        """See `Task.check`; volumes are read once for all configurations that have the same ones."""
+        """See `Task.check`."""
         check_keys(config)
-        data = str(plain(config.data))
-        if self._volumes is None or self._volumes[0] != data:
-            self._volumes = data, instantiate(config.data, _convert_="object")
-        experiment = build(config, self._volumes[1])
+        experiment = build(config, self._volumes.of(config))
         if not isinstance(experiment.agent, Learner):
             raise InvalidValueError(
                 f"agent is {config.agent.get('_target_')!r}, but the trials of this study need one that learns"
