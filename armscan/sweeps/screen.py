@@ -22,7 +22,7 @@ from armscan.sweeps.ledger import ENV_STEPS, FAILURE, LEASE, RETRIED, Ledger, Ta
 from armscan.sweeps.opening import OpenStudy
 from armscan.sweeps.settings import StudySettings
 from armscan.sweeps.space import overrides_of
-from armscan.sweeps.verdict import SHOWN, verdicts
+from armscan.sweeps.verdict import shown_of, verdicts
 
 REFRESH_S = 2.0
 
@@ -164,17 +164,12 @@ def _print_verdicts(opened: OpenStudy) -> None:
     n_seeds = ", ".join(sorted({str(verdict.n_seeds) for verdict in judged}))
     title = f"result: trained again with {n_seeds} other seeds, on the test volumes (95 % intervals)"
     table = Table(title=title, title_justify="left")
-    names = [name for name in SHOWN if name in judged[0].means] or list(judged[0].means)
+    names = shown_of(judged[0])
     for heading in ("trial", *(name.removeprefix("test/").replace("_", " ") for name in names)):
         table.add_column(heading)
     for verdict in judged:
-        table.add_row(str(verdict.number), *(_with_interval(verdict.means[name]) for name in names))
+        table.add_row(str(verdict.number), *(verdict.text(name).replace(" (", "\n(") for name in names))
     Console().print(table)
-
-
-def _with_interval(mean: tuple[float, float, float]) -> str:
-    value, low, high = (f"{round(number, 3):g}" for number in mean)
-    return value if low == "nan" else f"{value}\n{low} to {high}"
 
 
 def _values(trial: FrozenTrial, objectives: Sequence[str]) -> str:

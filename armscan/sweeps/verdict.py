@@ -31,6 +31,16 @@ class Verdict:
     n_seeds: int
     means: Mapping[str, tuple[float, float, float]]
 
+    def text(self, name: str) -> str:
+        """Returns a figure with its interval, such as `1.52 (1.4 to 1.7)`."""
+        mean, low, high = (f"{round(number, 3):g}" for number in self.means[name])
+        return mean if low == "nan" else f"{mean} ({low} to {high})"
+
+
+def shown_of(verdict: Verdict) -> list[str]:
+    """Returns the names of the figures that a table shows: the most telling, or all where none of these is there."""
+    return [name for name in SHOWN if name in verdict.means] or list(verdict.means)
+
 
 def verdicts(judged: Sequence[FrozenTrial], *, seed: int = 0) -> list[Verdict]:
     """Returns what the trainings that judge say of each configuration.

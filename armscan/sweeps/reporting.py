@@ -1,0 +1,213 @@
+"""The report of a study: one HTML file that needs no server, and every number of it as CSV beside it."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import html
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import optuna
+from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+from optuna.trial import FrozenTrial, TrialState
+from plotly import graph_objects
+from plotly.offline import get_plotlyjs
+
+from armscan.sweeps.attempt import FOLDER
+from armscan.sweeps.judging import best_trials
+from armscan.sweeps.ledger import ENV_STEPS, FAILURE, FIGURES, JUDGED, RETRY_OF, Tally
+from armscan.sweeps.space import overrides_of
+from armscan.sweeps.verdict import Verdict, shown_of, verdicts
+
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
+<style>
+body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2rem auto; padding: 0 1rem; }}
+table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
+td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; }}
+</style><script>{plotly}</script></head><body><h1>{title}</h1>
+{body}
+</body></html>
+"""
+MIN_TRIALS_FOR_IMPORTANCE = 4
+N_CURVES = 5
+Row = Mapping[str, Any]
+
+
+def write_report(study: optuna.Study, judged: Sequence[FrozenTrial], folder: Path) -> Path:
+    """Writes the report of a study.
+
+    Args:
+        study: in its storage.
+        judged: the trials of the study that judges; none where there is none.
+        folder: takes `report.html` and the CSV files.
+
+    Returns:
+        The HTML file.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    objectives = list(study.user_attrs["objectives"])
+    trials, found = study.get_trials(deepcopy=False), verdicts(judged)
+    tables = {
+        "trials": [_trial_row(trial, objectives) for trial in trials],
+        "reports": [
+            {"trial": trial.number, "step": step, "value": value}
+            for trial in trials
+            for step, value in trial.intermediate_values.items()
+        ],
+        "failures": [_failure_row(trial) for trial in trials if trial.state == TrialState.FAIL],
+        "result": [row for verdict in found for row in _verdict_rows(verdict)],
+        "importances": [{"key": key, "importance": share} for key, share in _importances(study, objectives).items()],
+    }
+    for name, rows in tables.items():
+        _write_csv(folder / f"{name}.csv", rows)
+    parts = [
+        _summary(study, trials, objectives),
+        "<h2>Result</h2><p>The best settings, trained again with seeds that chose nothing, on the test volumes.</p>",
+        _table(_result_rows(found, trials)) if found else "<p>Nothing has been judged yet.</p>",
+        _films(judged),
+        *_charts(study, objectives, tables["importances"]),
+        "<h2>Failures</h2>",
+        _table(tables["failures"]) if tables["failures"] else "<p>No trial has failed.</p>",
+        "<h2>Numbers</h2><ul>" + "".join(f'<li><a href="{each}.csv">{each}.csv</a></li>' for each in tables) + "</ul>",
+    ]
+    file = folder / "report.html"
+    page = PAGE.format(title=html.escape(f"Study {study.study_name}"), plotly=get_plotlyjs(), body="\n".join(parts))
+    file.write_text(page)
+    return file
+
+
+def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
+    tally = Tally.of(trials)
+    n_pruned = sum(trial.state == TrialState.PRUNED for trial in tally.finished)
+    best = best_trials(study, 1)
+    found = (
+        ", ".join(f"{name} {value:.4g}" for name, value in zip(objectives, best[0].values, strict=True)) if best else ""
+    )
+    return (
+        f"<p>{len(tally.finished)} trials finished, {n_pruned} of them pruned; {len(tally.failed)} failed, "
+        f"{len(tally.retried)} taken up again after their worker died. {tally.env_steps:,} environment steps, "
+        f"{tally.busy_hours:.2f} hours."
+        + (f" Best while searching: trial {best[0].number}, {html.escape(found)}; that flatters it." if best else "")
+        + "</p>"
+    )
+
+
+def _charts(study: optuna.Study, objectives: Sequence[str], importances: Sequence[Row]) -> list[str]:
+    """Returns the charts with their headings; those of a single objective where there is one."""
+    charts: dict[str, graph_objects.Figure] = {}
+    finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if not finished:
+        return ["<p>No trial has run to its end yet.</p>"]
+    if len(objectives) == 1:
+        charts["History"] = optuna.visualization.plot_optimization_history(study, target_name=objectives[0])
+        if importances:
+            bars = graph_objects.Bar(
+                x=[row["importance"] for row in importances], y=[row["key"] for row in importances], orientation="h"
+            )
+            charts["Importance of each key"] = graph_objects.Figure(bars)
+        charts["Parallel coordinates"] = optuna.visualization.plot_parallel_coordinate(study, target_name=objectives[0])
+        charts["Slices of the space"] = optuna.visualization.plot_slice(study, target_name=objectives[0])
+        charts["Reports while training, pruned trials too"] = optuna.visualization.plot_intermediate_values(study)
+        charts["Learning curves of the best"] = _curves(best_trials(study, N_CURVES), objectives[0])
+    else:
+        charts["Trials that no other is better than"] = optuna.visualization.plot_pareto_front(
+            study, target_names=list(objectives)
+        )
+    return [f"<h2>{name}</h2>{_drawn(chart)}" for name, chart in charts.items()]
+
+
+def _curves(trials: Sequence[FrozenTrial], objective: str) -> graph_objects.Figure:
+    figure = graph_objects.Figure()
+    for trial in trials:
+        steps, values = list(trial.intermediate_values), list(trial.intermediate_values.values())
+        figure.add_scatter(x=steps, y=values, name=f"trial {trial.number}")
+    return figure.update_layout(xaxis_title="environment steps, seed after seed", yaxis_title=objective)
+
+
+def _drawn(chart: graph_objects.Figure) -> str:
+    return str(chart.to_html(full_html=False, include_plotlyjs=False))
+
+
+def _importances(study: optuna.Study, objectives: Sequence[str]) -> dict[str, float]:
+    n_finished = len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+    if len(objectives) > 1 or n_finished < MIN_TRIALS_FOR_IMPORTANCE:
+        return {}
+    return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
+
+
+def _films(judged: Sequence[FrozenTrial]) -> str:
+    """Returns a film of each configuration that was judged, of its first training that left one here."""
+    films: dict[int, str] = {}
+    for trial in judged:
+        files = sorted(Path(trial.user_attrs.get(FOLDER, "nowhere")).glob("seed_*/episode.gif"))
+        if files and trial.user_attrs[JUDGED] not in films:
+            contents = base64.b64encode(files[0].read_bytes()).decode()
+            films[trial.user_attrs[JUDGED]] = f'<img alt="an episode" src="data:image/gif;base64,{contents}">'
+    return "".join(f"<h3>Trial {number}: an episode on a test volume</h3>{film}" for number, film in films.items())
+
+
+def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> dict[str, Any]:
+    values = dict(zip(objectives, trial.values or (), strict=False)) if trial.state == TrialState.COMPLETE else {}
+    seconds = trial.duration.total_seconds() if trial.duration is not None else None
+    told = {f"figure/{name}": value for name, value in trial.user_attrs.get(FIGURES, {}).items()}
+    return {
+        "trial": trial.number,
+        "state": trial.state.name.lower(),
+        **values,
+        "seconds": seconds,
+        "env_steps": trial.user_attrs.get(ENV_STEPS),
+        "retry_of": trial.user_attrs.get(RETRY_OF),
+        "mlflow_run": trial.user_attrs.get("mlflow_run"),
+        **trial.params,
+        **told,
+    }
+
+
+def _failure_row(trial: FrozenTrial) -> dict[str, Any]:
+    return {
+        "trial": trial.number,
+        "cause": trial.user_attrs.get(FAILURE, "not known"),
+        "values": " ".join(overrides_of(trial.params)),
+    }
+
+
+def _verdict_rows(verdict: Verdict) -> Iterable[dict[str, Any]]:
+    for name, (mean, low, high) in verdict.means.items():
+        yield {
+            "trial": verdict.number,
+            "seeds": verdict.n_seeds,
+            "figure": name,
+            "mean": mean,
+            "low": low,
+            "high": high,
+        }
+
+
+def _result_rows(found: Sequence[Verdict], trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
+    return [
+        {
+            "trial": verdict.number,
+            "values": " ".join(overrides_of(trials[verdict.number].params)),
+            "seeds": verdict.n_seeds,
+            **{name.removeprefix("test/"): verdict.text(name) for name in shown_of(verdict)},
+        }
+        for verdict in found
+    ]
+
+
+def _table(rows: Sequence[Row]) -> str:
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    head = "".join(f"<th>{html.escape(key)}</th>" for key in keys)
+    lines = ("".join(f"<td>{html.escape(str(row.get(key, '')))}</td>" for key in keys) for row in rows)
+    return f"<table><tr>{head}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+
+
+def _write_csv(file: Path, rows: Sequence[Row]) -> None:
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    with file.open("w", newline="") as opened:
+        writer = csv.DictWriter(opened, keys)
+        writer.writeheader()
+        writer.writerows(rows)
