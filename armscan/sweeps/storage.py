@@ -76,6 +76,12 @@ def _open_journal(path: Path) -> Storage:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
+        # Before anything is mended: any other file would lose what stands behind its last line's end.
+        with path.open("rb") as file:
+            first_line = file.readline(BLOCK_BYTES)
+        is_torn_in_its_first = first_line.startswith(b"{") and not first_line.endswith(b"\n")
+        if first_line and not is_torn_in_its_first and not (first_line.startswith(b"{") and b'"op_code"' in first_line):
+            raise StudyError(f"study.storage is {str(path)!r}, but that file is no journal of Optuna")
         lock = JournalLock(path)
         lock.acquire()
         lock.release()

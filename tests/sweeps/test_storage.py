@@ -83,11 +83,14 @@ def test_storage_that_cannot_be_used_is_refused_in_one_line(uri, line):
     assert "secret" not in str(error.value)
 
 
-def test_storage_refuses_a_file_that_is_no_journal(tmp_path):
-    (tmp_path / "a").write_text("labels: {}\nsplits: {}\n")
+@pytest.mark.parametrize(
+    "contents", ["labels: {}\nsplits: {}\n", "a\nand a last line", "SQLite format 3\0", "garbage\n"]
+)
+def test_storage_refuses_a_file_that_is_no_journal_and_leaves_it_as_it_is(tmp_path, contents):
+    (tmp_path / "a").write_text(contents)
     with pytest.raises(StudyError, match="that file is no journal of Optuna"):
         open_storage(str(tmp_path / "a"))
-    assert (tmp_path / "a").read_text() == "labels: {}\nsplits: {}\n"
+    assert (tmp_path / "a").read_text() == contents
 
 
 def test_address_is_shown_without_its_password():
