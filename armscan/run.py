@@ -24,10 +24,10 @@ from armscan.invocation import Invocation
 from armscan.jobs import start_job
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME, mistake_in_one_line, quieten_libraries
 from armscan.multirun import INTERRUPTED, Multirun, end_multirun, remove_if_untracked
-from armscan.settings import RESUME
+from armscan.settings import MULTIRUN, RESUME
 
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
-MULTIRUN, REPEATED = ("-m", "--multirun"), f"{RESUME}=true"
+REPEATED = f"{RESUME}=true"
 
 
 def run(config: DictConfig) -> None:

@@ -20,6 +20,8 @@ CHANGES = {
     "device": "compute.device",
 }
 RESUME, TRACKING_URI = "resume", "tracking.uri"
+# Hydra's options for several runs.
+MULTIRUN = ("-m", "--multirun")
 # The phantoms, where a command asks for volumes.
 PHANTOM = "phantom"
 

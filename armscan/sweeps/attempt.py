@@ -12,10 +12,11 @@ from typing import Any
 import optuna
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 from optuna.trial import Trial
 
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
+from armscan.settings import plain
 from armscan.sweeps.ledger import ENV_STEPS, RETRY_OF, SEEDS
 from armscan.sweeps.space import Value, overrides_of
 from armscan.tracking import TrackedRun
@@ -132,9 +133,7 @@ def study_section(words: Sequence[str]) -> dict[str, Any]:
     GlobalHydra.instance().clear()
     with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
         section = compose(CONFIG_NAME, list(words)).get("study")
-    plain = OmegaConf.to_container(section, resolve=True, throw_on_missing=True) if section is not None else {}
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
+    return plain(section) if section is not None else {}
 
 
 def sum_of_config(config: Mapping[str, Any]) -> str:

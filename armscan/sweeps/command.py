@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 
 from armscan.errors import InvalidValueError
 from armscan.mistakes import quieten_libraries
+from armscan.settings import MULTIRUN
 from armscan.sweeps.checking import check_space
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy, open_for_work, read_settings
@@ -26,14 +27,9 @@ from armscan.sweeps.screen import Screen, print_result
 from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, local_workers, supervise
 
 WORKER_KEY, SEARCH_PATH = "study.worker", "hydra.searchpath"
-MULTIRUN, PLAN = ("-m", "--multirun"), "--plan"
+PLAN = "--plan"
 LAUNCHERS_ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
 LEAVE_S = 4.0
-
-
-def is_study(words: Sequence[str]) -> bool:
-    """Whether a command line asks for a study."""
-    return any(word.startswith("sweeps=") for word in words)
 
 
 def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:
@@ -59,7 +55,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     of_study = _words_of_study(own)
     settings, task, config = read_settings(of_study)
     check_space(settings, task, of_study, config)
-    if PLAN in words or _is_planned(of_study):
+    if PLAN in words or settings.plan:
         print_plan(settings)
         return 0
     launcher = _launcher(own)
@@ -156,7 +152,3 @@ def _check_single_values(words: Sequence[str]) -> None:
 def _launcher(words: Sequence[str]) -> str:
     chosen: Any = [word.partition("=")[2] for word in words if word.startswith("hydra/launcher=")]
     return str(chosen[-1]) if chosen else "joblib"
-
-
-def _is_planned(words: Sequence[str]) -> bool:
-    return any(word in ("study.plan=true", "study.plan=True") for word in words)

@@ -32,8 +32,10 @@ def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:
         trials = study.best_trials
     is_down = study.directions[0] == optuna.study.StudyDirection.MINIMIZE
     ranked = sorted(trials, key=lambda trial: (trial.values[0] if is_down else -trial.values[0], trial.number))
-    different = {json.dumps(trial.params, sort_keys=True, default=str): trial for trial in reversed(ranked)}
-    return [trial for trial in ranked if trial in different.values()][:n_best]
+    different: dict[str, FrozenTrial] = {}
+    for trial in ranked:
+        different.setdefault(json.dumps(trial.params, sort_keys=True), trial)
+    return list(different.values())[:n_best]
 
 
 def make_judging_study(storage: Storage, settings: StudySettings, searched: optuna.Study) -> optuna.Study:

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from hydra.utils import instantiate
 from mlflow import MlflowClient
@@ -24,8 +23,6 @@ from armscan.sweeps.study import STUDY_RUN, make_study, open_study
 from armscan.sweeps.tasks import Task
 from armscan.tracking import open_store, source_tags
 
-# Keys of the command line that are the study's own.
-OWN_SECTIONS = ("study", "sweeps", "hydra")
 NO_END = 10**9
 
 
@@ -37,7 +34,6 @@ class OpenStudy:
         settings: what it is asked to do.
         task: what its trials do.
         config: of its trials, without what they try.
-        words: that this was composed of.
         storage: that it is kept in.
         client: of the tracking store.
         experiment_id: of its tracked runs.
@@ -47,16 +43,10 @@ class OpenStudy:
     settings: StudySettings
     task: Task
     config: DictConfig
-    words: tuple[str, ...]
     storage: Storage
     client: MlflowClient
     experiment_id: str
     run_id: str
-
-    @property
-    def tracking(self) -> dict[str, Any]:
-        """The section of the configuration."""
-        return plain(self.config.tracking)
 
     @property
     def folder(self) -> Path:
@@ -151,7 +141,6 @@ def open_for_work(words: Sequence[str]) -> OpenStudy:
         settings=settings,
         task=task,
         config=config,
-        words=tuple(words),
         storage=storage,
         client=client,
         experiment_id=experiment_id,

@@ -15,7 +15,7 @@ from optuna.trial import FrozenTrial, TrialState
 from plotly import graph_objects
 from plotly.offline import get_plotlyjs
 
-from armscan.sweeps.attempt import FOLDER
+from armscan.sweeps.attempt import FOLDER, RUN
 from armscan.sweeps.judging import best_trials
 from armscan.sweeps.ledger import ENV_STEPS, FAILURE, FIGURES, JUDGED, RETRY_OF, Tally
 from armscan.sweeps.space import overrides_of
@@ -160,7 +160,7 @@ def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> dict[str, Any]:
         "seconds": seconds,
         "env_steps": trial.user_attrs.get(ENV_STEPS),
         "retry_of": trial.user_attrs.get(RETRY_OF),
-        "mlflow_run": trial.user_attrs.get("mlflow_run"),
+        "mlflow_run": trial.user_attrs.get(RUN),
         **trial.params,
         **told,
     }

@@ -151,7 +151,7 @@ def print_result(opened: OpenStudy) -> int:
         )
     Console().print(table)
     _print_verdicts(opened)
-    print_where_to_look(opened.folder, opened.tracking["uri"])
+    print_where_to_look(opened.folder, opened.config.tracking.uri)
     return 0
 
 

@@ -13,8 +13,8 @@ from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.space import Space
 
 NAME = re.compile(r"\w[\w\-.]*")
-# For the command: whether to show only what would be run, and which worker it is.
-NOT_READ = ("plan", "worker")
+# For the command: which worker it is.
+NOT_READ = ("worker",)
 DIRECTIONS, NO_PRUNER = ("minimize", "maximize"), "optuna.pruners.NopPruner"
 
 
@@ -58,6 +58,7 @@ class StudySettings:
         seeds: that each trial is run with, one after another.
         judging: of the best at the end.
         accept_changes: whether to go on although the fixed configuration has changed.
+        plan: whether only to show what would be run.
     """
 
     name: str
@@ -78,6 +79,7 @@ class StudySettings:
     seeds: tuple[int, ...]
     judging: Judging
     accept_changes: bool
+    plan: bool = False
 
     @classmethod
     def read(cls, section: Mapping[str, Any], fixed: Mapping[str, Any]) -> Self:
@@ -134,6 +136,7 @@ class StudySettings:
         if self.env_steps is not None:
             check_int("study.env_steps", self.env_steps, at_least=1)
         check_bool("study.accept_changes", self.accept_changes)
+        check_bool("study.plan", self.plan)
 
     def check_workers(self, n_cores: int) -> None:
         """Raises `InvalidValueError` where the workers' compute threads would be more than the cores of one machine."""

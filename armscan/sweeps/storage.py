@@ -79,8 +79,7 @@ def _open_journal(path: Path) -> Storage:
         # Before anything is mended: any other file would lose what stands behind its last line's end.
         with path.open("rb") as file:
             first_line = file.readline(BLOCK_BYTES)
-        is_torn_in_its_first = first_line.startswith(b"{") and not first_line.endswith(b"\n")
-        if first_line and not is_torn_in_its_first and not (first_line.startswith(b"{") and b'"op_code"' in first_line):
+        if not _begins_a_journal(first_line):
             raise StudyError(f"study.storage is {str(path)!r}, but that file is no journal of Optuna")
         lock = JournalLock(path)
         lock.acquire()
@@ -92,6 +91,11 @@ def _open_journal(path: Path) -> Storage:
     # What Optuna raises for a line that it cannot read, whichever way it is damaged.
     except (ValueError, KeyError, AssertionError) as error:
         raise StudyError(f"study.storage is {str(path)!r}, but that file is no journal of Optuna: {error}") from error
+
+
+def _begins_a_journal(line: bytes) -> bool:
+    """Whether this is the first line of a journal, which may be empty, or torn in its first line."""
+    return not line or (line.startswith(b"{") and (b'"op_code"' in line or not line.endswith(b"\n")))
 
 
 def _open_database(uri: str) -> Storage:

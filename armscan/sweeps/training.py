@@ -25,13 +25,14 @@ from armscan.sweeps.attempt import Attempt
 from armscan.sweeps.ledger import ENV_STEPS
 from armscan.sweeps.tasks import VolumesInMemory
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store
+from armscan.tracking.run import CURVE_FILE, EVALUATION_FILE
 from armscan.training import TEST, EpochReport, Evaluation, TrainingResult, film_episode, take_up
 
 # Of each training, beside the figures of its best validation.
 TRAINING_FIGURES = (ENV_STEPS, "training_s", "solved")
 # What is cut from each end of the sorted values in an interquartile mean.
 QUARTER = 0.25
-RUN_FILE, CURVE_FILE, FILM_FILE, EPISODES_FILE = "run.json", "learning_curve.png", "episode.gif", "evaluation.json"
+RUN_FILE, FILM_FILE = "run.json", "episode.gif"
 # What a training leaves that is worth having in the tracking store.
 KEPT = (".pt", ".png", ".gif", ".json")
 Conclude = Callable[[Stage, TrainingResult, Path], dict[str, float]]
@@ -121,7 +122,7 @@ class Training:
 def _concluded(stage: Stage, result: TrainingResult, folder: Path) -> dict[str, float]:
     evaluations = judged(stage)
     contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
-    (folder / EPISODES_FILE).write_text(json.dumps(contents, indent=1))
+    (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
     agent, seed = stage.experiment.agent, FILM_SEED + stage.experiment.seed
     film_episode(agent, stage.film_env, folder / FILM_FILE, seed=seed)
     figures = {f"test/{name}": value for name, value in evaluations[TEST].metrics().items()}

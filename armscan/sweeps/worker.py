@@ -37,11 +37,10 @@ class Worker:
         phase: of the study.
         words: of the command line, which a trial's configuration is composed of, but for what it tries.
         keeper: holds the trial that is at hand.
-        tracking: the section of the configuration.
     """
 
-    def __init__(self, phase: Phase, words: Sequence[str], keeper: Keeper, tracking: dict[str, Any]) -> None:
-        self._phase, self._words, self._keeper, self._tracking = phase, words, keeper, tracking
+    def __init__(self, phase: Phase, words: Sequence[str], keeper: Keeper) -> None:
+        self._phase, self._words, self._keeper = phase, words, keeper
         self._tracked: TrackedRun | None = None
 
     def work(self) -> str:

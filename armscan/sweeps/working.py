@@ -33,7 +33,7 @@ def work(words: Sequence[str], name: str, is_told_to_leave: Callable[[], bool], 
             on_death=partial(close_runs_of, phase=phase),
         )
         with keeper.at_work():
-            reason = Worker(phase, words, keeper, opened.tracking).work()
+            reason = Worker(phase, words, keeper).work()
         say(f"{phase.name}: {reason}")
         return reason
 
