@@ -24,6 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 from armscan.errors import ArmscanError, listed
 
 CONFIG_MODULE, CONFIG_NAME = "armscan.conf", "config"
+GROUP = re.compile(r"[a-z_/]+")
 
 
 def mistake_in_one_line(error: BaseException, words: Sequence[str] | None = None) -> str | None:
@@ -127,13 +128,14 @@ def _instantiation_mistake(error: InstantiationException, words: Sequence[str]) 
 def _emptied_group(words: Sequence[str]) -> str | None:
     """The group that was given as null in these words, if one was."""
     groups = (word.removesuffix("=null") for word in words if word.endswith("=null"))
-    return next((group for group in groups if group.isidentifier() and _choices_of(group)), None)
+    return next((group for group in groups if GROUP.fullmatch(group) and _choices_of(group)), None)
 
 
 def _choices_of(group: str) -> list[str]:
     """The choices of a group of the configuration, none where there is no such group."""
     folder = resources.files(CONFIG_MODULE) / group
-    return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir()) if folder.is_dir() else []
+    files = folder.iterdir() if folder.is_dir() else ()
+    return sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml"))
 
 
 def _keys_under(parent: str, words: Sequence[str]) -> list[str]:

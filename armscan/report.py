@@ -35,23 +35,26 @@ def _run(words: Sequence[str]) -> int:
     # Deferred: a mistake on the command line should be answered before these are loaded.
     import optuna
 
-    from armscan.sweeps.judging import SUFFIX
     from armscan.sweeps.reporting import write_report
-    from armscan.sweeps.storage import open_storage
+    from armscan.sweeps.settings import JUDGED_SUFFIX, check_study_name
+    from armscan.sweeps.storage import existing_storage, without_password
+    from armscan.sweeps.study import is_ours
 
     quieten_libraries()
-    name, uri = values["study"], values.get("storage", USUAL_STORAGE)
-    if "://" not in uri and not Path(uri).is_file():
-        raise StudyError(f"storage is {uri!r}, but there is no such file: give the one that the study is in")
-    storage = open_storage(uri).optuna
-    names = optuna.get_all_study_names(storage)
-    if name not in names or name.endswith(SUFFIX):
-        there = [each for each in names if not each.endswith(SUFFIX)]
-        raise StudyError(f"study is {name!r}, but {_which(there)} in {uri!r}")
+    name, uri = check_study_name("study", values["study"]), values.get("storage", USUAL_STORAGE)
+    storage = existing_storage(uri, where="storage")
+    if storage is None:
+        raise StudyError(f"storage is {without_password(uri)!r}, but nothing is there: give the one that it is in")
+    names = optuna.get_all_study_names(storage.optuna)
+    if name not in names:
+        there = [each for each in names if not each.endswith(JUDGED_SUFFIX)]
+        raise StudyError(f"study is {name!r}, but {_which(there)} in {storage.uri!r}")
+    study = optuna.load_study(study_name=name, storage=storage.optuna)
+    if not is_ours(study):
+        raise StudyError(f"study is {name!r}, but that one in {storage.uri!r} was not made by armscan")
     judged = []
-    if name + SUFFIX in names:
-        judged = optuna.load_study(study_name=name + SUFFIX, storage=storage).get_trials(deepcopy=False)
-    study = optuna.load_study(study_name=name, storage=storage)
+    if name + JUDGED_SUFFIX in names:
+        judged = optuna.load_study(study_name=name + JUDGED_SUFFIX, storage=storage.optuna).get_trials(deepcopy=False)
     file = write_report(study, judged, Path(values.get("out", f"reports/{name}")))
     print(f"look at   {file}")
     return 0

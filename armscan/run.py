@@ -19,7 +19,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from armscan.errors import is_interruption
+from armscan.errors import InvalidValueError, is_interruption
 from armscan.invocation import Invocation
 from armscan.jobs import start_job
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME, mistake_in_one_line, quieten_libraries
@@ -27,7 +27,6 @@ from armscan.multirun import INTERRUPTED, Multirun, end_multirun, remove_if_untr
 from armscan.settings import MULTIRUN, RESUME
 
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
-REPEATED = f"{RESUME}=true"
 
 
 def run(config: DictConfig) -> None:
@@ -77,6 +76,16 @@ def launched(words: Sequence[str]) -> None:
     hydra.main(version_base="1.3", config_path=f"pkg://{CONFIG_MODULE}", config_name=CONFIG_NAME)(run)()
 
 
+def _is_repeated(words: list[str]) -> bool:
+    """Whether a multirun is to repeat only what has not finished; takes the word that says so away."""
+    said = [word for word in words if word.startswith(f"{RESUME}=")]
+    for word in said:
+        if word.partition("=")[2].lower() != "true":
+            raise InvalidValueError(f"{word!r} is for a single run; a grid is repeated with {RESUME}=true")
+        words.remove(word)
+    return bool(said)
+
+
 def main() -> int:
     """Runs what the command line asks for; returns the exit code."""
     if os.environ.get("HYDRA_FULL_ERROR") == "1":
@@ -89,18 +98,17 @@ def main() -> int:
     # Hydra reads its options only before the first override, and people write them anywhere.
     sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in MULTIRUN)
     try:
-        if REPEATED in sys.argv[1:] and sys.argv[1] in MULTIRUN:
-            sys.argv.remove(REPEATED)
-            Multirun.is_repeated = True
+        if any(word == "--plan" or word.startswith("sweeps=") for word in sys.argv[1:]):
+            from armscan.sweeps.command import run_study
+
+            return run_study(sys.argv[1:], launched)
+        if any(word in MULTIRUN for word in sys.argv[1:]):
+            Multirun.is_repeated = _is_repeated(sys.argv)
         if any(word.startswith(f"{RESUME}=") for word in sys.argv[1:]):
             # Before Hydra composes a configuration, and makes a folder: a run that goes on has both.
             from armscan.resume import resume
 
             resume(sys.argv[1:])
-        elif any(word.startswith("sweeps=") for word in sys.argv[1:]):
-            from armscan.sweeps.command import run_study
-
-            return run_study(sys.argv[1:], launched)
         else:
             launched(sys.argv[1:])
     except BrokenPipeError:

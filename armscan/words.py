@@ -67,6 +67,9 @@ def answered(command: Callable[[Sequence[str]], int], words: Sequence[str] | Non
         if is_interruption(error):
             print(f"\ninterrupted; {left}", file=sys.stderr)
             return 130
+        if isinstance(error, OSError) and error.filename is not None:
+            print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
+            return 2
         if not isinstance(error, ArmscanError):
             raise
         print(f"error: {error}", file=sys.stderr)

@@ -18,7 +18,7 @@ from optuna.trial import Trial
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
 from armscan.settings import plain
 from armscan.sweeps.ledger import ENV_STEPS, RETRY_OF, SEEDS
-from armscan.sweeps.space import Value, overrides_of
+from armscan.sweeps.values import Value, overrides_of
 from armscan.tracking import TrackedRun
 
 # User attributes of a trial.

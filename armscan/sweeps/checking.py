@@ -12,8 +12,8 @@ from armscan.errors import ArmscanError, InvalidValueError
 from armscan.mistakes import mistake_in_one_line
 from armscan.sweeps.attempt import composed
 from armscan.sweeps.settings import StudySettings
-from armscan.sweeps.space import overrides_of
 from armscan.sweeps.tasks import Task
+from armscan.sweeps.values import overrides_of
 
 
 def check_space(settings: StudySettings, task: Task, words: Sequence[str], config: DictConfig) -> None:

@@ -11,23 +11,22 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
-from armscan.errors import InvalidValueError
 from armscan.mistakes import quieten_libraries
-from armscan.settings import MULTIRUN
+from armscan.settings import plain
+from armscan.sweeps.attempt import composed
 from armscan.sweeps.checking import check_space
+from armscan.sweeps.command_line import WORKER_KEY, CommandLine, words_of_trials
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy, open_for_work, read_settings
 from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import Screen, print_result
+from armscan.sweeps.study import existing_study
 from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, local_workers, supervise
 
-WORKER_KEY, SEARCH_PATH = "study.worker", "hydra.searchpath"
-PLAN = "--plan"
+LAUNCHER = "hydra/launcher"
 LAUNCHERS_ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
 LEAVE_S = 4.0
 
@@ -47,26 +46,24 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
         StudyError: see `open_for_work`.
         TrackingError: likewise.
     """
-    own = [word for word in words if word not in (*MULTIRUN, PLAN)]
-    if len(own) == len(words) or not set(words) & {*MULTIRUN}:
-        raise InvalidValueError("a study has many runs, which needs -m: python -m armscan.run -m " + " ".join(own))
-    _check_single_values(own)
+    given = CommandLine.read(words)
     quieten_libraries()
-    of_study = _words_of_study(own)
-    settings, task, config = read_settings(of_study)
-    check_space(settings, task, of_study, config)
-    if PLAN in words or settings.plan:
-        print_plan(settings)
-        return 0
-    launcher = _launcher(own)
+    settings, task, config = read_settings(given.of_trials)
+    launcher = composed(given.words)[1][LAUNCHER]
     if launcher in LAUNCHERS_ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))
-    opened = open_for_work(of_study)
+    check_space(settings, task, given.of_trials, config)
+    if given.is_plan or settings.plan:
+        print_plan(settings, existing_study(settings, plain(config)))
+        return 0
+    # Before anything is made: a study or a storage that would be refused.
+    existing_study(settings, plain(config))
+    opened = open_for_work(given.of_trials)
     folder = opened.folder / "workers" / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
     folder.mkdir(parents=True)
     Process.current().write(folder / LAUNCHER_FILE)
     numbers = ",".join(map(str, range(settings.workers)))
-    started = ["-m", *own, f"{WORKER_KEY}={numbers}", f"hydra.sweep.dir={folder}"]
+    started = ["-m", *given.words, f"{WORKER_KEY}={numbers}", f"hydra.sweep.dir={folder}"]
     if launcher == "joblib":
         started.append(f"hydra.launcher.n_jobs={settings.workers}")
     opened.client.update_run(opened.run_id, status="RUNNING")
@@ -83,16 +80,7 @@ def run_worker(config: DictConfig, words: Sequence[str], folder: Path) -> None:
         words: of the worker's job.
         folder: of the workers of this start.
     """
-    supervise(_words_of_study(words), int(config.study.worker), folder)
-
-
-def _words_of_study(words: Sequence[str]) -> list[str]:
-    """Returns the words that the configuration of a trial is composed of.
-
-    Those of Hydra itself are for the launching of workers, but for the one that says where configurations are found.
-    """
-    others = ("hydra", f"{WORKER_KEY}=")
-    return [word for word in words if not word.lstrip("+~").startswith(others) or word.startswith(SEARCH_PATH)]
+    supervise(words_of_trials(words), int(config.study.worker), folder)
 
 
 @contextlib.contextmanager
@@ -138,17 +126,3 @@ def _end_workers(folder: Path) -> None:
     for worker in alive:
         if process_start(worker.pid) == worker.started:
             os.kill(worker.pid, signal.SIGKILL)
-
-
-def _check_single_values(words: Sequence[str]) -> None:
-    for override in OverridesParser.create().parse_overrides(list(words)):
-        if override.is_sweep_override():
-            raise InvalidValueError(
-                f"{override.input_line!r} gives several values, but those of a study come from its space: give "
-                f"'+study.space.{override.key_or_group}.choices=[...]'"
-            )
-
-
-def _launcher(words: Sequence[str]) -> str:
-    chosen: Any = [word.partition("=")[2] for word in words if word.startswith("hydra/launcher=")]
-    return str(chosen[-1]) if chosen else "joblib"

@@ -8,12 +8,8 @@ import optuna
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.sweeps.ledger import JUDGED, JUDGED_SEED
-from armscan.sweeps.settings import StudySettings
+from armscan.sweeps.settings import FIRST_SEED_ABOVE, StudySettings
 from armscan.sweeps.storage import Storage
-
-SUFFIX = "-judged"
-# A seed that judges is this much above all those that choose.
-FIRST_SEED_ABOVE = 1000
 
 
 def judging_seeds(settings: StudySettings) -> tuple[int, ...]:
@@ -43,9 +39,8 @@ def make_judging_study(storage: Storage, settings: StudySettings, searched: optu
 
     Where it exists, trainings are added for configurations that have become the best since.
     """
-    name = settings.name + SUFFIX
     with storage.alone():
-        study = optuna.create_study(study_name=name, storage=storage.optuna, load_if_exists=True)
+        study = optuna.create_study(study_name=settings.judged_name, storage=storage.optuna, load_if_exists=True)
         there = {
             (trial.user_attrs[JUDGED], trial.user_attrs[JUDGED_SEED]) for trial in study.get_trials(deepcopy=False)
         }

@@ -7,15 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hydra.utils import instantiate
 from mlflow import MlflowClient
 from omegaconf import DictConfig
 
-from armscan.errors import InvalidValueError, listed
+from armscan.errors import InvalidValueError, StudyError, listed
 from armscan.settings import plain
 from armscan.sweeps.attempt import composed, study_section
-from armscan.sweeps.judging import SUFFIX, make_judging_study, seed_of_judged
+from armscan.sweeps.command_line import fixed_by
+from armscan.sweeps.judging import make_judging_study, seed_of_judged
 from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.parts import make_pruner, make_sampler, make_task
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.settings import StudySettings
 from armscan.sweeps.storage import Storage, open_storage
@@ -88,7 +89,7 @@ class OpenStudy:
         limits = Limits(n_trials=NO_END, max_failures=self.settings.max_failures, max_retries=self.settings.max_retries)
         return dataclasses.replace(
             searching,
-            name=self.settings.name + SUFFIX,
+            name=self.settings.judged_name,
             ledger=Ledger(study, self.storage, limits, is_open=False),
             objectives=(self.task.judged,),
             reported=None,
@@ -104,14 +105,12 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
     Raises:
         InvalidValueError: if something is not allowed.
     """
-    fixed = {word.lstrip("+~").partition("=")[0]: word for word in words}
     section = study_section(words)
     if not section:
-        raise InvalidValueError("there is no study: give sweeps=NAME")
-    settings = StudySettings.read(section, fixed)
-    task = instantiate(settings.task)
-    if missing := [name for name in ("figures", "judged", "check", "run", "judge") if not hasattr(task, name)]:
-        raise InvalidValueError(f"study.task is {task!r}, but it must have what a Task has, {missing[0]} first")
+        raise InvalidValueError("there is no study in the configuration: give sweeps=NAME of a file with one")
+    settings = StudySettings.read(section, fixed_by(words))
+    make_sampler(settings.sampler, settings.seed), make_pruner(settings.pruner)
+    task = make_task(settings.task)
     for name in settings.objectives:
         if name not in task.figures:
             raise InvalidValueError(f"study.objectives names {name!r}, but a trial returns only {listed(task.figures)}")
@@ -127,9 +126,15 @@ def open_for_work(words: Sequence[str]) -> OpenStudy:
         TrackingError: if the tracking store cannot be used.
     """
     settings, task, config = read_settings(words)
+    try:
+        Path(settings.folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StudyError(
+            f"study.folder is {settings.folder!r}, but no folder can be made there ({error.strerror})"
+        ) from error
+    client, experiment_id = open_store(**plain(config.tracking))
     storage = open_storage(settings.storage)
     study = make_study(storage, settings, plain(config))
-    client, experiment_id = open_store(**plain(config.tracking))
     with storage.alone():
         run_id = study.user_attrs.get(STUDY_RUN)
         if run_id is None:

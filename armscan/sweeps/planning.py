@@ -13,15 +13,19 @@ from rich.text import Text
 from armscan.sweeps.ledger import Tally
 from armscan.sweeps.settings import StudySettings
 from armscan.sweeps.space import Parameter
-from armscan.sweeps.storage import open_storage
-from armscan.sweeps.study import open_study
 
 BYTES_A_MIB = 2**20
 
 
-def print_plan(settings: StudySettings) -> None:
-    """Prints the space, how far the study is and what it has cost, and from that what the rest will take."""
+def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
+    """Prints the space, how far the study is and what it has cost, and from that what the rest will take.
+
+    Args:
+        settings: of the study.
+        study: as far as it is; None where it has not been begun.
+    """
     console = Console()
+    tally = Tally.of(study.get_trials(deepcopy=False)) if study is not None else None
     table = Table(title=f"study {settings.name}: what is searched", title_justify="left")
     for heading in ("key", "values", "where"):
         table.add_column(heading)
@@ -35,7 +39,6 @@ def print_plan(settings: StudySettings) -> None:
     n_judging = settings.judging.best * settings.judging.seeds
     console.print(f"objective  {objectives}, over the seeds {', '.join(map(str, settings.seeds))}")
     console.print(f"limits     {', '.join(limits)}; {settings.workers} workers; then {n_judging} trainings that judge")
-    tally = _tally(settings)
     done = len(tally.finished) if tally else 0
     console.print(f"done       {done} trials" + (f", {len(tally.failed)} failed" if tally and tally.failed else ""))
     if not tally or not done:
@@ -53,15 +56,6 @@ def print_plan(settings: StudySettings) -> None:
         f"the rest   {left} trials and the judging, about {hours:.2f} hours and {spent_mib / done * left:.0f} MiB "
         f"({mean_s:.0f} s a trial so far)"
     )
-
-
-def _tally(settings: StudySettings) -> Tally | None:
-    if "://" not in settings.storage and not Path(settings.storage).exists():
-        return None
-    storage = open_storage(settings.storage)
-    if settings.name not in optuna.get_all_study_names(storage.optuna):
-        return None
-    return Tally.of(open_study(storage, settings).get_trials(deepcopy=False))
 
 
 def _values(parameter: Parameter) -> str:

@@ -17,11 +17,11 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.console import print_where_to_look
-from armscan.sweeps.judging import SUFFIX, best_trials
+from armscan.sweeps.judging import best_trials
 from armscan.sweeps.ledger import ENV_STEPS, FAILURE, LEASE, RETRIED, Ledger, Tally
 from armscan.sweeps.opening import OpenStudy
 from armscan.sweeps.settings import StudySettings
-from armscan.sweeps.space import overrides_of
+from armscan.sweeps.values import overrides_of
 from armscan.sweeps.verdict import shown_of, verdicts
 
 REFRESH_S = 2.0
@@ -101,7 +101,7 @@ class Screen:
 
 def judging_study(opened: OpenStudy) -> optuna.Study | None:
     """Returns the study of the trainings that judge, None where it has not been begun."""
-    name = opened.settings.name + SUFFIX
+    name = opened.settings.judged_name
     if name not in optuna.get_all_study_names(opened.storage.optuna):
         return None
     return optuna.load_study(study_name=name, storage=opened.storage.optuna)

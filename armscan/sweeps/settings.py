@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from armscan.checks import check_bool, check_float, check_int, check_ints
+from armscan.checks import LARGEST_SEED, check_bool, check_float, check_int, check_ints, check_seed
 from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.space import Space
 
-NAME = re.compile(r"\w[\w\-.]*")
+NAME, MAX_NAME_CHARS = re.compile(r"\w[\w\-.]*"), 100
+# What follows the name of a study in that of the study of the trainings that judge it.
+JUDGED_SUFFIX = "-judged"
+# A seed that judges is this much above all those that choose.
+FIRST_SEED_ABOVE, MAX_JUDGING_SEEDS = 1000, 1000
 # For the command: which worker it is.
 NOT_READ = ("worker",)
 DIRECTIONS, NO_PRUNER = ("minimize", "maximize"), "optuna.pruners.NopPruner"
@@ -30,9 +34,16 @@ class Judging:
     best: int
     seeds: int
 
+    @classmethod
+    def read(cls, section: Any) -> Self:
+        """Returns what a section of the configuration says."""
+        if not isinstance(section, Mapping) or section.keys() != {"best", "seeds"}:
+            raise InvalidValueError(f"study.judging is {section!r}, but it must have best and seeds")
+        return cls(**section)
+
     def __post_init__(self) -> None:
         check_int("study.judging.best", self.best, at_least=0)
-        check_int("study.judging.seeds", self.seeds, at_least=1)
+        check_int("study.judging.seeds", self.seeds, at_least=1, at_most=MAX_JUDGING_SEEDS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,26 +109,23 @@ class StudySettings:
         values = {key: value for key, value in section.items() if key not in NOT_READ}
         if missing := [key for key in cls.__dataclass_fields__ if key not in values]:
             raise InvalidValueError(f"study.{missing[0]} is not set, but it must be")
-        judging = values["judging"]
-        if not isinstance(judging, Mapping) or judging.keys() != {"best", "seeds"}:
-            raise InvalidValueError(f"study.judging is {judging!r}, but it must have best and seeds")
+        judging = Judging.read(values["judging"])
         space = Space.read(values["space"]).without(fixed)
         if not space.parameters:
             raise InvalidValueError("nothing is left to search: each key of study.space is given a value")
         read = {
             "space": space,
-            "judging": Judging(**judging),
-            "seeds": _seeds(values["seeds"]),
+            "judging": judging,
+            "seeds": _seeds(values["seeds"], LARGEST_SEED - FIRST_SEED_ABOVE - judging.seeds),
             "objectives": _objectives(values["objectives"]),
         }
         return cls(**values | read)
 
     def __post_init__(self) -> None:
-        for name in ("name", "storage", "folder"):
-            if not isinstance(getattr(self, name), str):
-                raise InvalidValueError(f"study.{name} is {getattr(self, name)!r}, but it must be a text")
-        if not NAME.fullmatch(self.name):
-            raise InvalidValueError(f"study.name is {self.name!r}, but it must be of letters, digits, _, - and .")
+        check_study_name("study.name", self.name)
+        for name in ("storage", "folder"):
+            if not isinstance(given := getattr(self, name), str) or not given.strip() or "\0" in given:
+                raise InvalidValueError(f"study.{name} is {given!r}, but it must be a text that says where")
         for name, made in (("task", self.task), ("sampler", self.sampler), ("pruner", self.pruner)):
             if not isinstance(made, Mapping) or "." not in str(made.get("_target_")):
                 raise InvalidValueError(f"study.{name} is {made!r}, but it must have a _target_, the name of a class")
@@ -129,7 +137,7 @@ class StudySettings:
         check_int("study.n_trials", self.n_trials, at_least=1)
         check_int("study.max_failures", self.max_failures, at_least=0)
         check_int("study.max_retries", self.max_retries, at_least=0)
-        check_int("study.seed", self.seed, at_least=0)
+        check_seed("study.seed", self.seed)
         check_int("study.workers", self.workers, at_least=1)
         if self.hours is not None:
             check_float("study.hours", self.hours, above=0.0)
@@ -137,6 +145,11 @@ class StudySettings:
             check_int("study.env_steps", self.env_steps, at_least=1)
         check_bool("study.accept_changes", self.accept_changes)
         check_bool("study.plan", self.plan)
+
+    @property
+    def judged_name(self) -> str:
+        """The name of the study of the trainings that judge."""
+        return self.name + JUDGED_SUFFIX
 
     def check_workers(self, n_cores: int) -> None:
         """Raises `InvalidValueError` where the workers' compute threads would be more than the cores of one machine."""
@@ -149,20 +162,35 @@ class StudySettings:
             )
 
 
+def check_study_name(where: str, name: Any) -> str:
+    """Returns the name of a study, if it is one."""
+    if not isinstance(name, str) or not NAME.fullmatch(name) or len(name) > MAX_NAME_CHARS:
+        raise InvalidValueError(
+            f"{where} is {name!r}, but it must begin with a letter, a digit or _, go on with these, - and ., and have "
+            f"at most {MAX_NAME_CHARS} characters"
+        )
+    if name.endswith(JUDGED_SUFFIX):
+        raise InvalidValueError(f"{where} is {name!r}, but {JUDGED_SUFFIX} at its end is for the trainings that judge")
+    return name
+
+
 def _objectives(objectives: Any) -> dict[str, str]:
     """Returns the direction of each figure, of texts such as `minimize mean_steps`."""
-    pairs = [str(each).split() for each in objectives] if isinstance(objectives, Sequence) else []
+    pairs = [str(each).split() for each in objectives] if isinstance(objectives, list | tuple) else []
     if not pairs or any(len(pair) != 2 or pair[0] not in DIRECTIONS for pair in pairs):
         raise InvalidValueError(
             f"study.objectives is {objectives!r}, but it must be a list such as [minimize mean_steps, maximize solved]"
         )
-    return {name: direction for direction, name in pairs}
+    by_name = {name: direction for direction, name in pairs}
+    if len(by_name) < len(pairs):
+        raise InvalidValueError(f"study.objectives is {list(objectives)!r}, but no figure may be there twice")
+    return by_name
 
 
-def _seeds(seeds: Any) -> tuple[int, ...]:
-    if isinstance(seeds, Sequence) and not seeds:
-        raise InvalidValueError("study.seeds is [], but a trial needs at least one seed")
-    checked = check_ints("study.seeds", seeds, None, "seeds", at_least=0)
+def _seeds(seeds: Any, at_most: int) -> tuple[int, ...]:
+    if not isinstance(seeds, list | tuple) or not seeds:
+        raise InvalidValueError(f"study.seeds is {seeds!r}, but it must be a list of at least one seed, such as [0, 1]")
+    checked = check_ints("study.seeds", seeds, None, "", at_least=0, at_most=at_most)
     if len(set(checked)) < len(checked):
         raise InvalidValueError(f"study.seeds is {list(checked)}, but no seed may be there twice")
     return checked

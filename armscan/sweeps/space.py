@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 from optuna.distributions import (
@@ -18,11 +18,12 @@ from optuna.trial import BaseTrial
 
 from armscan.checks import check_bool, check_float, check_int
 from armscan.errors import InvalidValueError, listed
+from armscan.sweeps.values import Value, as_kept
 
 RANGE_KEYS, CHOICE_KEYS = ("low", "high", "log", "step", "when"), ("choices", "when")
+# Whatever begins with one of these.
+NOT_SEARCHED = ("study", "sweeps", "tracking", "hydra", "seed")
 KEY = re.compile(r"[A-Za-z_][\w/]*(\.\w+)*")
-PLAIN_TEXT = re.compile(r"[A-Za-z_][\w./\-]*")
-Value = bool | int | float | str | None
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,15 @@ class Parameter:
         where = f"study.space.{name}"
         if not KEY.fullmatch(name):
             raise InvalidValueError(f"{where}: {name!r} is no key of the configuration, such as agent.lr")
+        if name.partition("/")[0].partition(".")[0] in NOT_SEARCHED:
+            raise InvalidValueError(f"{where}: {name!r} says how a study is run or kept, which no trial can try")
         if not isinstance(described, Mapping) or not ({"low", "high"} <= described.keys() or "choices" in described):
             raise InvalidValueError(f"{where} is {described!r}, but it must have low and high, or choices")
+        if "choices" in described and {"low", "high"} & described.keys():
+            raise InvalidValueError(
+                f"{where} is {described!r}, but it must have low and high, or choices: {where}.choices=[...] on the "
+                "command line replaces a range"
+            )
         allowed = CHOICE_KEYS if "choices" in described else RANGE_KEYS
         if unknown := [key for key in described if key not in allowed]:
             raise InvalidValueError(f"there is no key {unknown[0]!r} in {where}, but only {listed(allowed)}")
@@ -104,7 +112,7 @@ class Space:
         """
         if not isinstance(described, Mapping) or not described:
             raise InvalidValueError(f"study.space is {described!r}, but it must have at least one key to search")
-        parameters = tuple(Parameter.read(str(name), each) for name, each in described.items())
+        parameters = tuple(Parameter.read(name, each) for name, each in _by_key(described).items())
         before: dict[str, tuple[Value, ...]] = {}
         for parameter in parameters:
             for name, values in parameter.when.items():
@@ -133,15 +141,26 @@ class Space:
 
         Where a parameter needs choices of others, these stand with it.
         """
+        beside: dict[str, dict[str, Value]] = {}
         for parameter in self.parameters:
-            needed = {name: values[0] for name, values in parameter.when.items()}
+            needed: dict[str, Value] = {}
+            for name, values in parameter.when.items():
+                needed |= beside[name] | {name: values[0]}
+            beside[parameter.name] = needed
             for value in parameter.extremes():
                 yield needed | {parameter.name: value}
 
     def without(self, fixed: Mapping[str, Any]) -> Space:
-        """Returns the space without keys that somebody has fixed, and without what needs these."""
-        kept = (each for each in self.parameters if each.name not in fixed and not fixed.keys() & each.when.keys())
-        return Space(tuple(kept))
+        """Returns the space without keys that somebody has given values, and without what needs other values."""
+        kept: dict[str, Parameter] = {}
+        for each in self.parameters:
+            can_apply = all(
+                as_kept(fixed[name]) in values if name in fixed else name in kept for name, values in each.when.items()
+            )
+            if each.name not in fixed and can_apply:
+                open_yet = {name: values for name, values in each.when.items() if name not in fixed}
+                kept[each.name] = replace(each, when=open_yet)
+        return Space(tuple(kept.values()))
 
     def plain(self) -> dict[str, str]:
         """Returns the space in a form that can be compared and kept."""
@@ -151,33 +170,30 @@ class Space:
         }
 
 
-def overrides_of(chosen: Mapping[str, Value]) -> list[str]:
-    """Returns values as they are written on the command line."""
-    return [f"{name}={written(value)}" for name, value in chosen.items()]
+def _by_key(described: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Returns descriptions by key, also of those that stand inside others, as the command line has them.
 
-
-def written(value: Any) -> str:
-    """Returns a value as Hydra reads it on the command line."""
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(written, value))}]"
-    if isinstance(value, Mapping):
-        return "{" + ",".join(f"{key}:{written(each)}" for key, each in value.items()) + "}"
-    if isinstance(value, str) and not PLAIN_TEXT.fullmatch(value) and not value.startswith(("[", "{")):
-        escaped = value.replace("\\", "\\\\").replace("'", "\\'")
-        return f"'{escaped}'"
-    return str(value)
+    Of two for one key the later counts: as far as it goes for a range, as a whole for choices, and null takes it out.
+    """
+    by_key: dict[str, Any] = {}
+    for name, each in described.items():
+        is_above_others = isinstance(each, Mapping) and each and not each.keys() & {*RANGE_KEYS, *CHOICE_KEYS}
+        found = _by_key(each, f"{above}{name}.") if is_above_others else {f"{above}{name}": each}
+        for key, later in found.items():
+            before = by_key.get(key)
+            if isinstance(before, Mapping) and isinstance(later, Mapping):
+                kept = {"when": before["when"]} if "when" in before else {}
+                by_key[key] = {**(kept if "choices" in later else before), **later}
+            else:
+                by_key[key] = later
+    return by_key if above else {key: each for key, each in by_key.items() if each is not None}
 
 
 def _choices(where: str, described: Mapping[str, Any]) -> CategoricalDistribution:
     choices = described["choices"]
     if not isinstance(choices, list | tuple) or not choices:
         raise InvalidValueError(f"{where}.choices is {choices!r}, but it must be a list of at least one value")
-    # Optuna keeps numbers and texts; of a list it keeps how it is written.
-    texts = [written(each) if isinstance(each, list | tuple | Mapping) else each for each in choices]
+    texts = [as_kept(each) for each in choices]
     if len(set(map(repr, texts))) < len(texts):
         raise InvalidValueError(f"{where}.choices is {choices!r}, but no value may be there twice")
     return CategoricalDistribution(texts)
@@ -207,4 +223,4 @@ def _conditions(where: str, when: Any) -> dict[str, tuple[Value, ...]]:
     if not isinstance(when, Mapping) or not when:
         raise InvalidValueError(f"{where}.when is {when!r}, but it must say which choice of which key is needed")
     several = {name: values if isinstance(values, list | tuple) else [values] for name, values in when.items()}
-    return {str(name): tuple(values) for name, values in several.items()}
+    return {str(name): tuple(map(as_kept, values)) for name, values in several.items()}

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import optuna
 from filelock import FileLock
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
-from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
-from sqlalchemy import text
+from sqlalchemy import create_engine, inspect, text
 from sqlalchemy.exc import SQLAlchemyError
 
-from armscan.checks import check_path
 from armscan.errors import StudyError
+from armscan.sweeps.journal import open_journal, read_journal
 
 SQLITE_PREFIX = "sqlite:///"
 # One of a PostgreSQL database's advisory locks.
 ADVISORY_LOCK = 0xA235CA
-BLOCK_BYTES = 4096
+# One of the tables of Optuna.
+A_TABLE = "studies"
+MAX_REASON_CHARS = 300
 
 
 @dataclass(frozen=True)
@@ -54,72 +54,128 @@ class Storage:
             yield
 
 
-def open_storage(uri: str) -> Storage:
+def open_storage(uri: str, *, where: str = "study.storage") -> Storage:
     """Opens a storage, and makes one where there is none.
 
     Args:
         uri: the path of a journal file, `sqlite:///FILE`, or the URL of a PostgreSQL database.
+        where: the user has given it, for messages.
 
     Raises:
         StudyError: if it cannot be reached or used.
     """
+    if is_journal(_checked(uri, where)):
+        path = Path(uri).absolute()
+        return _in_journal(path, open_journal(path, where))
+    return _open_database(uri, where)
+
+
+def existing_storage(uri: str, *, where: str = "study.storage") -> Storage | None:
+    """Opens a storage to look at, None where there is none; nothing is made, mended or locked.
+
+    Args:
+        uri: see `open_storage`.
+        where: likewise.
+
+    Raises:
+        StudyError: if it cannot be reached or used.
+    """
+    if is_journal(_checked(uri, where)):
+        path = Path(uri).absolute()
+        return _in_journal(path, read_journal(path, where)) if _is_there(path, where) else None
+    return _existing_database(uri, where)
+
+
+def is_journal(uri: str) -> bool:
+    """Whether an address is that of a journal file."""
+    return "://" not in uri
+
+
+def _is_there(path: Path, where: str) -> bool:
+    """Whether there is a file; refused, where none could be."""
+    above = next(each for each in path.parents if each.exists())
+    if path.is_dir() or not above.is_dir():
+        raise StudyError(f"{where} is {str(path)!r}, but no file can be used there")
+    return path.is_file()
+
+
+def _in_journal(path: Path, journal: JournalStorage) -> Storage:
+    return Storage(str(path), journal, path.with_name(f".{path.name}.alone"))
+
+
+def _checked(uri: Any, where: str) -> str:
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    if not isinstance(uri, str) or not uri.strip():
-        raise StudyError(f"study.storage is {uri!r}, but it must be a file, or the URL of a database")
-    if "://" not in uri:
-        return _open_journal(check_path("study.storage", uri))
-    return _open_database(uri)
+    if not isinstance(uri, str) or not uri.strip() or "\0" in uri:
+        raise StudyError(f"{where} is {uri!r}, but it must be a file, or the URL of a database")
+    return uri
 
 
-def _open_journal(path: Path) -> Storage:
-    path = path.absolute()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-        # Before anything is mended: any other file would lose what stands behind its last line's end.
-        with path.open("rb") as file:
-            first_line = file.readline(BLOCK_BYTES)
-        if not _begins_a_journal(first_line):
-            raise StudyError(f"study.storage is {str(path)!r}, but that file is no journal of Optuna")
-        lock = JournalLock(path)
-        lock.acquire()
-        lock.release()
-        backend = JournalFileBackend(str(path), lock_obj=lock)
-        return Storage(str(path), JournalStorage(backend), path.with_name(f".{path.name}.alone"))
-    except OSError as error:
-        raise StudyError(f"study.storage is {str(path)!r}, but no file can be used there ({error.strerror})") from error
-    # What Optuna raises for a line that it cannot read, whichever way it is damaged.
-    except (ValueError, KeyError, AssertionError) as error:
-        raise StudyError(f"study.storage is {str(path)!r}, but that file is no journal of Optuna: {error}") from error
-
-
-def _begins_a_journal(line: bytes) -> bool:
-    """Whether this is the first line of a journal, which may be empty, or torn in its first line."""
-    return not line or (line.startswith(b"{") and (b'"op_code"' in line or not line.endswith(b"\n")))
-
-
-def _open_database(uri: str) -> Storage:
-    shown = without_password(uri)
-    if not uri.startswith((SQLITE_PREFIX, "postgresql")):
-        raise StudyError(f"study.storage is {shown!r}, but it must be a file, sqlite:///FILE or postgresql://...")
-    logging.getLogger("alembic").setLevel(logging.WARNING)
-    lock_file = None
-    if uri.startswith(SQLITE_PREFIX):
-        database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
-        uri, lock_file = f"{SQLITE_PREFIX}{database}", database.with_name(f".{database.name}.alone")
-    options: dict[str, Any] = {"pool_pre_ping": True}
-    if lock_file is None:
-        options["connect_args"] = {"connect_timeout": 10}
-    try:
-        if lock_file is None:
-            return Storage(shown, RDBStorage(uri, engine_kwargs=options), None)
-        lock_file.parent.mkdir(parents=True, exist_ok=True)
+def _open_database(uri: str, where: str) -> Storage:
+    database = _Database.of(uri, where)
+    with database.refused_in_one_line():
+        if database.lock_file is None:
+            return database.storage()
+        database.lock_file.parent.mkdir(parents=True, exist_ok=True)
         # Processes that make the tables of a fresh file at once get into each other's way.
-        with FileLock(lock_file):
-            return Storage(shown, RDBStorage(uri, engine_kwargs=options), lock_file)
-    except (SQLAlchemyError, OSError, ImportError, RuntimeError) as error:
-        reason = " ".join(str(error).split()).replace(uri, shown)[:300]
-        raise StudyError(f"study.storage is {shown!r}, but this storage cannot be used: {reason}") from error
+        with FileLock(database.lock_file):
+            return database.storage()
+
+
+def _existing_database(uri: str, where: str) -> Storage | None:
+    database = _Database.of(uri, where)
+    with database.refused_in_one_line():
+        if uri.startswith(SQLITE_PREFIX) and not _is_there(Path(uri.removeprefix(SQLITE_PREFIX)).absolute(), where):
+            return None
+        engine = create_engine(database.uri, **database.options)
+        is_there = inspect(engine).has_table(A_TABLE)
+        engine.dispose()
+        return database.storage(skip_table_creation=True) if is_there else None
+
+
+@dataclass(frozen=True)
+class _Database:
+    """A database, before it is opened.
+
+    Args:
+        where: its address was given.
+        uri: its address.
+        lock_file: see `Storage`.
+        options: of the connections.
+    """
+
+    where: str
+    uri: str
+    lock_file: Path | None
+    options: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, uri: str, where: str) -> Self:
+        """Returns the one at an address."""
+        logging.getLogger("alembic").setLevel(logging.WARNING)
+        if uri.startswith(SQLITE_PREFIX):
+            file = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
+            lock_file = file.with_name(f".{file.name}.alone")
+            return cls(where, f"{SQLITE_PREFIX}{file}", lock_file, {"pool_pre_ping": True})
+        if uri.startswith("postgresql"):
+            options = {"pool_pre_ping": True, "connect_args": {"connect_timeout": 10}}
+            return cls(where, uri, None, options)
+        shown = without_password(uri)
+        raise StudyError(f"{where} is {shown!r}, but it must be a file, sqlite:///FILE or postgresql://...")
+
+    def storage(self, **options: Any) -> Storage:
+        """Returns the storage in it."""
+        opened = RDBStorage(self.uri, engine_kwargs=dict(self.options), **options)
+        return Storage(without_password(self.uri), opened, self.lock_file)
+
+    @contextlib.contextmanager
+    def refused_in_one_line(self) -> Iterator[None]:
+        """Answers what comes of a database that cannot be used."""
+        try:
+            yield
+        except (SQLAlchemyError, OSError, ImportError, RuntimeError) as error:
+            shown = without_password(self.uri)
+            reason = " ".join(str(error).split()).replace(self.uri, shown)[:MAX_REASON_CHARS]
+            raise StudyError(f"{self.where} is {shown!r}, but this storage cannot be used: {reason}") from error
 
 
 def without_password(uri: str) -> str:
@@ -127,45 +183,3 @@ def without_password(uri: str) -> str:
     scheme, separator, rest = uri.partition("://")
     account, at, host = rest.rpartition("@")
     return f"{scheme}{separator}{account.partition(':')[0]}{at}{host}"
-
-
-class JournalLock(JournalFileOpenLock):
-    """The lock of a journal file; whoever gets it finds whole lines.
-
-    The system frees it when a process dies, where Optuna's own would make all others wait for 30 s. A line that was
-    torn because its writer died is cut off: Optuna would take it for the beginning of the next one, and then nobody
-    could read either.
-
-    Args:
-        journal: the file.
-    """
-
-    def __init__(self, journal: Path) -> None:
-        super().__init__(str(journal))
-        self._journal = journal
-        self._lock = FileLock(journal.with_name(f".{journal.name}.lock"))
-
-    def acquire(self) -> bool:
-        """Waits for the lock."""
-        self._lock.acquire()
-        cut_torn_line(self._journal)
-        return True
-
-    def release(self) -> None:
-        """Frees it."""
-        self._lock.release()
-
-
-def cut_torn_line(path: Path) -> None:
-    """Cuts off what stands behind the last line of a file that has an end."""
-    with path.open("rb+") as file:
-        size = end = file.seek(0, os.SEEK_END)
-        while end > 0:
-            start = max(0, end - BLOCK_BYTES)
-            file.seek(start)
-            newline = file.read(end - start).rfind(b"\n")
-            end = start + newline + 1 if newline >= 0 else start
-            if newline >= 0:
-                break
-        if end < size:
-            file.truncate(end)

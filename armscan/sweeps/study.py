@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import optuna
-from hydra.utils import instantiate
 from optuna.study import StudyDirection
 
 from armscan.errors import StudyError
+from armscan.sweeps.parts import make_pruner
 from armscan.sweeps.settings import StudySettings
-from armscan.sweeps.storage import Storage
+from armscan.sweeps.storage import Storage, existing_storage
 from armscan.tracking import flattened
 
 # User attributes of a study.
@@ -29,7 +29,7 @@ def open_study(storage: Storage, settings: StudySettings, name: str | None = Non
         settings: of it.
         name: its name; that of the settings where it is None.
     """
-    pruner = instantiate(settings.pruner)
+    pruner = make_pruner(settings.pruner)
     return optuna.load_study(study_name=name or settings.name, storage=storage.optuna, pruner=pruner)
 
 
@@ -45,26 +45,52 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
         StudyError: if the study that exists searches another space, has other objectives, or has trials with another
             configuration.
     """
-    wanted: dict[str, Any] = {
-        SPACE: settings.space.plain(),
-        DASHBOARD_OBJECTIVES: dict(settings.objectives),
-        FIXED: compared(fixed, settings)
-        | {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]},
-    }
+    wanted = _wanted(settings, fixed)
     with storage.alone():
         names = optuna.get_all_study_names(storage.optuna)
         if settings.name not in names:
-            study = optuna.create_study(
-                study_name=settings.name,
-                storage=storage.optuna,
-                directions=[StudyDirection[each.upper()] for each in settings.objectives.values()],
-            )
+            directions = [StudyDirection[each.upper()] for each in settings.objectives.values()]
+            optuna.create_study(study_name=settings.name, storage=storage.optuna, directions=directions)
+        study = open_study(storage, settings)
+        # Also where whoever has just made it died before it could say what it is.
+        if not study.user_attrs.keys() >= wanted.keys() and not study.get_trials(deepcopy=False):
             for key, value in wanted.items():
                 study.set_user_attr(key, value)
-            return open_study(storage, settings)
-    study = open_study(storage, settings)
     _check_same(settings, study, wanted)
     return study
+
+
+def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study | None:
+    """Returns the study that these settings would go on with, to look at; None where they would begin one.
+
+    Raises:
+        StudyError: see `open_storage` and `make_study`.
+    """
+    storage = existing_storage(settings.storage)
+    if storage is None or settings.name not in optuna.get_all_study_names(storage.optuna):
+        return None
+    study = open_study(storage, settings)
+    if not settings.accept_changes:
+        _check_same(settings, study, _wanted(settings, fixed))
+    return study
+
+
+def _wanted(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what a study says of itself, by which it is compared."""
+    of_trials = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
+    return {
+        SPACE: settings.space.plain(),
+        DASHBOARD_OBJECTIVES: dict(settings.objectives),
+        FIXED: compared(fixed, settings) | of_trials,
+    }
+
+
+def is_ours(study: optuna.Study) -> bool:
+    """Whether a study was made here, and not by somebody else's program in the same storage."""
+    there = study.user_attrs
+    if not {SPACE, FIXED, DASHBOARD_OBJECTIVES} <= there.keys():
+        return False
+    return [direction.name.lower() for direction in study.directions] == [*there[DASHBOARD_OBJECTIVES].values()]
 
 
 def compared(config: Mapping[str, Any], settings: StudySettings) -> dict[str, Any]:
@@ -80,6 +106,8 @@ def compared(config: Mapping[str, Any], settings: StudySettings) -> dict[str, An
 
 def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[str, Any]) -> None:
     there = study.user_attrs
+    if not is_ours(study):
+        raise StudyError(f"study.name is {settings.name!r}, but that study in its storage was not made by armscan")
     whose = f"the study {settings.name} in {settings.storage if '://' not in settings.storage else 'its storage'}"
     other = "; give study.name another value"
     for key, what in ((SPACE, "searches another space"), (DASHBOARD_OBJECTIVES, "has other objectives")):

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import optuna
-from hydra.utils import instantiate
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
@@ -22,8 +21,9 @@ from armscan.settings import plain
 from armscan.sweeps.attempt import CONFIG_SUM, FOLDER, RUN, Attempt, composed, sum_of_config, trial_folder
 from armscan.sweeps.lease import Keeper, LimitReachedError
 from armscan.sweeps.ledger import ENV_STEPS, FIGURES, RETRY_OF
+from armscan.sweeps.parts import make_sampler
 from armscan.sweeps.phases import Phase
-from armscan.sweeps.space import overrides_of
+from armscan.sweeps.values import overrides_of
 from armscan.tracking import TrackedRun
 
 WAIT_S = 1.0
@@ -89,7 +89,7 @@ class Worker:
         phase = self._phase
         # By the number of the trial: workers side by side draw other points, and one alone the same ones again.
         seed = np.random.SeedSequence((phase.seed, trial.number)).generate_state(1)[0]
-        trial.study.sampler = instantiate(phase.sampler, seed=int(seed))
+        trial.study.sampler = make_sampler(phase.sampler, int(seed))
         chosen = phase.space.suggest(trial)
         config, _ = composed([*self._words, *overrides_of(chosen)])
         folder = trial_folder(phase.folder, trial.number)

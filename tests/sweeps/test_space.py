@@ -5,7 +5,8 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from armscan.errors import InvalidValueError
-from armscan.sweeps.space import Space, overrides_of, written
+from armscan.sweeps.space import Space
+from armscan.sweeps.values import overrides_of, written
 
 DESCRIBED = {
     "network": {"choices": ["mlp", "multimodal"]},

@@ -1,0 +1,37 @@
+"""The values that a trial tries: as Optuna keeps them, and as the command line has them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+PLAIN_TEXT = re.compile(r"[A-Za-z_][\w./\-]*")
+Value = bool | int | float | str | None
+
+
+def as_kept(value: Any) -> Value:
+    """Returns a value as Optuna keeps it: a number or a text; of a list how it is written."""
+    kept: Value = written(value) if isinstance(value, list | tuple | Mapping) else value
+    return kept
+
+
+def overrides_of(chosen: Mapping[str, Value]) -> list[str]:
+    """Returns values as they are written on the command line."""
+    return [f"{name}={written(value)}" for name, value in chosen.items()]
+
+
+def written(value: Any) -> str:
+    """Returns a value as Hydra reads it on the command line."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(written, value))}]"
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{written(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, str) and not PLAIN_TEXT.fullmatch(value) and not value.startswith(("[", "{")):
+        escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+        return f"'{escaped}'"
+    return str(value)
