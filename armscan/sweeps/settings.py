@@ -59,6 +59,7 @@ class StudySettings:
         objectives: direction by the name of each figure.
         sampler: what makes an Optuna sampler of a seed, as Hydra would instantiate it.
         pruner: an Optuna pruner, likewise.
+        prune_after_env_steps: of each trial, before it may be pruned.
         n_trials: that are to finish.
         max_failures: trials that may raise or die for good before the study ends.
         max_retries: how often a trial is taken up again whose worker died.
@@ -80,6 +81,7 @@ class StudySettings:
     objectives: Mapping[str, str]
     sampler: Mapping[str, Any]
     pruner: Mapping[str, Any]
+    prune_after_env_steps: int
     n_trials: int
     max_failures: int
     max_retries: int
@@ -134,6 +136,7 @@ class StudySettings:
                 f"study.pruner is {self.pruner['_target_']}, but trials of several objectives cannot be pruned: give "
                 "study/pruner=none"
             )
+        check_int("study.prune_after_env_steps", self.prune_after_env_steps, at_least=1)
         check_int("study.n_trials", self.n_trials, at_least=1)
         check_int("study.max_failures", self.max_failures, at_least=0)
         check_int("study.max_retries", self.max_retries, at_least=0)

@@ -21,6 +21,7 @@ from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.values import Value, as_kept
 
 RANGE_KEYS, CHOICE_KEYS = ("low", "high", "log", "step", "when"), ("choices", "when")
+OWN_KEYS = {*RANGE_KEYS, *CHOICE_KEYS}
 # Whatever begins with one of these.
 NOT_SEARCHED = ("study", "sweeps", "tracking", "hydra", "seed")
 KEY = re.compile(r"[A-Za-z_][\w/]*(\.\w+)*")
@@ -170,23 +171,31 @@ class Space:
         }
 
 
-def _by_key(described: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+def _by_key(described: Mapping[str, Any]) -> dict[str, Any]:
     """Returns descriptions by key, also of those that stand inside others, as the command line has them.
 
-    Of two for one key the later counts: as far as it goes for a range, as a whole for choices, and null takes it out.
+    Of two for one key the later counts: as far as it goes for a range, as a whole for choices; null takes a key out.
     """
     by_key: dict[str, Any] = {}
+    for name, later in _in_order(described, ""):
+        before = by_key.get(name)
+        if isinstance(before, Mapping) and isinstance(later, Mapping):
+            kept = {key: each for key, each in before.items() if key == "when" or "choices" not in later}
+            by_key[name] = {**kept, **later}
+        else:
+            by_key[name] = later
+    return {name: each for name, each in by_key.items() if each is not None}
+
+
+def _in_order(described: Mapping[str, Any], above: str) -> Iterator[tuple[str, Any]]:
     for name, each in described.items():
-        is_above_others = isinstance(each, Mapping) and each and not each.keys() & {*RANGE_KEYS, *CHOICE_KEYS}
-        found = _by_key(each, f"{above}{name}.") if is_above_others else {f"{above}{name}": each}
-        for key, later in found.items():
-            before = by_key.get(key)
-            if isinstance(before, Mapping) and isinstance(later, Mapping):
-                kept = {"when": before["when"]} if "when" in before else {}
-                by_key[key] = {**(kept if "choices" in later else before), **later}
-            else:
-                by_key[key] = later
-    return by_key if above else {key: each for key, each in by_key.items() if each is not None}
+        key, inside = f"{above}{name}", {}
+        if isinstance(each, Mapping):
+            inside = {at: one for at, one in each.items() if at not in OWN_KEYS and isinstance(one, Mapping | None)}
+            each = {at: one for at, one in each.items() if at not in inside}
+        if each or not inside:
+            yield key, each
+        yield from _in_order(inside, f"{key}.")
 
 
 def _choices(where: str, described: Mapping[str, Any]) -> CategoricalDistribution:

@@ -28,7 +28,8 @@ def searched(folder, objectives, n_trials=6):
     storage = open_storage(str(folder / "optuna.journal"))
     directions = ["minimize"] * len(objectives)
     study = optuna.create_study(study_name="a", storage=storage.optuna, directions=directions)
-    study.set_user_attr("objectives", dict.fromkeys(objectives, "minimize"))
+    for name, value in (("objectives", dict.fromkeys(objectives, "minimize")), ("space", {}), ("fixed_config", {})):
+        study.set_user_attr(name, value)
     for number in range(n_trials):
         trial = study.ask()
         lr = trial.suggest_float("agent.lr", 0.0, 1.0)
@@ -102,19 +103,39 @@ def test_report_of_several_objectives_or_of_nothing_yet_can_be_made(answer, tmp_
     assert ("Trials that no other is better than" if n_trials else "No trial has run to its end yet") in page
 
 
+def test_report_needs_only_to_read_the_storage(answer, tmp_path):
+    searched(tmp_path, ["mean_steps"])
+    with (tmp_path / "optuna.journal").open("ab") as journal:
+        journal.write(b'{"op_code": 4, "wor')
+    for file in tmp_path.glob(".*"):
+        file.unlink()
+    assert answer("study=a")[0] == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["optuna.journal", "reports"]
+    assert (tmp_path / "optuna.journal").read_bytes().endswith(b'"wor')
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
         ([], "error: study is not set, but it must be"),
-        (["study=a", "storage=nowhere"], "error: storage is 'nowhere', but there is no such file"),
-        (["study=b"], "error: study is 'b', but there is only a in 'optuna.journal'"),
+        (["study=a", "storage=nowhere"], "error: storage is 'nowhere', but nothing is there: give the one that it is"),
+        (["study=a", "storage=sqlite:///nowhere.db"], "error: storage is 'sqlite:///nowhere.db', but nothing is there"),
+        (["study=a", "storage=list.journal"], "error: storage is '/"),
+        (["study=b"], "error: study is 'b', but there is only a or foreign in '/"),
+        (["study=../a"], "error: study is '../a', but it must begin with a letter, a digit or _"),
+        (["study=foreign"], "error: study is 'foreign', but that one in '/"),
+        (["study=a", "out=/dev/null/a"], "error: /dev/null/a: Not a directory"),
         (["study=a", "foo=1"], "error: there is no key 'foo', but only study, storage or out"),
     ],
     ids=str,
 )
 def test_report_answers_mistakes_in_one_line(answer, tmp_path, words, line):
-    searched(tmp_path, ["mean_steps"], n_trials=1)
+    storage = searched(tmp_path, ["mean_steps"], n_trials=1)
+    optuna.create_study(study_name="foreign", storage=storage.optuna)
+    (tmp_path / "list.journal").write_text('{"op_code": 9}\n[1]\n')
+    there = sorted(tmp_path.iterdir())
     code, printed, errors = answer(*words)
     assert (code, printed) == (2, "")
     assert errors.startswith(line)
     assert len(errors.splitlines()) == 1
+    assert sorted(tmp_path.iterdir()) == there

@@ -51,9 +51,43 @@ def test_space_extremes_have_every_choice_and_both_ends():
         assert [one[name] for one in extremes if name in one] == list(values)
 
 
-def test_space_without_what_is_fixed_lacks_what_needs_it():
-    names = [each.name for each in Space.read(DESCRIBED).without({"network": 1, "agent.lr": 1}).parameters]
-    assert names == ["agent.batch_size", "agent.gamma", "training.solved"]
+@pytest.mark.parametrize(("network", "is_there"), [("mlp", True), ("multimodal", False), ("auto", False)])
+def test_space_without_what_is_fixed_keeps_what_this_allows(network, is_there):
+    space = Space.read(DESCRIBED).without({"network": network, "agent.lr": 1})
+    others = ["agent.batch_size", "agent.gamma", "training.solved"]
+    assert [each.name for each in space.parameters] == ["network.hidden_sizes"] * is_there + others
+    chosen = space.suggest(optuna.create_study().ask())
+    assert ("network.hidden_sizes" in chosen) == is_there
+
+
+def test_space_without_what_is_fixed_lacks_what_needs_what_is_gone():
+    chain = {
+        "a": {"choices": [1, 2]},
+        "b": {"choices": [1, 2], "when": {"a": 1}},
+        "c": {"choices": [1, 2], "when": {"b": 2}},
+    }
+    assert list(Space.read(chain).extremes())[-1] == {"a": 1, "b": 2, "c": 2}
+    assert Space.read(chain).without({"a": 2}).parameters == ()
+    assert [each.name for each in Space.read(chain).without({"b": 2}).parameters] == ["a", "c"]
+
+
+def test_space_is_changed_key_by_key_as_the_command_line_has_it():
+    of_agent = {"lr": {"high": 0.5}, "batch_size": {"choices": [8, 16]}, "gamma": None, "tau": {"choices": [0.1]}}
+    of_network = DESCRIBED["network"] | {"hidden_sizes": {"choices": [[8, 8]]}}
+    changed = Space.read(DESCRIBED | {"agent": of_agent, "network": of_network}).plain()
+    assert (
+        changed
+        == Space.read(
+            {
+                "network": DESCRIBED["network"],
+                "network.hidden_sizes": DESCRIBED["network.hidden_sizes"],
+                "agent.lr": {"low": 1e-4, "high": 0.5, "log": True},
+                "agent.batch_size": {"choices": [8, 16]},
+                "training.solved": DESCRIBED["training.solved"],
+                "agent.tau": {"choices": [0.1]},
+            }
+        ).plain()
+    )
 
 
 @pytest.mark.parametrize(
@@ -66,7 +100,9 @@ def test_space_without_what_is_fixed_lacks_what_needs_it():
         ({"a": {"low": 3}}, "study.space.a is {'low': 3}, but it must have low and high, or choices"),
         ({"a": {"choices": []}}, "study.space.a.choices is [], but it must be a list of at least one value"),
         ({"a": {"choices": [1, 1]}}, "study.space.a.choices is [1, 1], but no value may be there twice"),
-        ({"a": {"choices": [1], "low": 1}}, "there is no key 'low' in study.space.a, but only choices or when"),
+        ({"a": {"choices": [1], "low": 1}}, "'low': 1}, but it must have low and high, or choices: study.space.a.cho"),
+        ({"a": {"choices": [1], "log": 1}}, "there is no key 'log' in study.space.a, but only choices or when"),
+        ({"study.seed": {"choices": [1]}}, "study.space.study.seed: 'study.seed' says how a study is run or kept"),
         ({"a": {"low": 1, "high": 2, "max": 1}}, "there is no key 'max' in study.space.a, but only low, high, log"),
         ({"a": {"low": 2, "high": 1}}, "study.space.a.low is 2, but it must be below high, 1"),
         ({"a": {"low": "x", "high": 1}}, "study.space.a.low is 'x', but it must be a finite number"),

@@ -22,6 +22,7 @@ def settings(**changes):
         "sampler": {"_target_": "optuna.samplers.RandomSampler"},
         "pruner": {"_target_": "optuna.pruners.NopPruner"},
         "n_trials": 5,
+        "prune_after_env_steps": 4000,
         "max_failures": 1,
         "max_retries": 1,
         "hours": None,
