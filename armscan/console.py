@@ -142,11 +142,11 @@ def print_where_to_look(folder: Path, tracking_uri: str, *, files: Sequence[str]
         files: what is worth looking at in the folder; the folder itself where none is named.
     """
     for file in files:
-        print(f"look at   {_from_here(folder / file)}")
-    print(f"all runs  {_from_here(Path(sys.executable))} -m mlflow ui --backend-store-uri {tracking_uri}")
+        print(f"look at   {from_here(folder / file)}")
+    print(f"all runs  {from_here(Path(sys.executable))} -m mlflow ui --backend-store-uri {tracking_uri}")
 
 
-def _from_here(path: Path) -> Path:
-    """The path as one would type it in the current folder."""
+def from_here(path: Path) -> Path:
+    """Returns a path as one would type it in the current folder."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path

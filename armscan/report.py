@@ -17,10 +17,10 @@ from pathlib import Path
 
 from armscan.errors import InvalidValueError, StudyError, listed
 from armscan.mistakes import quieten_libraries
+from armscan.settings import USUAL_STORAGE
 from armscan.words import answered, read_words
 
 KEYS = ("study", "storage", "out")
-USUAL_STORAGE = "optuna.journal"
 
 
 def main(words: Sequence[str] | None = None) -> int:

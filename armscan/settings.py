@@ -24,6 +24,8 @@ RESUME, TRACKING_URI = "resume", "tracking.uri"
 MULTIRUN = ("-m", "--multirun")
 # The phantoms, where a command asks for volumes.
 PHANTOM = "phantom"
+# Where studies are kept.
+USUAL_STORAGE = "optuna.journal"
 
 
 def plain(config: DictConfig | ListConfig) -> dict[str, Any]:
@@ -51,6 +53,15 @@ def evaluate_command(run_id: str, tracking_uri: str) -> str:
     return _command("armscan.evaluate", f"run={run_id}", "tracking", tracking_uri)
 
 
+def report_command(study: str, storage: str) -> str:
+    """Returns what one types to see what a study has found."""
+    return _command_at("armscan.report", f"study={study}", "storage", storage, USUAL_STORAGE)
+
+
 def _command(module: str, of_run: str, key_of_store: str, tracking_uri: str) -> str:
-    store = [] if tracking_uri == usual_tracking()["uri"] else [f"{key_of_store}={tracking_uri}"]
-    return shlex.join(["python", "-m", module, of_run, *store])
+    return _command_at(module, of_run, key_of_store, tracking_uri, usual_tracking()["uri"])
+
+
+def _command_at(module: str, of_what: str, key_of_place: str, place: str, usual_place: str) -> str:
+    where = [] if place == usual_place else [f"{key_of_place}={place}"]
+    return shlex.join(["python", "-m", module, of_what, *where])

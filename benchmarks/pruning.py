@@ -2,7 +2,8 @@
 
     python -m benchmarks.pruning [folder=FOLDER] [seeds=0,1,2] [trials=40]
 
-Both studies of a seed begin with the same random points. A folder that has studies already is gone on with.
+Both studies of a seed draw the same points at random, so that a trial of one is the same training as that of the other
+as far as it goes, and what differs is the pruning. A folder that has studies already is gone on with.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ STUDIES = {"plain": ["study/pruner=none"], "pruned": []}
 def trials_of(folder: Path, seed: int, name: str, n_trials: int) -> list[FrozenTrial]:
     """Runs a study, and returns its trials in the order in which they ended."""
     words = ["-m", "sweeps=sac_y", f"study.name={name}", f"study.seed={seed}", f"study.n_trials={n_trials}"]
-    words += ["study.judging.best=0", *STUDIES[name]]
+    words += ["study.judging.best=0", "study/sampler=random", *STUDIES[name]]
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / f"{name}.log").open("a") as log:
         subprocess.run(

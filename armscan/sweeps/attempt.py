@@ -40,6 +40,7 @@ class Attempt:
         objective: the figure that is reported while it runs; None where it is not.
         tell_progress: takes what is known of how far it is.
         opened: takes the tracked run of a training while it goes on, and None when it has ended.
+        show_picture: takes a file that the dashboard is to show.
     """
 
     trial: Trial
@@ -51,6 +52,7 @@ class Attempt:
     objective: str | None
     tell_progress: Callable[[dict[str, Any]], None]
     opened: Callable[[TrackedRun | None], None]
+    show_picture: Callable[[Path], None]
     env_steps: int = field(default=0, init=False)
     _reported: set[int] = field(default_factory=set, init=False)
 

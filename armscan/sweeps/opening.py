@@ -14,6 +14,7 @@ from armscan.errors import InvalidValueError, StudyError, listed
 from armscan.settings import plain
 from armscan.sweeps.attempt import composed, study_section
 from armscan.sweeps.command_line import fixed_by
+from armscan.sweeps.dashboard import note_run
 from armscan.sweeps.judging import make_judging_study, seed_of_judged
 from armscan.sweeps.ledger import Ledger, Limits
 from armscan.sweeps.parts import make_pruner, make_sampler, make_task
@@ -76,6 +77,7 @@ class OpenStudy:
             sampler=settings.sampler,
             seed=settings.seed,
             folder=self.folder,
+            artifacts=Path(settings.artifacts),
             storage_uri=self.storage.uri,
             client=self.client,
             experiment_id=self.experiment_id,
@@ -142,6 +144,7 @@ def open_for_work(words: Sequence[str]) -> OpenStudy:
             run = client.create_run(experiment_id, run_name=f"study {settings.name}", tags=tags)
             run_id = run.info.run_id
             study.set_user_attr(STUDY_RUN, run_id)
+            note_run(study, client, experiment_id, run_id, Path(settings.folder))
     return OpenStudy(
         settings=settings,
         task=task,

@@ -32,6 +32,7 @@ class Phase:
         sampler: see `StudySettings`.
         seed: of the samplers.
         folder: of the trials.
+        artifacts: see `StudySettings`.
         storage_uri: of the storage, as it may be shown.
         client: of the tracking store.
         experiment_id: of the tracked runs.
@@ -48,6 +49,7 @@ class Phase:
     sampler: Mapping[str, Any]
     seed: int
     folder: Path
+    artifacts: Path
     storage_uri: str
     client: MlflowClient
     experiment_id: str

@@ -17,10 +17,13 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.console import print_where_to_look
+from armscan.settings import report_command
+from armscan.sweeps.dashboard import dashboard_command
 from armscan.sweeps.judging import best_trials
 from armscan.sweeps.ledger import ENV_STEPS, FAILURE, LEASE, RETRIED, Ledger, Tally
 from armscan.sweeps.opening import OpenStudy
 from armscan.sweeps.settings import StudySettings
+from armscan.sweeps.storage import without_password
 from armscan.sweeps.values import overrides_of
 from armscan.sweeps.verdict import shown_of, verdicts
 
@@ -152,6 +155,9 @@ def print_result(opened: OpenStudy) -> int:
     Console().print(table)
     _print_verdicts(opened)
     print_where_to_look(opened.folder, opened.config.tracking.uri)
+    storage = without_password(settings.storage)
+    print(f"studies   {dashboard_command(storage, settings.artifacts)}")
+    print(f"report    {report_command(settings.name, storage)}")
     return 0
 
 

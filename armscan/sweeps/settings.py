@@ -54,6 +54,7 @@ class StudySettings:
         name: of the study, in its storage and of its folder.
         storage: where it is kept, as `open_storage` takes it.
         folder: of its trials.
+        artifacts: folder of the pictures for Optuna's dashboard.
         task: what makes a `Task`, as Hydra would instantiate it.
         space: what is searched.
         objectives: direction by the name of each figure.
@@ -76,6 +77,7 @@ class StudySettings:
     name: str
     storage: str
     folder: str
+    artifacts: str
     task: Mapping[str, Any]
     space: Space
     objectives: Mapping[str, str]
@@ -125,7 +127,7 @@ class StudySettings:
 
     def __post_init__(self) -> None:
         check_study_name("study.name", self.name)
-        for name in ("storage", "folder"):
+        for name in ("storage", "folder", "artifacts"):
             if not isinstance(given := getattr(self, name), str) or not given.strip() or "\0" in given:
                 raise InvalidValueError(f"study.{name} is {given!r}, but it must be a text that says where")
         for name, made in (("task", self.task), ("sampler", self.sampler), ("pruner", self.pruner)):

@@ -163,6 +163,7 @@ def trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> di
             else:
                 concluded = conclude(stage, result, folder) if conclude else {}
             draw_learning_curve(reporter.reports, folder / CURVE_FILE, title=tracked.name)
+            attempt.show_picture(folder / CURVE_FILE)
             # Nobody goes on with it; the best one stays.
             (folder / LAST_CHECKPOINT).unlink(missing_ok=True)
             tracked.log_files(*(file for file in folder.iterdir() if file.suffix in KEPT))

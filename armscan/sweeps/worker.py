@@ -19,6 +19,7 @@ from armscan.files import CONFIG_FILE, SUM_TAGS
 from armscan.mistakes import mistake_in_one_line
 from armscan.settings import plain
 from armscan.sweeps.attempt import CONFIG_SUM, FOLDER, RUN, Attempt, composed, sum_of_config, trial_folder
+from armscan.sweeps.dashboard import note_run, show_picture
 from armscan.sweeps.lease import Keeper, LimitReachedError
 from armscan.sweeps.ledger import ENV_STEPS, FIGURES, RETRY_OF
 from armscan.sweeps.parts import make_sampler
@@ -109,6 +110,7 @@ class Worker:
             objective=phase.reported,
             tell_progress=self._keeper.tell_progress,
             opened=self._opened,
+            show_picture=partial(show_picture, trial, artifacts=phase.artifacts),
         )
         try:
             return phase.run(attempt)
@@ -140,6 +142,7 @@ class Worker:
                 parent_id=phase.run_id,
             )
             trial.set_user_attr(RUN, tracked.run_id)
+            note_run(trial, phase.client, phase.experiment_id, tracked.run_id, folder)
         self._opened(None)
         return tracked
 

@@ -12,6 +12,8 @@ import optuna
 import pytest
 from hydra.errors import HydraException
 from mlflow import MlflowClient
+from optuna.artifacts import get_all_artifact_meta
+from optuna_dashboard._note import get_note_from_system_attrs
 
 from armscan.errors import ArmscanError, StudyError
 from armscan.mistakes import mistake_in_one_line
@@ -87,6 +89,7 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
     by_id = {each.info.run_id: each for each in runs}
     assert {each.info.status for each in runs} == {"FINISHED"}
+    storage = open_storage(str(tmp_path / "optuna.journal")).optuna
     (study_run,) = [each for each in runs if each.info.run_name == "study sac_y"]
     for trial in trials_of(tmp_path):
         # Trial, run, folder and configuration know each other.
@@ -101,6 +104,12 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
         assert float(training.data.params["agent.lr"]) == trial.params["agent.lr"]
         assert training.data.tags["folder"].startswith(tracked.data.tags["folder"])
         assert trial.intermediate_values.keys() == {200, 400}
+        # What Optuna's dashboard shows of it.
+        (picture,) = get_all_artifact_meta(trial, storage=storage)
+        assert (tmp_path / "optuna.artifacts" / picture.artifact_id).read_bytes().startswith(b"\x89PNG")
+        notes = storage.get_study_system_attrs(storage.get_study_id_from_name("sac_y"))
+        link = f"http://127.0.0.1:5000/#/experiments/{tracked.info.experiment_id}/runs/{tracked.info.run_id}"
+        assert link in get_note_from_system_attrs(notes, trial._trial_id)["body"]
     assert len({trial.params["agent.lr"] for trial in trials_of(tmp_path)}) == 2
     again = run(*TINY, "study.n_trials=3", "study.judging.best=0", cwd=tmp_path)
     assert again.returncode == 0, again.stderr

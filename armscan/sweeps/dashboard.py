@@ -1,0 +1,55 @@
+"""What Optuna's dashboard shows of a study beside Optuna's own: the way to MLflow, and pictures of learning curves."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+import optuna
+from mlflow import MlflowClient
+from optuna.artifacts import FileSystemArtifactStore, upload_artifact
+from optuna.trial import Trial
+
+from armscan.console import from_here
+from armscan.sweeps.storage import without_password
+
+# Where `mlflow ui` answers, for stores that are no server themselves.
+USUAL_UI = "http://127.0.0.1:5000"
+
+
+def note_run(noted: optuna.Study | Trial, client: MlflowClient, experiment_id: str, run_id: str, folder: Path) -> None:
+    """Leaves a note with the link to the tracked run, and the folder.
+
+    Args:
+        noted: the study, or the trial.
+        client: of the tracking store.
+        experiment_id: of the run.
+        run_id: of the run.
+        folder: of the study or the trial.
+    """
+    # Deferred: it takes a second, and only who works at a study needs it.
+    from optuna_dashboard import save_note
+
+    uri = str(client.tracking_uri)
+    address = without_password(uri).rstrip("/") if uri.startswith("http") else USUAL_UI
+    link = f"[its run in MLflow]({address}/#/experiments/{experiment_id}/runs/{run_id})"
+    save_note(noted, f"{link}, {run_id}\n\nits folder: `{folder.resolve()}`")
+
+
+def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:
+    """Copies a picture to where the dashboard finds those of a trial.
+
+    Args:
+        trial: which still runs.
+        picture: a file.
+        artifacts: folder of the pictures of all studies.
+    """
+    artifacts.mkdir(parents=True, exist_ok=True)
+    upload_artifact(study_or_trial=trial, file_path=str(picture), artifact_store=FileSystemArtifactStore(artifacts))
+
+
+def dashboard_command(storage: str, artifacts: str) -> str:
+    """Returns what one types to look at the studies of a storage."""
+    program = from_here(Path(sys.executable).with_name("optuna-dashboard"))
+    return shlex.join([str(program), storage, "--artifact-dir", artifacts])
