@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig
 
 from armscan.errors import InvalidValueError
 from armscan.mistakes import quieten_libraries
@@ -24,9 +23,15 @@ from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy, open_for_work, read_settings
 from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import Screen, print_result
-from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, local_workers, supervise
+from armscan.sweeps.supervising import (
+    LAUNCHER_FILE,
+    STOP_FILE,
+    WORKER_KEY,
+    Process,
+    local_workers,
+    words_of_study,
+)
 
-WORKER_KEY, SEARCH_PATH = "study.worker", "hydra.searchpath"
 PLAN = "--plan"
 LAUNCHERS_ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
 LEAVE_S = 4.0
@@ -52,7 +57,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
         raise InvalidValueError("a study has many runs, which needs -m: python -m armscan.run -m " + " ".join(own))
     _check_single_values(own)
     quieten_libraries()
-    of_study = _words_of_study(own)
+    of_study = words_of_study(own)
     settings, task, config = read_settings(of_study)
     check_space(settings, task, of_study, config)
     if PLAN in words or settings.plan:
@@ -73,26 +78,6 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     with _leaving(opened, folder), Screen(opened, folder):
         launch(started)
     return print_result(opened)
-
-
-def run_worker(config: DictConfig, words: Sequence[str], folder: Path) -> None:
-    """What a launcher runs: one worker, and others in its place where it dies.
-
-    Args:
-        config: with the number of the worker.
-        words: of the worker's job.
-        folder: of the workers of this start.
-    """
-    supervise(_words_of_study(words), int(config.study.worker), folder)
-
-
-def _words_of_study(words: Sequence[str]) -> list[str]:
-    """Returns the words that the configuration of a trial is composed of.
-
-    Those of Hydra itself are for the launching of workers, but for the one that says where configurations are found.
-    """
-    others = ("hydra", f"{WORKER_KEY}=")
-    return [word for word in words if not word.lstrip("+~").startswith(others) or word.startswith(SEARCH_PATH)]
 
 
 @contextlib.contextmanager

@@ -1,4 +1,7 @@
-"""A worker's process, and the one above it, which starts another in its place when it dies."""
+"""A worker's process, and the one above it, which starts another in its place when it dies.
+
+The one above does nothing else, so that nothing is imported here that takes long, such as torch and MLflow.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Self
 
+from omegaconf import DictConfig
+
 from armscan.files import write_whole
 from armscan.sweeps.lease import process_start
 
+WORKER_KEY, SEARCH_PATH = "study.worker", "hydra.searchpath"
 LAUNCHER_FILE, STOP_FILE = "launcher.json", "stop"
 LEFT = 130
 # A worker that dies again and again does no work; its trials have long been given up by then.
@@ -71,6 +77,26 @@ def local_workers(folder: Path) -> list[Process]:
     workers = [Process.read(file) for file in folder.glob("worker-*.json")]
     here = socket.gethostname()
     return [each for each in workers if each.host == here and process_start(each.pid) == each.started]
+
+
+def run_worker(config: DictConfig, words: Sequence[str], folder: Path) -> None:
+    """What a launcher runs: one worker, and others in its place where it dies.
+
+    Args:
+        config: with the number of the worker.
+        words: of the worker's job.
+        folder: of the workers of this start.
+    """
+    supervise(words_of_study(words), int(config.study.worker), folder)
+
+
+def words_of_study(words: Sequence[str]) -> list[str]:
+    """Returns the words that the configuration of a trial is composed of.
+
+    Those of Hydra itself are for the launching of workers, but for the one that says where configurations are found.
+    """
+    others = ("hydra", f"{WORKER_KEY}=")
+    return [word for word in words if not word.lstrip("+~").startswith(others) or word.startswith(SEARCH_PATH)]
 
 
 def supervise(words: Sequence[str], number: int, folder: Path) -> None:
