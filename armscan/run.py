@@ -33,7 +33,7 @@ def run(config: DictConfig) -> None:
     """What Hydra calls: a single run, one job of a multirun, or one worker of a study."""
     if config.get("study") is not None:
         # Deferred, because only studies need Optuna.
-        from armscan.sweeps.command import run_worker
+        from armscan.sweeps.supervising import run_worker
 
         hydra_config = HydraConfig.get()
         words = [*hydra_config.overrides.task, *hydra_config.overrides.hydra]

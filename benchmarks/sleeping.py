@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import time
-
 from omegaconf import DictConfig
 
 from armscan.building import check_keys
 from armscan.sweeps.attempt import Attempt
+from benchmarks.waiting import N_PARTS, Waited, wait
 
-N_REPORTS = 10
+STEPS_A_PART = 100
 
 
 class Sleeping:
-    """The task of waiting for `training.env_steps` milliseconds, with ten reports."""
+    """The task of waiting, with ten reports; see `wait`."""
 
-    figures = ("mean_steps", "slept_s")
+    figures = ("mean_steps", *Waited._fields)
     judged = "test/mean_steps"
+
+    def __init__(self, shortest_s: float = 1.0, longest_s: float = 5.0) -> None:
+        self._shortest_s, self._longest_s = shortest_s, longest_s
 
     def check(self, config: DictConfig) -> None:
         """See `Task.check`."""
@@ -24,16 +26,16 @@ class Sleeping:
 
     def run(self, attempt: Attempt) -> dict[str, float]:
         """Waits; the value is what `agent.lr` is."""
-        config, _ = attempt.config(attempt.seeds[0])
-        n_ms, value = int(config.training.env_steps), float(config.agent.lr)
-        start_s = time.perf_counter()
-        for i in range(1, N_REPORTS + 1):
-            until_s = start_s + n_ms / 1000 * i / N_REPORTS
-            time.sleep(max(0.0, until_s - time.perf_counter()))
-            figures = {"mean_steps": value, "mean_return": -value}
-            at = {"n_env_steps": i * 100, "grid": 100, "total": N_REPORTS * 100}
-            attempt.report(figures, seed=attempt.seeds[0], **at)
-        return {"mean_steps": value, "slept_s": n_ms / 1000}
+        (seed,) = attempt.seeds
+        config, _ = attempt.config(seed)
+        value = float(config.agent.lr)
+
+        def report(part: int) -> None:
+            at = {"n_env_steps": part * STEPS_A_PART, "grid": STEPS_A_PART, "total": N_PARTS * STEPS_A_PART}
+            attempt.report({"mean_steps": value, "mean_return": -value}, seed=seed, **at)
+
+        waited = wait(attempt.trial.number, self._shortest_s, self._longest_s, report)
+        return {"mean_steps": value, **waited._asdict()}
 
     def judge(self, attempt: Attempt) -> dict[str, float]:
         """See `Task.judge`."""

@@ -1,10 +1,15 @@
 """What a study costs beside its trials, and what is left of it when its workers are killed.
 
-    python -m benchmarks.sweeps idle [folder=FOLDER]      how much of the workers' time is spent in trials
+    python -m benchmarks.sweeps compare [folder=FOLDER] [trials=60] [shortest_s=6] [longest_s=30]
+                                        the workers' time spent in trials, beside Hydra's own Optuna sweeper
+    python -m benchmarks.sweeps idle [folder=FOLDER] [trials=60] [shortest_s=1] [longest_s=5]
+                                        the same of armscan alone, with trials that are over soon
+    python -m benchmarks.sweeps beside [folder=FOLDER] [trials=6]
+                                        what a study adds to a training of a minute
     python -m benchmarks.sweeps kill [folder=FOLDER] [trials=200] [every_s=20]
-                                                          200 trials, workers killed, the storage locked twice
+                                        200 trials, workers killed, the storage locked twice
 
-Trials only wait (`benchmarks/sleeping.py`), 1 to 5 seconds, so that four workers can be had on two cores.
+But for `beside`, trials only wait (`benchmarks/sleeping.py`), so that four workers can be had on two cores.
 """
 
 from __future__ import annotations
@@ -13,82 +18,32 @@ import json
 import os
 import random
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
-import optuna
 from filelock import FileLock
 
-from armscan.sweeps.ledger import FIGURES, RETRY_OF, Tally
-from armscan.sweeps.storage import open_storage
-
-N_WORKERS = 4
-REPOSITORY = Path(__file__).parent.parent
-WORDS = [
-    *("-m", "sweeps=sac_y", "study.task._target_=benchmarks.sleeping.Sleeping", "study/sampler=random"),
-    *("study/pruner=none", "study.judging.best=0", f"study.workers={N_WORKERS}", "study.name=sleeping"),
-    "+study.space={training.env_steps:{low:1000,high:5000},agent.lr:{low:1.0e-4,high:1.0e-2}}",
-]
-# The cores are not what is measured: a trial that waits needs none.
-PROGRAM = """
-import os, sys
-os.sched_getaffinity = lambda _: range(64)
-from armscan.run import main
-sys.exit(main())
-"""
-
-
-def started(folder: Path, *words: str) -> subprocess.Popen[bytes]:
-    """Starts the study in a folder."""
-    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
-    with (folder / "printed").open("ab") as printed:
-        return subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, *WORDS, *words], cwd=folder, env=environment, stdout=printed, stderr=printed
-        )
-
-
-def tally_in(folder: Path) -> Tally:
-    """Returns how the study of a folder stands."""
-    storage = open_storage(str(folder / "optuna.journal"))
-    if "sleeping" not in optuna.get_all_study_names(storage.optuna):
-        return Tally.of([])
-    return Tally.of(optuna.load_study(study_name="sleeping", storage=storage.optuna).trials)
+from armscan.sweeps.ledger import RETRY_OF
+from benchmarks.beside import beside
+from benchmarks.compare_sweepers import compare
+from benchmarks.occupation import idle
+from benchmarks.studies import NAME, SLEEPING, started, tally_in
 
 
 def workers_in(folder: Path) -> list[int]:
     """Returns the processes of the workers."""
-    files = folder.glob("studies/sleeping/workers/*/worker-*.json")
+    files = folder.glob(f"studies/{NAME}/workers/*/worker-*.json")
     return [int(json.loads(file.read_text())["pid"]) for file in files]
 
 
-def idle(folder: Path) -> None:
-    """Measures how much of the workers' time is spent in trials, and what each trial takes beside its task."""
-    assert started(folder, "study.n_trials=60").wait() == 0, (folder / "printed").read_text()
-    finished = tally_in(folder).finished
-    begin, end = (moment(getattr(trial, f"datetime_{which}") for trial in finished) for moment, which in ENDS)
-    inside_s = [(trial.datetime_complete - trial.datetime_start).total_seconds() for trial in finished]
-    slept_s = [trial.user_attrs[FIGURES]["slept_s"] for trial in finished]
-    # At the end no trial is left for a worker that has finished its last: until then.
-    of_worker: dict[str, list[optuna.trial.FrozenTrial]] = {}
-    for trial in finished:
-        of_worker.setdefault(trial.user_attrs["lease"]["worker"], []).append(trial)
-    present_s = sum((max(t.datetime_complete for t in each) - begin).total_seconds() for each in of_worker.values())
-    beside_s = sorted(inside - slept for inside, slept in zip(inside_s, slept_s, strict=True))
-    print(f"{len(finished)} trials by {len(of_worker)} workers in {(end - begin).total_seconds():.1f} s")
-    print(f"of the workers' time {sum(inside_s) / present_s:.1%} in trials, {sum(slept_s) / present_s:.1%} in tasks")
-    print(f"beside its task a trial takes {beside_s[len(beside_s) // 2]:.2f} s (median), {beside_s[-1]:.2f} s at most")
-
-
-ENDS = ((min, "start"), (max, "complete"))
-
-
-def kill(folder: Path, n_trials: int, every_s: float) -> None:
+def kill(folder: Path, *, trials: int = 200, every_s: float = 20.0) -> None:
     """Kills workers, and holds the lock of the storage, until the study is done; counts what has become of it."""
-    process, chance, n_killed, n_locked = started(folder, f"study.n_trials={n_trials}"), random.Random(0), 0, 0
+    process = started(folder, *SLEEPING, f"study.n_trials={trials}")
+    chance, n_killed, n_locked = random.Random(0), 0, 0
     start_s = next_s = time.monotonic()
     while process.poll() is None:
         time.sleep(0.2)
@@ -105,24 +60,24 @@ def kill(folder: Path, n_trials: int, every_s: float) -> None:
     retries = Counter(trial.user_attrs[RETRY_OF] for trial in tally.all if RETRY_OF in trial.user_attrs)
     print(f"{n_killed} workers killed, the storage locked {n_locked} times, {time.monotonic() - start_s:.0f} s")
     print(
-        f"{len(tally.finished)} of {n_trials} trials finished, {len(tally.failed)} failed, {len(tally.retried)} taken "
+        f"{len(tally.finished)} of {trials} trials finished, {len(tally.failed)} failed, {len(tally.retried)} taken "
         f"up again, {len(tally.running)} left running, {len(tally.waiting)} waiting"
     )
     print(f"taken up more than once: {sum(count > 1 for count in retries.values())}; exit code {process.returncode}")
 
 
+MEASURES: dict[str, Callable[..., None]] = {"compare": compare, "idle": idle, "beside": beside, "kill": kill}
+
+
 def main(words: list[str]) -> None:
-    """Runs what is asked for."""
+    """Measures what is asked for."""
     given = dict(word.split("=", 1) for word in words if "=" in word)
     what = [word for word in words if "=" not in word]
-    folder = Path(given.get("folder", tempfile.mkdtemp()))
-    folder.mkdir(parents=True, exist_ok=True)
-    if what == ["idle"]:
-        idle(folder)
-    elif what == ["kill"]:
-        kill(folder, int(given.get("trials", "200")), float(given.get("every_s", "20")))
-    else:
+    if len(what) != 1 or what[0] not in MEASURES:
         sys.exit(__doc__)
+    folder = Path(given.pop("folder", "") or tempfile.mkdtemp()).absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    MEASURES[what[0]](folder, **{name: json.loads(number) for name, number in given.items()})
 
 
 if __name__ == "__main__":

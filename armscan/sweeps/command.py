@@ -12,19 +12,17 @@ from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from armscan.mistakes import quieten_libraries
 from armscan.settings import plain
 from armscan.sweeps.attempt import composed
 from armscan.sweeps.checking import check_space
-from armscan.sweeps.command_line import WORKER_KEY, CommandLine, words_of_trials
+from armscan.sweeps.command_line import WORKER_KEY, CommandLine
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy, open_for_work, read_settings
 from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import Screen, print_result
 from armscan.sweeps.study import existing_study
-from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, local_workers, supervise
+from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, local_workers
 
 LAUNCHER = "hydra/launcher"
 LAUNCHERS_ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
@@ -70,17 +68,6 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     with _leaving(opened, folder), Screen(opened, folder):
         launch(started)
     return print_result(opened)
-
-
-def run_worker(config: DictConfig, words: Sequence[str], folder: Path) -> None:
-    """What a launcher runs: one worker, and others in its place where it dies.
-
-    Args:
-        config: with the number of the worker.
-        words: of the worker's job.
-        folder: of the workers of this start.
-    """
-    supervise(words_of_trials(words), int(config.study.worker), folder)
 
 
 @contextlib.contextmanager

@@ -1,4 +1,7 @@
-"""A worker's process, and the one above it, which starts another in its place when it dies."""
+"""A worker's process, and the one above it, which starts another in its place when it dies.
+
+The one above does nothing else, so that nothing is imported here that takes long, such as torch and MLflow.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Self
 
+from omegaconf import DictConfig
+
 from armscan.files import write_whole
+from armscan.sweeps.command_line import words_of_trials
 from armscan.sweeps.lease import process_start
 
 LAUNCHER_FILE, STOP_FILE = "launcher.json", "stop"
@@ -71,6 +77,17 @@ def local_workers(folder: Path) -> list[Process]:
     workers = [Process.read(file) for file in folder.glob("worker-*.json")]
     here = socket.gethostname()
     return [each for each in workers if each.host == here and process_start(each.pid) == each.started]
+
+
+def run_worker(config: DictConfig, words: Sequence[str], folder: Path) -> None:
+    """What a launcher runs: one worker, and others in its place where it dies.
+
+    Args:
+        config: with the number of the worker.
+        words: of the worker's job.
+        folder: of the workers of this start.
+    """
+    supervise(words_of_trials(words), int(config.study.worker), folder)
 
 
 def supervise(words: Sequence[str], number: int, folder: Path) -> None:

@@ -92,7 +92,7 @@ class Worker:
         seed = np.random.SeedSequence((phase.seed, trial.number)).generate_state(1)[0]
         trial.study.sampler = make_sampler(phase.sampler, int(seed))
         chosen = phase.space.suggest(trial)
-        config, _ = composed([*self._words, *overrides_of(chosen)])
+        config, choices = composed([*self._words, *overrides_of(chosen)])
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)
         config_sum = sum_of_config(plain(config))
@@ -103,7 +103,7 @@ class Worker:
         attempt = Attempt(
             trial=trial,
             chosen=chosen,
-            words=self._words,
+            composed=(config, choices),
             seeds=phase.seeds_of(trial),
             study_folder=phase.folder,
             run_id=self._tracked.run_id,

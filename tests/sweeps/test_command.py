@@ -246,3 +246,11 @@ def test_study_answers_mistakes_in_one_line_before_anything_is_there(tmp_path, m
     assert "\n" not in answer
     assert "secret" not in answer
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_watches_over_a_worker_loads_nothing_that_a_worker_trains_and_tracks_with():
+    program = (
+        "import sys, armscan.run, armscan.sweeps.supervising; "
+        "print([m for m in ('torch', 'mlflow', 'tianshou') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == "[]\n"
