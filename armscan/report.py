@@ -37,7 +37,7 @@ def _run(words: Sequence[str]) -> int:
 
     from armscan.sweeps.judging import SUFFIX
     from armscan.sweeps.reporting import write_report
-    from armscan.sweeps.storage import open_storage
+    from armscan.sweeps.storage import open_storage, without_password
 
     quieten_libraries()
     name, uri = values["study"], values.get("storage", USUAL_STORAGE)
@@ -47,7 +47,7 @@ def _run(words: Sequence[str]) -> int:
     names = optuna.get_all_study_names(storage)
     if name not in names or name.endswith(SUFFIX):
         there = [each for each in names if not each.endswith(SUFFIX)]
-        raise StudyError(f"study is {name!r}, but {_which(there)} in {uri!r}")
+        raise StudyError(f"study is {name!r}, but {_which(there)} in {without_password(uri)!r}")
     judged = []
     if name + SUFFIX in names:
         judged = optuna.load_study(study_name=name + SUFFIX, storage=storage).get_trials(deepcopy=False)

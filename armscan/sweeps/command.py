@@ -16,17 +16,20 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, StorageAwayError
 from armscan.mistakes import quieten_libraries
 from armscan.settings import MULTIRUN
 from armscan.sweeps.checking import check_space
+from armscan.sweeps.database import hand_over_password
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy, open_for_work, read_settings
+from armscan.sweeps.patience import impatient
 from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import Screen, print_result
+from armscan.sweeps.storage import without_password
 from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, local_workers, supervise
 
-WORKER_KEY, SEARCH_PATH = "study.worker", "hydra.searchpath"
+WORKER_KEY, SEARCH_PATH, STORAGE = "study.worker", "hydra.searchpath", "study.storage="
 PLAN = "--plan"
 LAUNCHERS_ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
 LEAVE_S = 4.0
@@ -54,6 +57,11 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     quieten_libraries()
     of_study = _words_of_study(own)
     settings, task, config = read_settings(of_study)
+    # Words are written into files, logs and the tracking store.
+    if (shown := without_password(settings.storage)) != settings.storage:
+        hand_over_password(settings.storage)
+        own = [*(word for word in own if not word.lstrip("+").startswith(STORAGE)), f"{STORAGE}'{shown}'"]
+        of_study = _words_of_study(own)
     check_space(settings, task, of_study, config)
     if PLAN in words or settings.plan:
         print_plan(settings)
@@ -122,7 +130,9 @@ def _leaving(opened: OpenStudy, folder: Path) -> Iterator[None]:
             signal.signal(each, signal.SIG_IGN)
         (folder / STOP_FILE).touch()
         _end_workers(folder)
-        opened.searching().ledger.reclaim(Witness().is_dead)
+        # Where the storage is away, whoever goes on with the study does it.
+        with contextlib.suppress(StorageAwayError), impatient():
+            opened.searching().ledger.reclaim(Witness().is_dead)
         opened.client.set_terminated(opened.run_id, "KILLED" if is_asked.is_set() else status)
         for each, handler in before.items():
             signal.signal(each, handler)

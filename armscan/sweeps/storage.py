@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import optuna
 from filelock import FileLock
-from optuna.storages import BaseStorage, JournalStorage, RDBStorage
+from optuna.storages import BaseStorage, JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
-from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.checks import check_path
-from armscan.errors import StudyError
+from armscan.errors import StorageAwayError, StudyError
+from armscan.sweeps.database import DatabaseStorage, open_database, url_of
 
+T = TypeVar("T")
 SQLITE_PREFIX = "sqlite:///"
-# One of a PostgreSQL database's advisory locks.
-ADVISORY_LOCK = 0xA235CA
 BLOCK_BYTES = 4096
 
 
@@ -40,25 +39,29 @@ class Storage:
     optuna: BaseStorage = field(repr=False)
     lock_file: Path | None
 
-    @contextlib.contextmanager
-    def alone(self) -> Iterator[None]:
-        """Keeps all other processes out while something is decided; short, because they wait."""
+    def alone(self, decide: Callable[[], T]) -> T:
+        """Keeps all other processes out while something is decided.
+
+        Args:
+            decide: what is done then; short, because the others wait. Where the storage goes away in the middle, it is
+                called again when it is back: then all that it did before is there, or nothing of it.
+
+        Returns:
+            What it returns.
+        """
         if self.lock_file is not None:
             with FileLock(self.lock_file):
-                yield
-            return
-        assert isinstance(self.optuna, RDBStorage)
-        with self.optuna.engine.connect() as connection, connection.begin():
-            # Freed when the transaction ends, also by the death of this process.
-            connection.execute(text(f"SELECT pg_advisory_xact_lock({ADVISORY_LOCK})"))
-            yield
+                return decide()
+        assert isinstance(self.optuna, DatabaseStorage)
+        return self.optuna.alone(decide)
 
 
-def open_storage(uri: str) -> Storage:
+def open_storage(uri: str, *, is_patient: bool = False) -> Storage:
     """Opens a storage, and makes one where there is none.
 
     Args:
         uri: the path of a journal file, `sqlite:///FILE`, or the URL of a PostgreSQL database.
+        is_patient: whether to wait for a database that is away; once it is open, it is waited for in any case.
 
     Raises:
         StudyError: if it cannot be reached or used.
@@ -68,7 +71,7 @@ def open_storage(uri: str) -> Storage:
         raise StudyError(f"study.storage is {uri!r}, but it must be a file, or the URL of a database")
     if "://" not in uri:
         return _open_journal(check_path("study.storage", uri))
-    return _open_database(uri)
+    return _open_database(uri, is_patient=is_patient)
 
 
 def _open_journal(path: Path) -> Storage:
@@ -98,26 +101,28 @@ def _begins_a_journal(line: bytes) -> bool:
     return not line or (line.startswith(b"{") and (b'"op_code"' in line or not line.endswith(b"\n")))
 
 
-def _open_database(uri: str) -> Storage:
+def _open_database(uri: str, *, is_patient: bool) -> Storage:
     shown = without_password(uri)
     if not uri.startswith((SQLITE_PREFIX, "postgresql")):
         raise StudyError(f"study.storage is {shown!r}, but it must be a file, sqlite:///FILE or postgresql://...")
     logging.getLogger("alembic").setLevel(logging.WARNING)
-    lock_file = None
-    if uri.startswith(SQLITE_PREFIX):
-        database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
-        uri, lock_file = f"{SQLITE_PREFIX}{database}", database.with_name(f".{database.name}.alone")
-    options: dict[str, Any] = {"pool_pre_ping": True}
-    if lock_file is None:
-        options["connect_args"] = {"connect_timeout": 10}
     try:
-        if lock_file is None:
-            return Storage(shown, RDBStorage(uri, engine_kwargs=options), None)
-        lock_file.parent.mkdir(parents=True, exist_ok=True)
+        if not uri.startswith(SQLITE_PREFIX):
+            return Storage(shown, open_database(url_of(uri), shown, is_patient=is_patient), None)
+        database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
+        database.parent.mkdir(parents=True, exist_ok=True)
+        lock_file = database.with_name(f".{database.name}.alone")
         # Processes that make the tables of a fresh file at once get into each other's way.
         with FileLock(lock_file):
-            return Storage(shown, RDBStorage(uri, engine_kwargs=options), lock_file)
-    except (SQLAlchemyError, OSError, ImportError, RuntimeError) as error:
+            url = url_of(f"{SQLITE_PREFIX}{database}")
+            return Storage(shown, open_database(url, shown, is_patient=is_patient), lock_file)
+    except StorageAwayError:
+        raise
+    except ModuleNotFoundError as error:
+        raise StudyError(
+            f"study.storage is {shown!r}, but {error.name} is not installed: pip install 'armscan[postgres]'"
+        ) from error
+    except (SQLAlchemyError, OSError, ImportError, RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split()).replace(uri, shown)[:300]
         raise StudyError(f"study.storage is {shown!r}, but this storage cannot be used: {reason}") from error
 
@@ -126,7 +131,8 @@ def without_password(uri: str) -> str:
     """Returns an address as it may be shown."""
     scheme, separator, rest = uri.partition("://")
     account, at, host = rest.rpartition("@")
-    return f"{scheme}{separator}{account.partition(':')[0]}{at}{host}"
+    shown = f"{scheme}{separator}{account.partition(':')[0]}{at}{host}"
+    return re.sub(r"([?&])password=[^&]*&?", r"\1", shown).rstrip("?&")
 
 
 class JournalLock(JournalFileOpenLock):

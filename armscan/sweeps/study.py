@@ -51,17 +51,19 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
         FIXED: compared(fixed, settings)
         | {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]},
     }
-    with storage.alone():
-        names = optuna.get_all_study_names(storage.optuna)
-        if settings.name not in names:
-            study = optuna.create_study(
-                study_name=settings.name,
-                storage=storage.optuna,
-                directions=[StudyDirection[each.upper()] for each in settings.objectives.values()],
-            )
-            for key, value in wanted.items():
-                study.set_user_attr(key, value)
-            return open_study(storage, settings)
+
+    def make() -> None:
+        if settings.name in optuna.get_all_study_names(storage.optuna):
+            return
+        study = optuna.create_study(
+            study_name=settings.name,
+            storage=storage.optuna,
+            directions=[StudyDirection[each.upper()] for each in settings.objectives.values()],
+        )
+        for key, value in wanted.items():
+            study.set_user_attr(key, value)
+
+    storage.alone(make)
     study = open_study(storage, settings)
     _check_same(settings, study, wanted)
     return study

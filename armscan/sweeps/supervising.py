@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Self
 
+from armscan.errors import StorageAwayError
 from armscan.files import write_whole
 from armscan.sweeps.lease import process_start
 
@@ -115,6 +116,11 @@ def worker_main() -> None:
         is_alone = os.getppid() != parent_pid or launcher.is_gone
         return is_asked.is_set() or is_alone or (folder / STOP_FILE).exists()
 
+    from armscan.sweeps.log import say
     from armscan.sweeps.working import work
 
-    work(words, f"{folder.name}/{number}", is_told_to_leave, leave=lambda: os._exit(LEFT))
+    try:
+        work(words, f"{folder.name}/{number}", is_told_to_leave, leave=lambda: os._exit(LEFT))
+    except StorageAwayError as error:
+        say(str(error))
+        raise SystemExit(1) from error

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Sequence
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,14 @@ from hydra.utils import instantiate
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
+from armscan.errors import StorageAwayError
 from armscan.files import CONFIG_FILE, SUM_TAGS
 from armscan.mistakes import mistake_in_one_line
 from armscan.settings import plain
 from armscan.sweeps.attempt import CONFIG_SUM, FOLDER, RUN, Attempt, composed, sum_of_config, trial_folder
 from armscan.sweeps.lease import Keeper, LimitReachedError
 from armscan.sweeps.ledger import ENV_STEPS, FIGURES, RETRY_OF
+from armscan.sweeps.log import say
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.space import overrides_of
 from armscan.tracking import TrackedRun
@@ -72,7 +73,9 @@ class Worker:
             say(f"trial {trial.number} is handed back: {limit}")
             self._keeper.hand_back()
             self._tracked = None
-        # Whatever a trial raises is the trial's, and not the study's.
+        except StorageAwayError:
+            raise
+        # Whatever else a trial raises is the trial's, and not the study's.
         except Exception as error:
             line = mistake_in_one_line(error)
             if line is None:
@@ -192,11 +195,6 @@ def close_runs_of(trial: FrozenTrial, phase: Phase) -> None:
     for each in (*(child.info.run_id for child in children), run_id):
         client.set_tag(each, "failure", reason)
         client.set_terminated(each, "FAILED")
-
-
-def say(text: str) -> None:
-    """Writes a line into the worker's log."""
-    print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
 
 
 def _close(runs: Sequence[TrackedRun]) -> None:
