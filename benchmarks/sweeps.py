@@ -1,8 +1,12 @@
 """What a study costs beside its trials, and what is left of it when its workers are killed.
 
     python -m benchmarks.sweeps idle [folder=FOLDER]      how much of the workers' time is spent in trials
-    python -m benchmarks.sweeps kill [folder=FOLDER] [trials=200] [every_s=20]
-                                                          200 trials, workers killed, the storage locked twice
+    python -m benchmarks.sweeps kill [folder=FOLDER] [trials=200] [every_s=20] [storage=journal]
+                                                          200 trials, workers killed, the storage away twice
+
+storage=journal      its lock is held by somebody else
+storage=sqlite       its file is locked by somebody else
+storage=postgresql   a server of its own is stopped and started again
 
 Trials only wait (`benchmarks/sleeping.py`), 1 to 5 seconds, so that four workers can be had on two cores.
 """
@@ -13,11 +17,15 @@ import json
 import os
 import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 
 import optuna
@@ -25,8 +33,10 @@ from filelock import FileLock
 
 from armscan.sweeps.ledger import FIGURES, RETRY_OF, Tally
 from armscan.sweeps.storage import open_storage
+from tests.postgres import postgres_server
 
 N_WORKERS = 4
+JOURNAL, AWAY_S = "optuna.journal", 10.0
 REPOSITORY = Path(__file__).parent.parent
 WORDS = [
     *("-m", "sweeps=sac_y", "study.task._target_=benchmarks.sleeping.Sleeping", "study/sampler=random"),
@@ -51,9 +61,9 @@ def started(folder: Path, *words: str) -> subprocess.Popen[bytes]:
         )
 
 
-def tally_in(folder: Path) -> Tally:
+def tally_in(folder: Path, uri: str = JOURNAL) -> Tally:
     """Returns how the study of a folder stands."""
-    storage = open_storage(str(folder / "optuna.journal"))
+    storage = open_storage(uri if "://" in uri else str(folder / uri))
     if "sleeping" not in optuna.get_all_study_names(storage.optuna):
         return Tally.of([])
     return Tally.of(optuna.load_study(study_name="sleeping", storage=storage.optuna).trials)
@@ -86,24 +96,25 @@ def idle(folder: Path) -> None:
 ENDS = ((min, "start"), (max, "complete"))
 
 
-def kill(folder: Path, n_trials: int, every_s: float) -> None:
-    """Kills workers, and holds the lock of the storage, until the study is done; counts what has become of it."""
-    process, chance, n_killed, n_locked = started(folder, f"study.n_trials={n_trials}"), random.Random(0), 0, 0
-    start_s = next_s = time.monotonic()
-    while process.poll() is None:
-        time.sleep(0.2)
-        if time.monotonic() < next_s + every_s or not workers_in(folder):
-            continue
-        next_s = time.monotonic()
-        os.kill(chance.choice(workers_in(folder)), signal.SIGKILL)
-        n_killed += 1
-        if n_killed in (3, 6):
-            with FileLock(folder / ".optuna.journal.lock"):
-                time.sleep(10.0)
-            n_locked += 1
-    tally = tally_in(folder)
+def kill(folder: Path, n_trials: int, every_s: float, kind: str) -> None:
+    """Kills workers, and takes the storage away twice, until the study is done; counts what has become of it."""
+    with storage_of_kind(kind, folder) as (uri, take_away):
+        process = started(folder, f"study.n_trials={n_trials}", f"study.storage={uri}")
+        chance, n_killed, n_away, start_s = random.Random(0), 0, 0, time.monotonic()
+        next_s = start_s
+        while process.poll() is None:
+            time.sleep(0.2)
+            if time.monotonic() < next_s + every_s or not workers_in(folder):
+                continue
+            next_s = time.monotonic()
+            os.kill(chance.choice(workers_in(folder)), signal.SIGKILL)
+            n_killed += 1
+            if n_killed in (3, 6):
+                take_away()
+                n_away += 1
+        took_s, tally = time.monotonic() - start_s, tally_in(folder, uri)
     retries = Counter(trial.user_attrs[RETRY_OF] for trial in tally.all if RETRY_OF in trial.user_attrs)
-    print(f"{n_killed} workers killed, the storage locked {n_locked} times, {time.monotonic() - start_s:.0f} s")
+    print(f"{n_killed} workers killed, the storage away {n_away} times, {took_s:.0f} s")
     print(
         f"{len(tally.finished)} of {n_trials} trials finished, {len(tally.failed)} failed, {len(tally.retried)} taken "
         f"up again, {len(tally.running)} left running, {len(tally.waiting)} waiting"
@@ -111,16 +122,49 @@ def kill(folder: Path, n_trials: int, every_s: float) -> None:
     print(f"taken up more than once: {sum(count > 1 for count in retries.values())}; exit code {process.returncode}")
 
 
+@contextmanager
+def storage_of_kind(kind: str, folder: Path) -> Iterator[tuple[str, Callable[[], None]]]:
+    """A storage, and what takes it away from the workers for a while."""
+    match kind:
+        case "journal":
+            yield JOURNAL, partial(hold_lock, folder / f".{JOURNAL}.lock")
+        case "sqlite":
+            yield f"sqlite:///{folder}/optuna.db", partial(lock_file, folder / "optuna.db")
+        case "postgresql":
+            with postgres_server() as server:
+                yield server.make_database(), partial(server.restart, away_s=AWAY_S)
+        case _:
+            sys.exit(__doc__)
+
+
+def hold_lock(file: Path) -> None:
+    """Holds the lock of a journal."""
+    with FileLock(file):
+        time.sleep(AWAY_S)
+
+
+def lock_file(file: Path) -> None:
+    """Locks a file of SQLite."""
+    with closing(sqlite3.connect(file, isolation_level=None, timeout=60.0)) as connection:
+        connection.execute("BEGIN EXCLUSIVE")
+        time.sleep(AWAY_S)
+
+
 def main(words: list[str]) -> None:
     """Runs what is asked for."""
     given = dict(word.split("=", 1) for word in words if "=" in word)
     what = [word for word in words if "=" not in word]
-    folder = Path(given.get("folder", tempfile.mkdtemp()))
+    folder = Path(given.get("folder", tempfile.mkdtemp())).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     if what == ["idle"]:
         idle(folder)
     elif what == ["kill"]:
-        kill(folder, int(given.get("trials", "200")), float(given.get("every_s", "20")))
+        kill(
+            folder,
+            int(given.get("trials", "200")),
+            float(given.get("every_s", "20")),
+            given.get("storage", "journal"),
+        )
     else:
         sys.exit(__doc__)
 
