@@ -13,7 +13,6 @@ Trials only wait (`benchmarks/sleeping.py`), 1 to 5 seconds, so that four worker
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import signal
@@ -33,6 +32,7 @@ from filelock import FileLock
 
 from armscan.sweeps.ledger import FIGURES, RETRY_OF, Tally
 from armscan.sweeps.storage import open_storage
+from armscan.sweeps.supervising import local_workers
 from tests.postgres import postgres_server
 
 N_WORKERS = 4
@@ -70,9 +70,8 @@ def tally_in(folder: Path, uri: str = JOURNAL) -> Tally:
 
 
 def workers_in(folder: Path) -> list[int]:
-    """Returns the processes of the workers."""
-    files = folder.glob("studies/sleeping/workers/*/worker-*.json")
-    return [int(json.loads(file.read_text())["pid"]) for file in files]
+    """Returns the processes of the workers that are at work."""
+    return [each.pid for start in folder.glob("studies/sleeping/workers/*") for each in local_workers(start)]
 
 
 def idle(folder: Path) -> None:
@@ -104,10 +103,10 @@ def kill(folder: Path, n_trials: int, every_s: float, kind: str) -> None:
         next_s = start_s
         while process.poll() is None:
             time.sleep(0.2)
-            if time.monotonic() < next_s + every_s or not workers_in(folder):
+            if time.monotonic() < next_s + every_s or not (workers := workers_in(folder)):
                 continue
             next_s = time.monotonic()
-            os.kill(chance.choice(workers_in(folder)), signal.SIGKILL)
+            os.kill(chance.choice(workers), signal.SIGKILL)
             n_killed += 1
             if n_killed in (3, 6):
                 take_away()

@@ -21,8 +21,14 @@ T = TypeVar("T")
 ADVISORY_LOCK = 0xA235CA
 # Whoever holds it and is not heard of for so long, because its machine is gone, loses it with its connection.
 SILENT_S = 120
-# Seconds until a connection counts as lost on which nothing comes back.
-TCP = {"connect_timeout": 10, "keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3}
+# When a connection counts as lost on which nothing comes back: in seconds, but for the last one, in milliseconds.
+TCP = {
+    "connect_timeout": 10,
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 25_000,
+}
 # Where the address has no password: the command hands it to its workers so, and not in words that are written down.
 PASSWORD_VARIABLE = "ARMSCAN_STORAGE_PASSWORD"
 

@@ -14,7 +14,7 @@ from sqlalchemy import create_engine, text
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.errors import StorageAwayError
-from armscan.sweeps import lease, patience
+from armscan.sweeps import lease, patience, screen
 from armscan.sweeps.lease import Keeper, Witness, process_start
 from armscan.sweeps.ledger import LEASE, RETRY_OF, Ledger, Limits
 from armscan.sweeps.storage import open_storage
@@ -234,6 +234,23 @@ def test_worker_that_is_told_to_leave_while_the_storage_is_away_leaves_soon(open
         finally:
             postgres.start()
             told.clear()
+
+
+def test_screen_says_once_that_the_storage_is_away_and_shows_what_is_new_when_it_is_back(monkeypatch, capsys):
+    monkeypatch.setattr(screen, "REFRESH_S", 0.0)
+    # Of a screen, what shows again and again.
+    shown = screen.Screen.__new__(screen.Screen)
+    shown._stopped, is_away = threading.Event(), [True, True, False, False]
+
+    def show():
+        if len(is_away) == 2:
+            shown._stopped.set()
+        if is_away.pop(0):
+            raise StorageAwayError("it is away")
+        print("trial 3 done")
+
+    shown._repeat(show)
+    assert capsys.readouterr().out.splitlines() == ["it is away", "trial 3 done", "trial 3 done"]
 
 
 @pytest.mark.parametrize(("statement", "is_away"), [("SELECT * FROM nowhere", False), ("DELETE FROM a", True)])
