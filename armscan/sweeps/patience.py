@@ -85,12 +85,16 @@ class Patience:
             self._n_waiting += 1
             if self._n_waiting == 1 and not self._is_over:
                 say(f"the storage is away ({_reason(away)}): waiting")
+        is_back = True
         try:
             yield
+        except (StorageAwayError, KeyboardInterrupt):
+            is_back = False
+            raise
         finally:
             with self._changing:
                 self._n_waiting -= 1
-                if self._n_waiting == 0 and not self._is_over:
+                if self._n_waiting == 0 and is_back:
                     say("the storage is back")
 
 

@@ -1,5 +1,6 @@
 """Storages that are away for a while: nothing is lost, nothing is done twice, and nobody waits for ever."""
 
+import contextlib
 import multiprocessing
 import os
 import random
@@ -9,7 +10,6 @@ import time
 
 import optuna
 import pytest
-from optuna.trial import TrialState
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -34,7 +34,7 @@ def open_ledger(postgres):
 
 @pytest.fixture(params=[True, False], ids=["done", "undone"])
 def lose_commit(request, monkeypatch):
-    """Loses the connection while the next transaction is committed, after it was done or before."""
+    """Loses the connection while the next transaction that changes anything is committed, once it is done or before."""
 
     def lose(ledger, meanwhile=lambda: None):
         import psycopg
@@ -43,6 +43,8 @@ def lose_commit(request, monkeypatch):
         commit = dialect.do_commit
 
         def lost(connection):
+            if connection.dbapi_connection.execute("SELECT pg_current_xact_id_if_assigned()").fetchone() == (None,):
+                return commit(connection)
             monkeypatch.setattr(dialect, "do_commit", commit)
             if request.param:
                 commit(connection)
@@ -90,10 +92,12 @@ def test_trial_is_told_once_where_the_answer_is_lost(open_ledger, lose_commit, c
 
 def test_trial_that_was_failed_by_another_meanwhile_is_not_told(open_ledger, lose_commit):
     ledger, other = open_ledger(), open_ledger()
-    trial = ledger.claim({})
-    other.reclaim(lambda _: True)
-    with pytest.raises(optuna.exceptions.UpdateFinishedTrialError):
-        ledger.study._storage.set_trial_state_values(trial._trial_id, TrialState.COMPLETE, [1.0])
+    trial, is_told = ledger.claim({}), False
+    lose_commit(ledger, meanwhile=lambda: other.reclaim(lambda _: True))
+    with contextlib.suppress(optuna.exceptions.UpdateFinishedTrialError):
+        ledger.study.tell(trial, 1.0)
+        is_told = True
+    assert states(other) == (["COMPLETE"] if is_told else ["FAIL", "WAITING"])
 
 
 def test_trial_that_is_taken_up_by_another_while_it_is_handed_back_stays_theirs(open_ledger, lose_commit):
@@ -132,6 +136,20 @@ def test_claim_in_the_middle_of_which_the_server_restarts_holds_the_lock_again(o
     assert ledger.claim({"worker": "a"}) is None
     assert states(ledger) == states(other) == ["RUNNING"]
     assert other.tally().running[0].user_attrs[LEASE] == {"worker": "b"}
+
+
+def test_what_was_decided_where_something_went_wrong_is_not_there(open_ledger):
+    ledger = open_ledger()
+
+    def decide():
+        for _ in range(2):
+            ledger.study.ask()
+        raise ValueError("something went wrong")
+
+    with pytest.raises(ValueError, match="something went wrong"):
+        ledger._storage.alone(decide)
+    assert ledger.tally().all == open_ledger().tally().all == ()
+    assert ledger._storage.alone(ledger.tally).all == ()
 
 
 def work(open_ledger, n_trials):
