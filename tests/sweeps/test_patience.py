@@ -146,6 +146,7 @@ def test_what_was_decided_where_something_went_wrong_is_not_there(open_ledger):
             ledger.study.ask()
         raise ValueError("something went wrong")
 
+    assert ledger._storage.alone(ledger.tally).all == ()
     with pytest.raises(ValueError, match="something went wrong"):
         ledger._storage.alone(decide)
     assert ledger.tally().all == open_ledger().tally().all == ()
