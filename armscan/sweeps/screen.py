@@ -181,7 +181,7 @@ def _print_verdicts(opened: OpenStudy) -> None:
     if not judged:
         return
     n_seeds = ", ".join(sorted({str(verdict.n_seeds) for verdict in judged}))
-    title = f"result: trained again with {n_seeds} other seeds, on the test volumes (95 % intervals)"
+    title = f"result: on the test volumes, other seeds: {n_seeds} (95 % intervals)"
     table = Table(title=title, title_justify="left")
     names = shown_of(judged[0])
     for heading in ("trial", *(name.removeprefix("test/").replace("_", " ") for name in names)):
