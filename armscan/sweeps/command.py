@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from armscan.mistakes import quieten_libraries
 from armscan.settings import plain
 from armscan.sweeps.attempt import composed
 from armscan.sweeps.checking import check_space
-from armscan.sweeps.command_line import WORKER_KEY, CommandLine
+from armscan.sweeps.command_line import LAUNCHER, USUAL_LAUNCHER, WORKER_KEY, CommandLine
 from armscan.sweeps.database import hand_over_password
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy, open_for_work, read_settings
@@ -26,11 +27,12 @@ from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import Screen, print_result
 from armscan.sweeps.storage import without_password
 from armscan.sweeps.study import existing_study
-from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, local_workers
+from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, keep_gpus, local_workers
 
-LAUNCHER = "hydra/launcher"
 LAUNCHERS_ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
 LEAVE_S = 4.0
+# A study's own budgets say when it ends; ten years.
+MINUTES_WITHOUT_END = 5_256_000
 
 
 def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:
@@ -54,7 +56,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     # Words are written into files, logs and the tracking store.
     hand_over_password(settings.storage)
     given = given.with_storage(without_password(settings.storage))
-    launcher = composed(given.words)[1][LAUNCHER]
+    launcher = composed(given.launching)[1][LAUNCHER]
     if launcher in LAUNCHERS_ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))
     check_space(settings, task, given.of_trials, config)
@@ -68,11 +70,16 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     folder.mkdir(parents=True)
     Process.current().write(folder / LAUNCHER_FILE)
     numbers = ",".join(map(str, range(settings.workers)))
-    started = ["-m", *given.words, f"{WORKER_KEY}={numbers}", f"hydra.sweep.dir={folder}"]
+    started = ["-m", *given.launching, f"{WORKER_KEY}={numbers}", f"hydra.sweep.dir={folder}"]
+    waiting: AbstractContextManager[None] = contextlib.nullcontext()
     if launcher == "joblib":
         started.append(f"hydra.launcher.n_jobs={settings.workers}")
     opened.client.update_run(opened.run_id, status="RUNNING")
-    with _leaving(opened, folder), Screen(opened, folder):
+    if launcher == USUAL_LAUNCHER:
+        started.insert(1, f"hydra.launcher.timeout_min={MINUTES_WITHOUT_END}")
+        waiting = _interrupted_alone()
+        keep_gpus()
+    with _leaving(opened, folder), Screen(opened, folder), waiting:
         launch(started)
     return print_result(opened)
 
@@ -112,6 +119,20 @@ def _leaving(opened: OpenStudy, folder: Path) -> Iterator[None]:
             signal.signal(each, handler)
     if is_asked.is_set():
         raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def _interrupted_alone() -> Iterator[None]:
+    """What launching is done in by a launcher whose processes would tell a Ctrl-C, each with a trace.
+
+    They inherit that this thread does not take it. Another thread of this process does, and then this one is told as
+    usual, as soon as it has slept its second.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end_workers(folder: Path) -> None:

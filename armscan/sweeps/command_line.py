@@ -15,6 +15,7 @@ from armscan.settings import MULTIRUN, RESUME
 from armscan.sweeps.values import written
 
 PLAN, SWEEPS, STUDY = "--plan", "sweeps", "study"
+LAUNCHER, USUAL_LAUNCHER = "hydra/launcher", "submitit_local"
 WORKER_KEY, SPACE, STORAGE, SEARCH_PATH = "study.worker", "study.space", "study.storage", "hydra.searchpath"
 
 
@@ -62,6 +63,12 @@ class CommandLine:
             return self
         others = (word for word in self.words if word.lstrip("+").partition("=")[0] != STORAGE)
         return replace(self, words=(*others, f"{STORAGE}={written(uri)}"))
+
+    @property
+    def launching(self) -> list[str]:
+        """The words that the workers are launched with."""
+        is_chosen = any(word.startswith(f"{LAUNCHER}=") for word in self.words)
+        return [*self.words, *([] if is_chosen else [f"{LAUNCHER}={USUAL_LAUNCHER}"])]
 
     @property
     def of_trials(self) -> list[str]:

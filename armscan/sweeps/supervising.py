@@ -27,6 +27,7 @@ from armscan.sweeps.lease import process_start
 
 LAUNCHER_FILE, STOP_FILE = "launcher.json", "stop"
 LEFT = 130
+GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"
 # A worker that dies again and again does no work; its trials have long been given up by then.
 MAX_RESTARTS = 100
 WORKER_PROGRAM = """
@@ -111,6 +112,7 @@ def supervise(words: Sequence[str], number: int, folder: Path) -> None:
             ended = subprocess.run(
                 [sys.executable, "-c", WORKER_PROGRAM],
                 input=handed_over,
+                env=_environment(),
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
@@ -118,6 +120,21 @@ def supervise(words: Sequence[str], number: int, folder: Path) -> None:
             )
             if ended.returncode >= 0:
                 return
+
+
+def keep_gpus() -> None:
+    """Notes which GPUs this process may use, for workers whose launcher would hide them."""
+    os.environ[KEPT_GPUS] = os.environ.get(GPUS, ALL_GPUS)
+
+
+def _environment() -> dict[str, str]:
+    environment = dict(os.environ)
+    kept = environment.pop(KEPT_GPUS, None)
+    if kept == ALL_GPUS:
+        environment.pop(GPUS, None)
+    elif kept is not None:
+        environment[GPUS] = kept
+    return environment
 
 
 def worker_main() -> None:
@@ -128,6 +145,8 @@ def worker_main() -> None:
     launcher, is_asked = Process.read(folder / LAUNCHER_FILE), threading.Event()
     for asking in (signal.SIGINT, signal.SIGTERM):
         signal.signal(asking, lambda *_: is_asked.set())
+    # Whatever the launcher has kept from its processes.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def is_told_to_leave() -> bool:
         is_alone = os.getppid() != parent_pid or launcher.is_gone
