@@ -72,6 +72,10 @@ class StudyError(ArmscanError, RuntimeError):
     """A study cannot be started or gone on with."""
 
 
+class StorageAwayError(StudyError):
+    """The storage of a study cannot be reached, and is not waited for any longer."""
+
+
 def is_interruption(error: BaseException | None) -> bool:
     """Whether an error is an interrupt, or came of one: raised inside compiled code, it can come out as any other."""
     while error is not None:

@@ -14,7 +14,7 @@ from armscan.sweeps.ledger import LEASE, Tally
 from armscan.sweeps.storage import open_storage
 
 N_WORKERS = 4
-NAME = "benchmark"
+NAME, JOURNAL = "benchmark", "optuna.journal"
 REPOSITORY = Path(__file__).parent.parent
 SLEEPING = (
     *("study.task._target_=benchmarks.sleeping.Sleeping", "study/sampler=random", "study/pruner=none"),
@@ -46,9 +46,9 @@ def finish(folder: Path, *words: str) -> Tally:
     return tally_in(folder)
 
 
-def tally_in(folder: Path) -> Tally:
+def tally_in(folder: Path, uri: str = JOURNAL) -> Tally:
     """Returns how the study of a folder stands."""
-    storage = open_storage(str(folder / "optuna.journal"))
+    storage = open_storage(uri if "://" in uri else str(folder / uri))
     if NAME not in optuna.get_all_study_names(storage.optuna):
         return Tally.of([])
     return Tally.of(optuna.load_study(study_name=NAME, storage=storage.optuna).trials)

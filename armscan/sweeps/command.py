@@ -12,15 +12,19 @@ from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 
+from armscan.errors import StorageAwayError
 from armscan.mistakes import quieten_libraries
 from armscan.settings import plain
 from armscan.sweeps.attempt import composed
 from armscan.sweeps.checking import check_space
 from armscan.sweeps.command_line import WORKER_KEY, CommandLine
+from armscan.sweeps.database import hand_over_password
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy, open_for_work, read_settings
+from armscan.sweeps.patience import impatient
 from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import Screen, print_result
+from armscan.sweeps.storage import without_password
 from armscan.sweeps.study import existing_study
 from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, local_workers
 
@@ -47,6 +51,9 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     given = CommandLine.read(words)
     quieten_libraries()
     settings, task, config = read_settings(given.of_trials)
+    # Words are written into files, logs and the tracking store.
+    hand_over_password(settings.storage)
+    given = given.with_storage(without_password(settings.storage))
     launcher = composed(given.words)[1][LAUNCHER]
     if launcher in LAUNCHERS_ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))
@@ -97,7 +104,9 @@ def _leaving(opened: OpenStudy, folder: Path) -> Iterator[None]:
             signal.signal(each, signal.SIG_IGN)
         (folder / STOP_FILE).touch()
         _end_workers(folder)
-        opened.searching().ledger.reclaim(Witness().is_dead)
+        # Where the storage is away, whoever goes on with the study does it.
+        with contextlib.suppress(StorageAwayError), impatient():
+            opened.searching().ledger.reclaim(Witness().is_dead)
         opened.client.set_terminated(opened.run_id, "KILLED" if is_asked.is_set() else status)
         for each, handler in before.items():
             signal.signal(each, handler)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,9 +12,10 @@ from hydra.core.override_parser.types import Override, QuotedString
 
 from armscan.errors import InvalidValueError
 from armscan.settings import MULTIRUN, RESUME
+from armscan.sweeps.values import written
 
 PLAN, SWEEPS, STUDY = "--plan", "sweeps", "study"
-WORKER_KEY, SPACE, SEARCH_PATH = "study.worker", "study.space", "hydra.searchpath"
+WORKER_KEY, SPACE, STORAGE, SEARCH_PATH = "study.worker", "study.space", "study.storage", "hydra.searchpath"
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,13 @@ class CommandLine:
         _check_single_values(overrides)
         _check_search_path(overrides)
         return cls(own, PLAN in options)
+
+    def with_storage(self, uri: str) -> Self:
+        """Returns the same for the storage at another address."""
+        if uri == fixed_by(self.words).get(STORAGE, uri):
+            return self
+        others = (word for word in self.words if word.lstrip("+").partition("=")[0] != STORAGE)
+        return replace(self, words=(*others, f"{STORAGE}={written(uri)}"))
 
     @property
     def of_trials(self) -> list[str]:

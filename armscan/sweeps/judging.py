@@ -39,7 +39,8 @@ def make_judging_study(storage: Storage, settings: StudySettings, searched: optu
 
     Where it exists, trainings are added for configurations that have become the best since.
     """
-    with storage.alone():
+
+    def made() -> optuna.Study:
         study = optuna.create_study(study_name=settings.judged_name, storage=storage.optuna, load_if_exists=True)
         there = {
             (trial.user_attrs[JUDGED], trial.user_attrs[JUDGED_SEED]) for trial in study.get_trials(deepcopy=False)
@@ -48,7 +49,9 @@ def make_judging_study(storage: Storage, settings: StudySettings, searched: optu
             for seed in judging_seeds(settings):
                 if (trial.number, seed) not in there:
                     study.enqueue_trial(trial.params, user_attrs={JUDGED: trial.number, JUDGED_SEED: seed})
-    return study
+        return study
+
+    return storage.alone(made)
 
 
 def seed_of_judged(trial: Trial) -> tuple[int, ...]:

@@ -13,11 +13,16 @@ from typing import Any
 
 from optuna.trial import FrozenTrial, Trial
 
-from armscan.sweeps.ledger import LEASE, Ledger
+from armscan.sweeps.ledger import HOLDER, LEASE, Ledger
+from armscan.sweeps.log import say
 
 BEAT_S, TICK_S = 10.0, 0.25
 # Missed beats before a worker counts as dead: a busy storage may hold up some.
 DEAD_AFTER_S = 40.0
+# Of the time between two looks at a lease: in a longer one the storage was away for all, and nobody could renew any.
+MOST_UNSEEN_S = 15.0
+# Where the storage is away, what is at hand cannot be handed back: it is reclaimed, as its process is gone.
+HAND_BACK_S = 5.0
 
 
 def process_start(pid: int) -> str:
@@ -41,7 +46,8 @@ class Witness:
     """Tells the dead from the living, by its own clock: clocks of machines differ."""
 
     def __init__(self) -> None:
-        self._seen: dict[int, tuple[Any, float]] = {}
+        # By trial: its last sign, when it was last looked at, and for how long it has been the same by then.
+        self._seen: dict[int, tuple[Any, float, float]] = {}
         self._host = socket.gethostname()
 
     def is_dead(self, trial: FrozenTrial) -> bool:
@@ -50,11 +56,11 @@ class Witness:
         if lease.get("host") == self._host and Path("/proc/self/stat").exists():
             return process_start(lease["pid"]) != str(lease["started"])
         sign = lease.get("worker"), lease.get("beat")
-        before, since_s = self._seen.get(trial.number, (None, 0.0))
-        if before != sign:
-            since_s = time.monotonic()
-            self._seen[trial.number] = sign, since_s
-        return time.monotonic() - since_s > DEAD_AFTER_S
+        now_s = time.monotonic()
+        before, looked_s, silent_s = self._seen.get(trial.number, (None, now_s, 0.0))
+        silent_s = silent_s + min(now_s - looked_s, MOST_UNSEEN_S) if before == sign else 0.0
+        self._seen[trial.number] = sign, now_s, silent_s
+        return silent_s > DEAD_AFTER_S
 
 
 class Keeper:
@@ -93,23 +99,27 @@ class Keeper:
         # Held while a trial changes hands, so that none is forgotten by who leaves in the middle of it.
         self._changing = threading.Lock()
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._keep, daemon=True)
+        # Two, because signs of life wait for a storage that is away, and whoever is told to leave does not.
+        self._threads = [threading.Thread(target=each, daemon=True) for each in (self._watch, self._beat)]
 
     @contextmanager
     def at_work(self) -> Iterator[None]:
         """Keeps watch as long as it lasts."""
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
         try:
             yield
         finally:
             self._stopped.set()
-            self._thread.join()
+            for thread in self._threads:
+                thread.join()
 
     def claim(self) -> Trial | None:
         """Takes a trial, as `Ledger.claim` does, and holds it from then on."""
         with self._changing:
+            # How far the trial before was is not said of this one.
+            self._lease = {key: self._lease[key] for key in (*HOLDER, "beat")}
             self._trial = self._ledger.claim(self._lease)
-            self._lease = {key: self._lease[key] for key in ("worker", "host", "pid", "started", "beat")}
             return self._trial
 
     def closing(self, close: Callable[[], None] | None) -> None:
@@ -142,21 +152,29 @@ class Keeper:
             yield
             self._trial = self._close = None
 
-    def _keep(self) -> None:
-        next_beat_s = time.monotonic()
+    def _watch(self) -> None:
         while not self._stopped.wait(TICK_S):
             if self._is_told_to_leave():
-                self.hand_back()
-                self._leave()
-            if time.monotonic() >= next_beat_s:
-                next_beat_s = time.monotonic() + BEAT_S
+                late = threading.Timer(HAND_BACK_S, self._leave)
+                late.daemon = True
+                late.start()
                 try:
-                    self._beat()
-                # Whatever a storage raises that is away for a while: the next beat may find it there again.
-                except Exception as error:
-                    print(f"no sign of life could be given: {error!r}", flush=True)
+                    self.hand_back()
+                finally:
+                    late.cancel()
+                    self._leave()
 
     def _beat(self) -> None:
+        while True:
+            try:
+                self._give_sign()
+            # Whatever a storage raises that is away for long: the next beat may find it there again.
+            except Exception as error:
+                say(f"no sign of life could be given: {error!r}")
+            if self._stopped.wait(BEAT_S):
+                return
+
+    def _give_sign(self) -> None:
         with self._changing:
             if self._trial is not None:
                 self._lease = self._lease | {"beat": self._lease["beat"] + 1}

@@ -23,6 +23,8 @@ RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
 # Of those, what a retry has from the attempt before: the seeds that are done, and what it is to be judged for.
 JUDGED, JUDGED_SEED = "judged", "judged_seed"
 KEPT_BY_RETRY = (SEEDS, JUDGED, JUDGED_SEED)
+# In a lease: who holds the trial.
+HOLDER = ("worker", "host", "pid", "started")
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 # After this many failures, with no trial that got anywhere, the fault is in the configuration and not in a trial.
 FAILURES_AT_ONCE = 3
@@ -135,14 +137,23 @@ class Ledger:
         Returns:
             The trial, or None where there is none to be had now: those that run may be enough, or the study is over.
         """
-        with self._storage.alone():
+        asked: list[Trial] = []
+
+        def claimed() -> Trial | None:
             tally = self.tally()
+            # Where the storage went away in the middle, one may have been taken before, and only the answer been lost.
+            leases = {trial._trial_id: trial.user_attrs.get(LEASE) for trial in tally.running}
+            for trial in asked:
+                if leases.get(trial._trial_id) == lease:
+                    return trial
             enough = len(tally.finished) + len(tally.running) >= self._limits.n_trials
             if enough or self.end(tally) is not None or not (self._is_open or tally.waiting):
                 return None
-            trial = self.study.ask()
-            trial.set_user_attr(LEASE, dict(lease))
-            return trial
+            asked.append(self.study.ask())
+            asked[-1].set_user_attr(LEASE, dict(lease))
+            return asked[-1]
+
+        return self._storage.alone(claimed)
 
     def end(self, tally: Tally) -> str | None:
         """Returns why no further trial is to be begun; None where some are."""
@@ -176,12 +187,20 @@ class Ledger:
 
     def hand_back(self, trial: Trial, lease: Mapping[str, Any]) -> None:
         """Leaves a trial of one's own for another to go on with; the lease says how far it is."""
-        self.renew(trial, lease)
-        try:
-            self.study._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
-        except UpdateFinishedTrialError:
-            # Somebody has taken this worker for dead in the meantime.
-            return
+        storage = self.study._storage
+        # Nobody holds it: whoever takes it and dies before its own lease is there is not to be taken for this worker.
+        left = {**lease, "started": ""}
+
+        def handed_back() -> None:
+            now = storage.get_trial(trial._trial_id)
+            holder = now.user_attrs.get(LEASE, {})
+            is_own = all(holder.get(key) == lease[key] for key in HOLDER if key in lease)
+            # Not where somebody took this worker for dead, nor, where only the answer was lost, took it up already.
+            if now.state == TrialState.RUNNING and is_own:
+                storage.set_trial_user_attr(trial._trial_id, LEASE, left)
+                storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+
+        self._storage.alone(handed_back)
 
     def renew(self, trial: Trial, lease: Mapping[str, Any]) -> None:
         """Says that the worker of a trial of one's own is alive, and how far it is."""
@@ -192,8 +211,7 @@ class Ledger:
 
     def fail(self, trial: Trial, reason: str) -> None:
         """Ends a trial of one's own that raised."""
-        with self._storage.alone():
-            self._fail(trial._trial_id, {FAILURE: reason})
+        self._storage.alone(lambda: self._fail(trial._trial_id, {FAILURE: reason}))
 
     def reclaim(self, is_dead: Callable[[FrozenTrial], bool]) -> list[FrozenTrial]:
         """Fails the trials of workers that have died, and lets each be taken up again where it may be.
@@ -212,9 +230,17 @@ class Ledger:
         # First without keeping others out: hardly ever is one lost.
         if not any(map(is_lost, self.tally().running)):
             return []
-        with self._storage.alone():
+        reclaimed: dict[int, FrozenTrial] = {}
+
+        def reclaim() -> None:
             tally = self.tally()
-            return [trial for trial in tally.running if is_lost(trial) and self._reclaimed(trial, tally)]
+            for trial in tally.running:
+                if is_lost(trial) and self._reclaimed(trial, tally):
+                    reclaimed[trial.number] = trial
+
+        # Those of a first time, of which only the answer was lost, are among them.
+        self._storage.alone(reclaim)
+        return list(reclaimed.values())
 
     def _reclaimed(self, trial: FrozenTrial, tally: Tally) -> bool:
         attempt = trial.user_attrs.get(ATTEMPT, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,8 +120,12 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
     return settings, task, composed(words)[0]
 
 
-def open_for_work(words: Sequence[str]) -> OpenStudy:
+def open_for_work(words: Sequence[str], *, is_patient: bool = False) -> OpenStudy:
     """Opens a study, and makes it where there is none.
+
+    Args:
+        words: of the study.
+        is_patient: see `open_storage`.
 
     Raises:
         InvalidValueError: if something in the words is not allowed.
@@ -135,16 +140,20 @@ def open_for_work(words: Sequence[str]) -> OpenStudy:
             f"study.folder is {settings.folder!r}, but no folder can be made there ({error.strerror})"
         ) from error
     client, experiment_id = open_store(**plain(config.tracking))
-    storage = open_storage(settings.storage)
+    storage = open_storage(settings.storage, is_patient=is_patient)
     study = make_study(storage, settings, plain(config))
-    with storage.alone():
-        run_id = study.user_attrs.get(STUDY_RUN)
-        if run_id is None:
-            tags = {**source_tags(), "study": settings.name, "study.storage": storage.uri, "overrides": " ".join(words)}
-            run = client.create_run(experiment_id, run_name=f"study {settings.name}", tags=tags)
-            run_id = run.info.run_id
-            study.set_user_attr(STUDY_RUN, run_id)
-            note_run(study, client, experiment_id, run_id, Path(settings.folder))
+
+    @functools.cache
+    def run_made() -> str:
+        tags = {**source_tags(), "study": settings.name, "study.storage": storage.uri, "overrides": " ".join(words)}
+        return str(client.create_run(experiment_id, run_name=f"study {settings.name}", tags=tags).info.run_id)
+
+    def tracked() -> str:
+        if STUDY_RUN not in study.user_attrs:
+            study.set_user_attr(STUDY_RUN, run_made())
+            note_run(study, client, experiment_id, run_made(), Path(settings.folder))
+        return str(study.user_attrs[STUDY_RUN])
+
     return OpenStudy(
         settings=settings,
         task=task,
@@ -152,5 +161,5 @@ def open_for_work(words: Sequence[str]) -> OpenStudy:
         storage=storage,
         client=client,
         experiment_id=experiment_id,
-        run_id=str(run_id),
+        run_id=storage.alone(tracked),
     )

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
-from plotly import graph_objects
 from plotly.offline import get_plotlyjs
 
 from armscan.sweeps.attempt import FOLDER, RUN
+from armscan.sweeps.charts import charts, importances
 from armscan.sweeps.judging import best_trials
 from armscan.sweeps.ledger import ENV_STEPS, FAILURE, FIGURES, JUDGED, RETRY_OF, Tally
 from armscan.sweeps.values import overrides_of
@@ -31,8 +30,6 @@ td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; }}
 {body}
 </body></html>
 """
-MIN_TRIALS_FOR_IMPORTANCE = 4
-N_CURVES = 5
 Row = Mapping[str, Any]
 
 
@@ -59,7 +56,7 @@ def write_report(study: optuna.Study, judged: Sequence[FrozenTrial], folder: Pat
         ],
         "failures": [_failure_row(trial) for trial in trials if trial.state == TrialState.FAIL],
         "result": [row for verdict in found for row in _verdict_rows(verdict)],
-        "importances": [{"key": key, "importance": share} for key, share in _importances(study, objectives).items()],
+        "importances": importances(study, objectives),
     }
     for name, rows in tables.items():
         _write_csv(folder / f"{name}.csv", rows)
@@ -68,7 +65,7 @@ def write_report(study: optuna.Study, judged: Sequence[FrozenTrial], folder: Pat
         "<h2>Result</h2><p>The best settings, trained again with seeds that chose nothing, on the test volumes.</p>",
         _table(_result_rows(found, trials)) if found else "<p>Nothing has been judged yet.</p>",
         _films(judged),
-        *_charts(study, objectives, tables["importances"]),
+        *charts(study, objectives, tables["importances"]),
         "<h2>Failures</h2>",
         _table(tables["failures"]) if tables["failures"] else "<p>No trial has failed.</p>",
         "<h2>Numbers</h2><ul>" + "".join(f'<li><a href="{each}.csv">{each}.csv</a></li>' for each in tables) + "</ul>",
@@ -93,49 +90,6 @@ def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Seq
         + (f" Best while searching: trial {best[0].number}, {html.escape(found)}; that flatters it." if best else "")
         + "</p>"
     )
-
-
-def _charts(study: optuna.Study, objectives: Sequence[str], importances: Sequence[Row]) -> list[str]:
-    """Returns the charts with their headings; those of a single objective where there is one."""
-    charts: dict[str, graph_objects.Figure] = {}
-    finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    if not finished:
-        return ["<p>No trial has run to its end yet.</p>"]
-    if len(objectives) == 1:
-        charts["History"] = optuna.visualization.plot_optimization_history(study, target_name=objectives[0])
-        if importances:
-            bars = graph_objects.Bar(
-                x=[row["importance"] for row in importances], y=[row["key"] for row in importances], orientation="h"
-            )
-            charts["Importance of each key"] = graph_objects.Figure(bars)
-        charts["Parallel coordinates"] = optuna.visualization.plot_parallel_coordinate(study, target_name=objectives[0])
-        charts["Slices of the space"] = optuna.visualization.plot_slice(study, target_name=objectives[0])
-        charts["Reports while training, pruned trials too"] = optuna.visualization.plot_intermediate_values(study)
-        charts["Learning curves of the best"] = _curves(best_trials(study, N_CURVES), objectives[0])
-    else:
-        charts["Trials that no other is better than"] = optuna.visualization.plot_pareto_front(
-            study, target_names=list(objectives)
-        )
-    return [f"<h2>{name}</h2>{_drawn(chart)}" for name, chart in charts.items()]
-
-
-def _curves(trials: Sequence[FrozenTrial], objective: str) -> graph_objects.Figure:
-    figure = graph_objects.Figure()
-    for trial in trials:
-        steps, values = list(trial.intermediate_values), list(trial.intermediate_values.values())
-        figure.add_scatter(x=steps, y=values, name=f"trial {trial.number}")
-    return figure.update_layout(xaxis_title="environment steps, seed after seed", yaxis_title=objective)
-
-
-def _drawn(chart: graph_objects.Figure) -> str:
-    return str(chart.to_html(full_html=False, include_plotlyjs=False))
-
-
-def _importances(study: optuna.Study, objectives: Sequence[str]) -> dict[str, float]:
-    n_finished = len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
-    if len(objectives) > 1 or n_finished < MIN_TRIALS_FOR_IMPORTANCE:
-        return {}
-    return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
 
 
 def _films(judged: Sequence[FrozenTrial]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -17,11 +17,13 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.console import print_where_to_look
+from armscan.errors import StorageAwayError
 from armscan.settings import report_command
 from armscan.sweeps.dashboard import dashboard_command
 from armscan.sweeps.judging import best_trials
 from armscan.sweeps.ledger import ENV_STEPS, FAILURE, LEASE, RETRIED, Ledger, Tally
 from armscan.sweeps.opening import OpenStudy
+from armscan.sweeps.patience import impatient
 from armscan.sweeps.settings import StudySettings
 from armscan.sweeps.storage import without_password
 from armscan.sweeps.values import overrides_of
@@ -57,15 +59,26 @@ class Screen:
         self._thread.join()
 
     def _show(self) -> None:
-        if not sys.stdout.isatty():
-            while not self._stopped.wait(REFRESH_S):
-                self._tell()
-            self._tell()
-            return
-        with Live(self._table(), refresh_per_second=1) as live:
-            while not self._stopped.wait(REFRESH_S):
-                live.update(self._table())
-            live.update(self._table())
+        # Nothing that is shown is worth waiting for: who leaves would wait for it, too.
+        with impatient():
+            if not sys.stdout.isatty():
+                self._repeat(self._tell)
+                return
+            with Live(refresh_per_second=1) as live:
+                self._repeat(lambda: live.update(self._table()))
+
+    def _repeat(self, show: Callable[[], None]) -> None:
+        """Shows how the study is going again and again; where its storage is away, that it is, and nothing new."""
+        is_away, is_last = False, False
+        while not is_last:
+            is_last = self._stopped.wait(REFRESH_S)
+            try:
+                show()
+                is_away = False
+            except StorageAwayError as error:
+                if not is_away:
+                    print(error, flush=True)
+                is_away = True
 
     def _ended(self) -> list[tuple[FrozenTrial, bool]]:
         """The trials that have ended, and whether they judge."""
@@ -168,7 +181,7 @@ def _print_verdicts(opened: OpenStudy) -> None:
     if not judged:
         return
     n_seeds = ", ".join(sorted({str(verdict.n_seeds) for verdict in judged}))
-    title = f"result: trained again with {n_seeds} other seeds, on the test volumes (95 % intervals)"
+    title = f"result: on the test volumes, other seeds: {n_seeds} (95 % intervals)"
     table = Table(title=title, title_justify="left")
     names = shown_of(judged[0])
     for heading in ("trial", *(name.removeprefix("test/").replace("_", " ") for name in names)):

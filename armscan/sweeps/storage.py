@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import optuna
 from filelock import FileLock
-from optuna.storages import BaseStorage, JournalStorage, RDBStorage
-from sqlalchemy import create_engine, inspect, text
+from optuna.storages import BaseStorage, JournalStorage
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.errors import StudyError
+from armscan.sweeps.database import DatabaseStorage, has_studies, open_database, url_of
 from armscan.sweeps.journal import open_journal, read_journal
 
+T = TypeVar("T")
 SQLITE_PREFIX = "sqlite:///"
-# One of a PostgreSQL database's advisory locks.
-ADVISORY_LOCK = 0xA235CA
-# One of the tables of Optuna.
-A_TABLE = "studies"
 MAX_REASON_CHARS = 300
 
 
@@ -40,26 +38,30 @@ class Storage:
     optuna: BaseStorage = field(repr=False)
     lock_file: Path | None
 
-    @contextlib.contextmanager
-    def alone(self) -> Iterator[None]:
-        """Keeps all other processes out while something is decided; short, because they wait."""
+    def alone(self, decide: Callable[[], T]) -> T:
+        """Keeps all other processes out while something is decided.
+
+        Args:
+            decide: what is done then; short, because the others wait. Where the storage goes away in the middle, it is
+                called again when it is back: then all that it did before is there, or nothing of it.
+
+        Returns:
+            What it returns.
+        """
         if self.lock_file is not None:
             with FileLock(self.lock_file):
-                yield
-            return
-        assert isinstance(self.optuna, RDBStorage)
-        with self.optuna.engine.connect() as connection, connection.begin():
-            # Freed when the transaction ends, also by the death of this process.
-            connection.execute(text(f"SELECT pg_advisory_xact_lock({ADVISORY_LOCK})"))
-            yield
+                return decide()
+        assert isinstance(self.optuna, DatabaseStorage)
+        return self.optuna.alone(decide)
 
 
-def open_storage(uri: str, *, where: str = "study.storage") -> Storage:
+def open_storage(uri: str, *, where: str = "study.storage", is_patient: bool = False) -> Storage:
     """Opens a storage, and makes one where there is none.
 
     Args:
         uri: the path of a journal file, `sqlite:///FILE`, or the URL of a PostgreSQL database.
         where: the user has given it, for messages.
+        is_patient: whether to wait for a database that is away; once it is open, it is waited for in any case.
 
     Raises:
         StudyError: if it cannot be reached or used.
@@ -67,7 +69,7 @@ def open_storage(uri: str, *, where: str = "study.storage") -> Storage:
     if is_journal(_checked(uri, where)):
         path = Path(uri).absolute()
         return _in_journal(path, open_journal(path, where))
-    return _open_database(uri, where)
+    return _open_database(uri, where, is_patient=is_patient)
 
 
 def existing_storage(uri: str, *, where: str = "study.storage") -> Storage | None:
@@ -100,7 +102,7 @@ def _is_there(path: Path, where: str) -> bool:
 
 
 def _in_journal(path: Path, journal: JournalStorage) -> Storage:
-    return Storage(str(path), journal, path.with_name(f".{path.name}.alone"))
+    return Storage(str(path), journal, _lock_file_of(path))
 
 
 def _checked(uri: Any, where: str) -> str:
@@ -110,76 +112,63 @@ def _checked(uri: Any, where: str) -> str:
     return uri
 
 
-def _open_database(uri: str, where: str) -> Storage:
-    database = _Database.of(uri, where)
-    with database.refused_in_one_line():
-        if database.lock_file is None:
-            return database.storage()
-        database.lock_file.parent.mkdir(parents=True, exist_ok=True)
+def _open_database(uri: str, where: str, *, is_patient: bool) -> Storage:
+    with _refused_in_one_line(uri, where):
+        if not uri.startswith(SQLITE_PREFIX):
+            return _in_database(uri, is_patient=is_patient)
+        file = _file_of(uri)
+        file.parent.mkdir(parents=True, exist_ok=True)
         # Processes that make the tables of a fresh file at once get into each other's way.
-        with FileLock(database.lock_file):
-            return database.storage()
+        with FileLock(_lock_file_of(file)):
+            return _in_database(uri, is_patient=is_patient)
 
 
 def _existing_database(uri: str, where: str) -> Storage | None:
-    database = _Database.of(uri, where)
-    with database.refused_in_one_line():
-        if uri.startswith(SQLITE_PREFIX) and not _is_there(Path(uri.removeprefix(SQLITE_PREFIX)).absolute(), where):
+    with _refused_in_one_line(uri, where):
+        if uri.startswith(SQLITE_PREFIX) and not _is_there(_file_of(uri), where):
             return None
-        engine = create_engine(database.uri, **database.options)
-        is_there = inspect(engine).has_table(A_TABLE)
-        engine.dispose()
-        return database.storage(skip_table_creation=True) if is_there else None
+        return _in_database(uri, is_made=False) if has_studies(url_of(uri)) else None
 
 
-@dataclass(frozen=True)
-class _Database:
-    """A database, before it is opened.
+def _in_database(uri: str, *, is_patient: bool = False, is_made: bool = True) -> Storage:
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    shown, lock_file = without_password(uri), None
+    if uri.startswith(SQLITE_PREFIX):
+        lock_file = _lock_file_of(_file_of(uri))
+        uri = f"{SQLITE_PREFIX}{_file_of(uri)}"
+    return Storage(shown, open_database(url_of(uri), shown, is_patient=is_patient, is_made=is_made), lock_file)
 
-    Args:
-        where: its address was given.
-        uri: its address.
-        lock_file: see `Storage`.
-        options: of the connections.
-    """
 
-    where: str
-    uri: str
-    lock_file: Path | None
-    options: Mapping[str, Any]
+def _file_of(uri: str) -> Path:
+    return Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
 
-    @classmethod
-    def of(cls, uri: str, where: str) -> Self:
-        """Returns the one at an address."""
-        logging.getLogger("alembic").setLevel(logging.WARNING)
-        if uri.startswith(SQLITE_PREFIX):
-            file = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
-            lock_file = file.with_name(f".{file.name}.alone")
-            return cls(where, f"{SQLITE_PREFIX}{file}", lock_file, {"pool_pre_ping": True})
-        if uri.startswith("postgresql"):
-            options = {"pool_pre_ping": True, "connect_args": {"connect_timeout": 10}}
-            return cls(where, uri, None, options)
-        shown = without_password(uri)
+
+def _lock_file_of(file: Path) -> Path:
+    return file.with_name(f".{file.name}.alone")
+
+
+@contextlib.contextmanager
+def _refused_in_one_line(uri: str, where: str) -> Iterator[None]:
+    """Answers what comes of a database that cannot be used."""
+    shown = without_password(uri)
+    if not uri.startswith((SQLITE_PREFIX, "postgresql")):
         raise StudyError(f"{where} is {shown!r}, but it must be a file, sqlite:///FILE or postgresql://...")
-
-    def storage(self, **options: Any) -> Storage:
-        """Returns the storage in it."""
-        opened = RDBStorage(self.uri, engine_kwargs=dict(self.options), **options)
-        return Storage(without_password(self.uri), opened, self.lock_file)
-
-    @contextlib.contextmanager
-    def refused_in_one_line(self) -> Iterator[None]:
-        """Answers what comes of a database that cannot be used."""
-        try:
-            yield
-        except (SQLAlchemyError, OSError, ImportError, RuntimeError) as error:
-            shown = without_password(self.uri)
-            reason = " ".join(str(error).split()).replace(self.uri, shown)[:MAX_REASON_CHARS]
-            raise StudyError(f"{self.where} is {shown!r}, but this storage cannot be used: {reason}") from error
+    try:
+        yield
+    except StudyError:
+        raise
+    except ModuleNotFoundError as error:
+        raise StudyError(
+            f"{where} is {shown!r}, but {error.name} is not installed: pip install 'armscan[postgres]'"
+        ) from error
+    except (SQLAlchemyError, OSError, ImportError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split()).replace(uri, shown)[:MAX_REASON_CHARS]
+        raise StudyError(f"{where} is {shown!r}, but this storage cannot be used: {reason}") from error
 
 
 def without_password(uri: str) -> str:
     """Returns an address as it may be shown."""
     scheme, separator, rest = uri.partition("://")
     account, at, host = rest.rpartition("@")
-    return f"{scheme}{separator}{account.partition(':')[0]}{at}{host}"
+    shown = f"{scheme}{separator}{account.partition(':')[0]}{at}{host}"
+    return re.sub(r"([?&])password=[^&]*&?", r"\1", shown).rstrip("?&")

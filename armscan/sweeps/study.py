@@ -46,9 +46,9 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
             configuration.
     """
     wanted = _wanted(settings, fixed)
-    with storage.alone():
-        names = optuna.get_all_study_names(storage.optuna)
-        if settings.name not in names:
+
+    def made() -> optuna.Study:
+        if settings.name not in optuna.get_all_study_names(storage.optuna):
             directions = [StudyDirection[each.upper()] for each in settings.objectives.values()]
             optuna.create_study(study_name=settings.name, storage=storage.optuna, directions=directions)
         study = open_study(storage, settings)
@@ -56,6 +56,9 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
         if not study.user_attrs.keys() >= wanted.keys() and not study.get_trials(deepcopy=False):
             for key, value in wanted.items():
                 study.set_user_attr(key, value)
+        return study
+
+    study = storage.alone(made)
     _check_same(settings, study, wanted)
     return study
 

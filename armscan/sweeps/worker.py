@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Sequence
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import optuna
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
+from armscan.errors import StorageAwayError
 from armscan.files import CONFIG_FILE, SUM_TAGS
 from armscan.mistakes import mistake_in_one_line
 from armscan.settings import plain
@@ -22,6 +22,7 @@ from armscan.sweeps.attempt import CONFIG_SUM, FOLDER, RUN, Attempt, composed, s
 from armscan.sweeps.dashboard import note_run, show_picture
 from armscan.sweeps.lease import Keeper, LimitReachedError
 from armscan.sweeps.ledger import ENV_STEPS, FIGURES, RETRY_OF
+from armscan.sweeps.log import say
 from armscan.sweeps.parts import make_sampler
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.values import overrides_of
@@ -73,7 +74,9 @@ class Worker:
             say(f"trial {trial.number} is handed back: {limit}")
             self._keeper.hand_back()
             self._tracked = None
-        # Whatever a trial raises is the trial's, and not the study's.
+        except StorageAwayError:
+            raise
+        # Whatever else a trial raises is the trial's, and not the study's.
         except Exception as error:
             line = mistake_in_one_line(error)
             if line is None:
@@ -195,11 +198,6 @@ def close_runs_of(trial: FrozenTrial, phase: Phase) -> None:
     for each in (*(child.info.run_id for child in children), run_id):
         client.set_tag(each, "failure", reason)
         client.set_terminated(each, "FAILED")
-
-
-def say(text: str) -> None:
-    """Writes a line into the worker's log."""
-    print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
 
 
 def _close(runs: Sequence[TrackedRun]) -> None:

@@ -7,9 +7,10 @@ from functools import partial
 
 from armscan.mistakes import quieten_libraries
 from armscan.sweeps.lease import Keeper
+from armscan.sweeps.log import say
 from armscan.sweeps.opening import open_for_work
 from armscan.sweeps.phases import Phase
-from armscan.sweeps.worker import Worker, close_runs_of, say
+from armscan.sweeps.worker import Worker, close_runs_of
 
 
 def work(words: Sequence[str], name: str, is_told_to_leave: Callable[[], bool], *, leave: Callable[[], None]) -> None:
@@ -20,9 +21,12 @@ def work(words: Sequence[str], name: str, is_told_to_leave: Callable[[], bool], 
         name: of the worker.
         is_told_to_leave: see `Keeper`.
         leave: likewise.
+
+    Raises:
+        StorageAwayError: if the storage is away for longer than a worker waits.
     """
     quieten_libraries()
-    opened = open_for_work(words)
+    opened = open_for_work(words, is_patient=True)
 
     def worked(phase: Phase) -> str:
         keeper = Keeper(

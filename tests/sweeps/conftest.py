@@ -5,11 +5,27 @@ import pytest
 
 from armscan.sweeps.ledger import Ledger, Limits
 from armscan.sweeps.storage import open_storage
+from tests.postgres import postgres_server, programs
 
 
-@pytest.fixture(params=["journal", "sqlite"])
+@pytest.fixture(scope="session")
+def postgres():
+    """A server for all tests of this process."""
+    if programs() is None:
+        pytest.skip("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
+    with postgres_server() as server:
+        yield server
+
+
+@pytest.fixture(params=["journal", "sqlite", "postgresql"])
 def storage_uri(request, tmp_path):
-    return {"journal": str(tmp_path / "a.journal"), "sqlite": f"sqlite:///{tmp_path}/a.db"}[request.param]
+    match request.param:
+        case "journal":
+            return str(tmp_path / "a.journal")
+        case "sqlite":
+            return f"sqlite:///{tmp_path}/a.db"
+        case _:
+            return request.getfixturevalue("postgres").make_database()
 
 
 @pytest.fixture

@@ -95,12 +95,14 @@ def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
     assert [row["key"] for row in rows(folder / "importances.csv")] == ["agent.lr"]
 
 
-@pytest.mark.parametrize(("objectives", "n_trials"), [(["mean_steps", "env_steps"], 5), (["mean_steps"], 0)])
+@pytest.mark.parametrize(("objectives", "n_trials"), [(["mean_steps", "env_steps"], 6), (["mean_steps"], 0)])
 def test_report_of_several_objectives_or_of_nothing_yet_can_be_made(answer, tmp_path, objectives, n_trials):
     searched(tmp_path, objectives, n_trials)
     assert answer("study=a", "out=here")[0] == 0
     page = (tmp_path / "here" / "report.html").read_text()
     assert ("Trials that no other is better than" if n_trials else "No trial has run to its end yet") in page
+    of_each = ["History", "Importance of each key", "Parallel coordinates", "Slices of the space"]
+    assert all(f"<h2>{what}: {name}</h2>" in page for what in of_each for name in objectives) == (n_trials > 0)
 
 
 def test_report_needs_only_to_read_the_storage(answer, tmp_path):

@@ -19,12 +19,14 @@ def test_storage_keeps_a_study_for_whoever_opens_it_next(storage_uri):
 
 
 def count_up(uri, path, n):
+    def count():
+        before = int(path.read_text())
+        time.sleep(0.002)
+        path.write_text(str(before + 1))
+
     storage = open_storage(uri)
     for _ in range(n):
-        with storage.alone():
-            count = int(path.read_text())
-            time.sleep(0.002)
-            path.write_text(str(count + 1))
+        storage.alone(count)
 
 
 def test_storage_lets_one_process_alone_at_a_time(storage_uri, tmp_path):
@@ -95,4 +97,8 @@ def test_storage_refuses_a_file_that_is_no_journal_and_leaves_it_as_it_is(tmp_pa
 
 def test_address_is_shown_without_its_password():
     assert without_password("postgresql://me:a:b@c@host:5432/db") == "postgresql://me@host:5432/db"
+    assert without_password("postgresql://host/db?user=me&password=a&sslmode=require") == (
+        "postgresql://host/db?user=me&sslmode=require"
+    )
+    assert without_password("postgresql://host/db?password=a") == "postgresql://host/db"
     assert without_password("sqlite:///a.db") == "sqlite:///a.db"

@@ -16,6 +16,7 @@ def settings(**changes):
         "name": "a",
         "storage": "optuna.journal",
         "folder": "studies/a",
+        "artifacts": "optuna.artifacts",
         "task": {"_target_": "armscan.sweeps.training.Training"},
         "space": Space.read({"agent.lr": {"low": 1e-4, "high": 1e-2}}),
         "objectives": {"mean_steps": "minimize"},
