@@ -5,7 +5,7 @@ claims the next one. All of that is the study's, but for what a single run of `a
 the task does between its begin and its end: environments and agent are built, the training is tracked, checkpoints are
 written, the learning curve is drawn. Within that the study's are the calls to the attempt (`OF_STUDY`): the composing
 of the configuration, which a single run does only once; the reports, with the pruner's answer; what is noted when a
-seed is done.
+seed is done; the picture for the dashboard.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from armscan.sweeps.ledger import FIGURES
 from armscan.sweeps.training import Training
 from benchmarks.studies import by_worker, finish
 
-OF_STUDY = ("config", "opened", "report", "keep_seed")
+OF_STUDY = ("config", "opened", "report", "keep_seed", "show_picture")
 N_WORKERS = 2
 # A minute of training for each trial, whatever its learning rate.
 TRAINING = (
-    *("study.task._target_=benchmarks.beside.TimedTraining", f"study.workers={N_WORKERS}", "training.env_steps=24000"),
+    *("study.task._target_=benchmarks.beside.TimedTraining", f"study.workers={N_WORKERS}", "training.env_steps=20000"),
     *("agent.updates_per_env_step=0.4", "agent.batch_size=128", "+study.sampler.n_startup_trials=1"),
 )
 
@@ -99,8 +99,8 @@ class Shares:
         return self.training_s + self.single_s + self.around_s + self.within_s
 
 
-def beside(folder: Path, *, trials: int = 6) -> None:
-    """Trains, and prints what the study took of each trial."""
+def beside(folder: Path, *, trials: int = 4) -> None:
+    """Trains, and prints what the study took of each trial; of more than five some would be pruned."""
     workers = by_worker(finish(folder, *TRAINING, f"study.n_trials={trials}")).values()
     shares = [Shares.of(trial) for of_worker in workers for trial in of_worker]
     between_s = [
