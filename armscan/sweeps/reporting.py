@@ -16,7 +16,7 @@ from plotly.offline import get_plotlyjs
 from armscan.sweeps.attempt import FOLDER, RUN
 from armscan.sweeps.charts import charts, importances
 from armscan.sweeps.judging import best_trials
-from armscan.sweeps.ledger import ENV_STEPS, FAILURE, FIGURES, JUDGED, RETRY_OF, Tally
+from armscan.sweeps.ledger import ENV_STEPS, FAILURE, FIGURES, JUDGED, RETRIED, RETRY_OF, Tally
 from armscan.sweeps.values import overrides_of
 from armscan.sweeps.verdict import Verdict, shown_of, verdicts
 
@@ -54,6 +54,7 @@ def write_report(study: optuna.Study, judged: Sequence[FrozenTrial], folder: Pat
             for trial in trials
             for step, value in trial.intermediate_values.items()
         ],
+        "endings": _endings(trials),
         "failures": [_failure_row(trial) for trial in trials if trial.state == TrialState.FAIL],
         "result": [row for verdict in found for row in _verdict_rows(verdict)],
         "importances": importances(study, objectives),
@@ -66,6 +67,8 @@ def write_report(study: optuna.Study, judged: Sequence[FrozenTrial], folder: Pat
         _table(_result_rows(found, trials)) if found else "<p>Nothing has been judged yet.</p>",
         _films(judged),
         *charts(study, objectives, tables["importances"]),
+        "<h2>How trials have ended</h2>",
+        _table(tables["endings"]) if trials else "<p>No trial has been begun.</p>",
         "<h2>Failures</h2>",
         _table(tables["failures"]) if tables["failures"] else "<p>No trial has failed.</p>",
         "<h2>Numbers</h2><ul>" + "".join(f'<li><a href="{each}.csv">{each}.csv</a></li>' for each in tables) + "</ul>",
@@ -118,6 +121,24 @@ def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> dict[str, Any]:
         **trial.params,
         **told,
     }
+
+
+def _endings(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
+    """Returns how many trials have ended in each way, and for which cause."""
+    of_ending: dict[tuple[str, str], list[int]] = {}
+    for trial in trials:
+        cause = ""
+        if trial.state == TrialState.FAIL:
+            cause = str(trial.user_attrs.get(FAILURE, "not known")) + (
+                ", taken up again" if RETRIED in trial.user_attrs else ""
+            )
+        elif trial.state == TrialState.PRUNED:
+            cause = f"behind the others at environment step {trial.last_step}"
+        of_ending.setdefault((trial.state.name.lower(), cause), []).append(trial.number)
+    return [
+        {"ending": ending, "cause": cause, "trials": len(numbers), "which": " ".join(map(str, numbers))}
+        for (ending, cause), numbers in sorted(of_ending.items())
+    ]
 
 
 def _failure_row(trial: FrozenTrial) -> dict[str, Any]:

@@ -89,6 +89,11 @@ def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
     assert trials[2]["mean_steps"] == ""
     assert len(rows(folder / "reports.csv")) == 6
     assert rows(folder / "failures.csv")[0]["cause"] == "it <b>broke</b>"
+    assert [(row["ending"], row["cause"], row["which"]) for row in rows(folder / "endings.csv")] == [
+        ("complete", "", "0 3 4 5"),
+        ("fail", "it <b>broke</b>", "1"),
+        ("pruned", "behind the others at environment step 100", "2"),
+    ]
     (steps, success) = rows(folder / "result.csv")
     assert (steps["figure"], float(steps["mean"]), success["mean"]) == ("test/mean_steps", 2.5, "1.0")
     assert float(steps["low"]) < 2.5 < float(steps["high"])
