@@ -30,7 +30,7 @@ SECTIONS = (
     "compute",
 )
 SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
-EVALUATION_KEYS = ("episodes",)
+EVALUATION_KEYS, TRACKING_KEYS = ("episodes",), ("uri", "experiment", "artifacts")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +132,7 @@ def check_keys(config: DictConfig) -> None:
     for node, where, allowed in (
         (config, "at the top", (*SECTIONS, *SINGLE_KEYS)),
         (config.evaluation, "in evaluation", EVALUATION_KEYS),
+        (config.tracking, "in tracking", TRACKING_KEYS),
     ):
         if unread := [key for key in node if key not in allowed]:
             raise InvalidValueError(f"there is no key {unread[0]!r} {where}, but only {listed(allowed)}")

@@ -20,6 +20,7 @@ from hydra.errors import (
 )
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from armscan.errors import ArmscanError, listed
 
@@ -56,6 +57,8 @@ def mistake_in_one_line(error: BaseException, words: Sequence[str] | None = None
             return f"{emptied} is None, but it must be {listed(_choices_of(emptied))}"
         case ValueError() if _is_raised_by_hydra(error):
             return " ".join(str(error).split())
+        case YAMLError() | UnicodeDecodeError():
+            return f"a file of the configuration cannot be read: {' '.join(str(error).split())}"
         case OSError() if error.filename is not None:
             return f"{error.filename}: {error.strerror}"
     return None
@@ -72,6 +75,8 @@ def quieten_libraries() -> None:
         warnings.filterwarnings("ignore", message=message)
     for category in (DeprecationWarning, FutureWarning, PendingDeprecationWarning):
         warnings.filterwarnings("ignore", category=category)
+    # What Hydra tells of a class that is not there is in the error, too.
+    logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
     logging.getLogger("tianshou").setLevel(logging.ERROR)
     logging.getLogger("sensai").setLevel(logging.ERROR)
 

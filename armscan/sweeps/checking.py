@@ -34,6 +34,6 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
         try:
             with_it, _ = composed([*words, *overrides])
             task.check(with_it)
-        except (ArmscanError, HydraException, OmegaConfBaseException) as error:
+        except (ArmscanError, HydraException, OmegaConfBaseException, ValueError) as error:
             line = mistake_in_one_line(error, [*words, *overrides]) or str(error)
             raise InvalidValueError(f"study.space: {' '.join(overrides)} is not allowed: {line}") from error

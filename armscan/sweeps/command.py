@@ -28,6 +28,7 @@ from armscan.sweeps.screen import Screen, print_result
 from armscan.sweeps.storage import without_password
 from armscan.sweeps.study import existing_study
 from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, keep_gpus, local_workers
+from armscan.sweeps.worker import close_runs_of
 
 LAUNCHERS_ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
 LEAVE_S = 4.0
@@ -99,7 +100,10 @@ def _leaving(opened: OpenStudy, folder: Path) -> Iterator[None]:
         (folder / STOP_FILE).touch()
         patience.start()
 
-    before = {each: signal.signal(each, ask) for each in (signal.SIGINT, signal.SIGTERM)}
+    asking = [signal.SIGINT, signal.SIGTERM]
+    # Its terminal was closed; where `nohup` has it go on, it does.
+    asking += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else []
+    before = {each: signal.signal(each, ask) for each in asking}
     try:
         yield
     except BaseException:
@@ -113,7 +117,9 @@ def _leaving(opened: OpenStudy, folder: Path) -> Iterator[None]:
         _end_workers(folder)
         # Where the storage is away, whoever goes on with the study does it.
         with contextlib.suppress(StorageAwayError), impatient():
-            opened.searching().ledger.reclaim(Witness().is_dead)
+            for phase in opened.begun():
+                for trial in phase.ledger.reclaim(Witness().is_dead):
+                    close_runs_of(trial, phase)
         opened.client.set_terminated(opened.run_id, "KILLED" if is_asked.is_set() else status)
         for each, handler in before.items():
             signal.signal(each, handler)

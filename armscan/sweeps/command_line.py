@@ -12,6 +12,7 @@ from hydra.core.override_parser.types import Override, QuotedString
 
 from armscan.errors import InvalidValueError
 from armscan.settings import MULTIRUN, RESUME
+from armscan.sweeps.space import NOT_SEARCHED
 from armscan.sweeps.values import written
 
 PLAN, SWEEPS, STUDY = "--plan", "sweeps", "study"
@@ -112,6 +113,10 @@ def _plain(value: Any) -> Any:
 
 def _check_single_values(overrides: Sequence[Override]) -> None:
     for override in overrides:
+        if override.is_sweep_override() and override.key_or_group.startswith(NOT_SEARCHED):
+            raise InvalidValueError(
+                f"{override.input_line!r} gives several values, but a study has one: 'KEY=[...]' is a list"
+            )
         if override.is_sweep_override():
             raise InvalidValueError(
                 f"{override.input_line!r} gives several values, but those of a study come from its space: give "

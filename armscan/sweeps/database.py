@@ -19,8 +19,6 @@ from armscan.sweeps.patience import ConnectionLostError, Patience
 T = TypeVar("T")
 # One of a PostgreSQL database's advisory locks.
 ADVISORY_LOCK = 0xA235CA
-# One of the tables of Optuna.
-A_TABLE = "studies"
 # Whoever holds it and is not heard of for so long, because its machine is gone, loses it with its connection.
 SILENT_S = 120
 # When a connection counts as lost on which nothing comes back: in seconds, but for the last one, in milliseconds.
@@ -159,11 +157,11 @@ def open_database(url: URL, shown: str, *, is_patient: bool, is_made: bool = Tru
     return cast(BaseStorage, opened)
 
 
-def has_studies(url: URL) -> bool:
-    """Whether a database has the tables of studies."""
+def tables_in(url: URL) -> list[str]:
+    """Returns the names of the tables of a database."""
     engine = create_engine(url, connect_args=TCP if url.get_backend_name() == "postgresql" else {})
     try:
-        return inspect(engine).has_table(A_TABLE)
+        return inspect(engine).get_table_names()
     finally:
         engine.dispose()
 

@@ -27,6 +27,7 @@ def open_journal(path: Path, where: str) -> JournalStorage:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
+        JournalLock(path).touch()
     except OSError as error:
         raise StudyError(f"{where} is {str(path)!r}, but no file can be used there ({error.strerror})") from error
     # Before anything is mended: any other file would lose what stands behind its last line's end.
@@ -85,6 +86,10 @@ class JournalLock(JournalFileOpenLock):
         super().__init__(str(journal))
         self._journal = journal
         self._lock = FileLock(journal.with_name(f".{journal.name}.lock"))
+
+    def touch(self) -> None:
+        """Makes the file of the lock: one that cannot be made would be waited for for ever."""
+        Path(self._lock.lock_file).touch()
 
     def acquire(self) -> bool:
         """Waits for the lock."""

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import optuna
 from mlflow import MlflowClient
 from omegaconf import DictConfig
 
@@ -88,7 +89,21 @@ class OpenStudy:
     def judging(self) -> Phase:
         """The phase in which the best configurations are judged; begun when the searching is over."""
         searching = self.searching()
-        study = make_judging_study(self.storage, self.settings, searching.ledger.study)
+        return self._judging(searching, make_judging_study(self.storage, self.settings, searching.ledger.study))
+
+    def judged(self) -> optuna.Study | None:
+        """The study of the trainings that judge, None where it has not been begun."""
+        name = self.settings.judged_name
+        if name not in optuna.get_all_study_names(self.storage.optuna):
+            return None
+        return optuna.load_study(study_name=name, storage=self.storage.optuna)
+
+    def begun(self) -> list[Phase]:
+        """The phases that have been begun."""
+        searching, judged = self.searching(), self.judged()
+        return [searching, *([] if judged is None else [self._judging(searching, judged)])]
+
+    def _judging(self, searching: Phase, study: optuna.Study) -> Phase:
         limits = Limits(n_trials=NO_END, max_failures=self.settings.max_failures, max_retries=self.settings.max_retries)
         return dataclasses.replace(
             searching,
@@ -113,11 +128,33 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
         raise InvalidValueError("there is no study in the configuration: give sweeps=NAME of a file with one")
     settings = StudySettings.read(section, fixed_by(words))
     make_sampler(settings.sampler, settings.seed), make_pruner(settings.pruner)
+    for name in ("folder", "artifacts"):
+        check_folder(f"study.{name}", getattr(settings, name))
     task = make_task(settings.task)
     for name in settings.objectives:
         if name not in task.figures:
             raise InvalidValueError(f"study.objectives names {name!r}, but a trial returns only {listed(task.figures)}")
     return settings, task, composed(words)[0]
+
+
+def check_folder(where: str, folder: str) -> None:
+    """Raises `StudyError` where something that is no folder is, or stands in the way."""
+    path = Path(folder).absolute()
+    there = next(each for each in (path, *path.parents) if each.exists())
+    if not there.is_dir():
+        raise StudyError(f"{where} is {folder!r}, but {str(there)!r} is no folder")
+
+
+def make_folder(where: str, folder: str) -> None:
+    """Makes a folder where there is none.
+
+    Raises:
+        StudyError: if that cannot be.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StudyError(f"{where} is {folder!r}, but no folder can be made there ({error.strerror})") from error
 
 
 def open_for_work(words: Sequence[str], *, is_patient: bool = False) -> OpenStudy:
@@ -133,13 +170,9 @@ def open_for_work(words: Sequence[str], *, is_patient: bool = False) -> OpenStud
         TrackingError: if the tracking store cannot be used.
     """
     settings, task, config = read_settings(words)
-    try:
-        Path(settings.folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StudyError(
-            f"study.folder is {settings.folder!r}, but no folder can be made there ({error.strerror})"
-        ) from error
     client, experiment_id = open_store(**plain(config.tracking))
+    for name in ("folder", "artifacts"):
+        make_folder(f"study.{name}", getattr(settings, name))
     storage = open_storage(settings.storage, is_patient=is_patient)
     study = make_study(storage, settings, plain(config))
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import optuna
 from optuna.trial import FrozenTrial, TrialState
 from rich.console import Console
 from rich.live import Live
@@ -83,7 +82,7 @@ class Screen:
     def _ended(self) -> list[tuple[FrozenTrial, bool]]:
         """The trials that have ended, and whether they judge."""
         studies = [(self._ledger.study, False)]
-        if (judging := judging_study(self._opened)) is not None:
+        if (judging := self._opened.judged()) is not None:
             studies.append((judging, True))
         return [
             (trial, is_judging)
@@ -104,7 +103,7 @@ class Screen:
         table = Table(title=Text(summary(self._ledger, tally, settings)), title_justify="left")
         for heading in ("worker", "trial", "seed", "environment steps", "return"):
             table.add_column(heading, justify="left" if heading == "worker" else "right")
-        judging = judging_study(self._opened)
+        judging = self._opened.judged()
         running = [("", trial) for trial in tally.running]
         if judging is not None:
             running += [("judging ", trial) for trial in Tally.of(judging.get_trials(deepcopy=False)).running]
@@ -113,14 +112,6 @@ class Screen:
             shown = (lease.get("seed", "-"), lease.get(ENV_STEPS, "-"), f"{lease.get('return', float('nan')):.2f}")
             table.add_row(lease.get("worker", "?").rpartition("/")[2], f"{what}{trial.number}", *map(str, shown))
         return table
-
-
-def judging_study(opened: OpenStudy) -> optuna.Study | None:
-    """Returns the study of the trainings that judge, None where it has not been begun."""
-    name = opened.settings.judged_name
-    if name not in optuna.get_all_study_names(opened.storage.optuna):
-        return None
-    return optuna.load_study(study_name=name, storage=opened.storage.optuna)
 
 
 def summary(ledger: Ledger, tally: Tally, settings: StudySettings) -> str:
@@ -155,8 +146,8 @@ def print_result(opened: OpenStudy) -> int:
     ledger, settings = opened.searching().ledger, opened.settings
     tally = ledger.tally()
     print(summary(ledger, tally, settings))
-    if broken := ledger.broken(tally):
-        print(f"error: {broken}", file=sys.stderr)
+    if wrong := ledger.broken(tally) or _unfinished(opened, ledger, tally):
+        print(f"error: {wrong}", file=sys.stderr)
         return 1
     table = Table(title="best while searching", title_justify="left")
     for heading in ("trial", *settings.objectives, "values"):
@@ -166,20 +157,34 @@ def print_result(opened: OpenStudy) -> int:
             str(trial.number), *(f"{value:.4g}" for value in trial.values), " ".join(overrides_of(trial.params))
         )
     Console().print(table)
-    _print_verdicts(opened)
+    is_judged = _print_verdicts(opened)
     print_where_to_look(opened.folder, opened.config.tracking.uri)
     storage = without_password(settings.storage)
     print(f"studies   {dashboard_command(storage, settings.artifacts)}")
     print(f"report    {report_command(settings.name, storage)}")
-    return 0
+    return 0 if is_judged else 1
 
 
-def _print_verdicts(opened: OpenStudy) -> None:
-    """Prints the table that is the result of a study, where anything was judged."""
-    study = judging_study(opened)
-    judged = verdicts(study.get_trials(deepcopy=False)) if study is not None else []
+def _unfinished(opened: OpenStudy, ledger: Ledger, tally: Tally) -> str | None:
+    """Returns what to say of a study that has ended without an end."""
+    if ledger.end(tally) is not None:
+        return None
+    return (
+        f"all workers have ended, but only {len(tally.finished)} of {opened.settings.n_trials} trials have finished: "
+        f"their logs in {opened.folder / 'workers'} say why; the same command goes on"
+    )
+
+
+def _print_verdicts(opened: OpenStudy) -> bool:
+    """Prints the table that is the result of a study, where it is to be judged; returns whether anything was."""
+    study = opened.judged()
+    tally = Tally.of(study.get_trials(deepcopy=False) if study is not None else ())
+    if opened.settings.judging.best and tally.failed:
+        reason = tally.failed[0].user_attrs.get(FAILURE)
+        print(f"error: {len(tally.failed)} of the trials that judge have failed: {reason}", file=sys.stderr)
+    judged = verdicts(tally.finished)
     if not judged:
-        return
+        return not opened.settings.judging.best
     n_seeds = ", ".join(sorted({str(verdict.n_seeds) for verdict in judged}))
     title = f"result: on the test volumes, other seeds: {n_seeds} (95 % intervals)"
     table = Table(title=title, title_justify="left")
@@ -189,6 +194,7 @@ def _print_verdicts(opened: OpenStudy) -> None:
     for verdict in judged:
         table.add_row(str(verdict.number), *(verdict.text(name).replace(" (", "\n(") for name in names))
     Console().print(table)
+    return True
 
 
 def _values(trial: FrozenTrial, objectives: Sequence[str]) -> str:

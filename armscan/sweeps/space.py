@@ -21,6 +21,8 @@ from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.values import Value, as_kept
 
 RANGE_KEYS, CHOICE_KEYS = ("low", "high", "log", "step", "when"), ("choices", "when")
+# Of one step: what decimal fractions are off in binary ones.
+STEP_TOLERANCE = 1e-6
 OWN_KEYS = {*RANGE_KEYS, *CHOICE_KEYS}
 # Whatever begins with one of these.
 NOT_SEARCHED = ("study", "sweeps", "tracking", "hydra", "seed")
@@ -127,7 +129,11 @@ class Space:
                     raise InvalidValueError(f"{where} is {wrong[0]!r}, but it must be {listed(before[name])}")
             if isinstance(parameter.distribution, CategoricalDistribution):
                 before[parameter.name] = tuple(parameter.distribution.choices)
-        return cls(parameters)
+        space = cls(parameters)
+        for parameter in parameters:
+            if space._with_needs({parameter.name: parameter.extremes()[0]}) is None:
+                raise InvalidValueError(f"study.space.{parameter.name}.when can never hold, for what its keys need")
+        return space
 
     def suggest(self, trial: BaseTrial) -> dict[str, Value]:
         """Returns the values of a trial by name."""
@@ -142,14 +148,24 @@ class Space:
 
         Where a parameter needs choices of others, these stand with it.
         """
-        beside: dict[str, dict[str, Value]] = {}
         for parameter in self.parameters:
-            needed: dict[str, Value] = {}
-            for name, values in parameter.when.items():
-                needed |= beside[name] | {name: values[0]}
-            beside[parameter.name] = needed
             for value in parameter.extremes():
-                yield needed | {parameter.name: value}
+                chosen = self._with_needs({parameter.name: value})
+                assert chosen is not None
+                yield chosen
+
+    def _with_needs(self, chosen: Mapping[str, Value]) -> dict[str, Value] | None:
+        """Returns choices with those that they need beside them, None where no choice is allowed by all."""
+        for parameter in self.parameters:
+            if parameter.name not in chosen:
+                continue
+            for name, values in parameter.when.items():
+                if name not in chosen:
+                    tried = (self._with_needs({name: value, **chosen}) for value in values)
+                    return next((each for each in tried if each is not None), None)
+                if chosen[name] not in values:
+                    return None
+        return dict(chosen)
 
     def without(self, fixed: Mapping[str, Any]) -> Space:
         """Returns the space without keys that somebody has given values, and without what needs other values."""
@@ -221,9 +237,19 @@ def _range(where: str, described: Mapping[str, Any]) -> BaseDistribution:
         raise InvalidValueError(f"{where}.step is {step!r}, but a range with log has no step")
     if is_whole:
         size = 1 if step is None else check_int(f"{where}.step", step, at_least=1, at_most=int(high - low))
+        _check_steps(where, low, high, size)
         return IntDistribution(int(low), int(high), log=log, step=size)
     size_of_step = None if step is None else check_float(f"{where}.step", step, above=0.0, at_most=high - low)
+    _check_steps(where, low, high, size_of_step)
     return FloatDistribution(low, high, log=log, step=size_of_step)
+
+
+def _check_steps(where: str, low: float, high: float, step: float | None) -> None:
+    """Raises `InvalidValueError` where steps from the lower end do not meet the upper one."""
+    n_steps = (high - low) / (step or 1.0)
+    if step is not None and abs(n_steps - round(n_steps)) > STEP_TOLERANCE:
+        last = low + int(n_steps) * step
+        raise InvalidValueError(f"{where}.high is {high:g}, but steps of {step:g} from {low:g} end at {last:g}")
 
 
 def _conditions(where: str, when: Any) -> dict[str, tuple[Value, ...]]:
@@ -232,4 +258,6 @@ def _conditions(where: str, when: Any) -> dict[str, tuple[Value, ...]]:
     if not isinstance(when, Mapping) or not when:
         raise InvalidValueError(f"{where}.when is {when!r}, but it must say which choice of which key is needed")
     several = {name: values if isinstance(values, list | tuple) else [values] for name, values in when.items()}
+    if empty := [name for name, values in several.items() if not values]:
+        raise InvalidValueError(f"{where}.when.{empty[0]} is [], but it must be a choice, or a list of several")
     return {str(name): tuple(map(as_kept, values)) for name, values in several.items()}

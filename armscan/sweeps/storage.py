@@ -12,16 +12,19 @@ from typing import Any, TypeVar
 
 import optuna
 from filelock import FileLock
+from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage, JournalStorage
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.errors import StudyError
-from armscan.sweeps.database import DatabaseStorage, has_studies, open_database, url_of
+from armscan.sweeps.database import DatabaseStorage, open_database, tables_in, url_of
 from armscan.sweeps.journal import open_journal, read_journal
 
 T = TypeVar("T")
 SQLITE_PREFIX = "sqlite:///"
 MAX_REASON_CHARS = 300
+# Of the tables of Optuna.
+A_TABLE, OTHER_TABLES = "studies", ("trials", "version_info")
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ def is_journal(uri: str) -> bool:
 def _is_there(path: Path, where: str) -> bool:
     """Whether there is a file; refused, where none could be."""
     above = next(each for each in path.parents if each.exists())
-    if path.is_dir() or not above.is_dir():
+    if (path.exists() and not path.is_file()) or not above.is_dir():
         raise StudyError(f"{where} is {str(path)!r}, but no file can be used there")
     return path.is_file()
 
@@ -118,8 +121,11 @@ def _open_database(uri: str, where: str, *, is_patient: bool) -> Storage:
             return _in_database(uri, is_patient=is_patient)
         file = _file_of(uri)
         file.parent.mkdir(parents=True, exist_ok=True)
+        # A lock that cannot be made would be waited for for ever.
+        _lock_file_of(file).touch()
         # Processes that make the tables of a fresh file at once get into each other's way.
         with FileLock(_lock_file_of(file)):
+            _check_is_for_studies(uri)
             return _in_database(uri, is_patient=is_patient)
 
 
@@ -127,7 +133,15 @@ def _existing_database(uri: str, where: str) -> Storage | None:
     with _refused_in_one_line(uri, where):
         if uri.startswith(SQLITE_PREFIX) and not _is_there(_file_of(uri), where):
             return None
-        return _in_database(uri, is_made=False) if has_studies(url_of(uri)) else None
+        _check_is_for_studies(uri)
+        return _in_database(uri, is_made=False) if A_TABLE in tables_in(url_of(uri)) else None
+
+
+def _check_is_for_studies(uri: str) -> None:
+    """Raises `ValueError` where a file of SQLite is somebody else's."""
+    tables = tables_in(url_of(uri)) if uri.startswith(SQLITE_PREFIX) else []
+    if tables and not {A_TABLE, *OTHER_TABLES} <= set(tables):
+        raise ValueError(f"it holds other tables, {tables[0]} first: give a file of its own")
 
 
 def _in_database(uri: str, *, is_patient: bool = False, is_made: bool = True) -> Storage:
@@ -161,7 +175,7 @@ def _refused_in_one_line(uri: str, where: str) -> Iterator[None]:
         raise StudyError(
             f"{where} is {shown!r}, but {error.name} is not installed: pip install 'armscan[postgres]'"
         ) from error
-    except (SQLAlchemyError, OSError, ImportError, RuntimeError, ValueError) as error:
+    except (SQLAlchemyError, StorageInternalError, OSError, ImportError, RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split()).replace(uri, shown)[:MAX_REASON_CHARS]
         raise StudyError(f"{where} is {shown!r}, but this storage cannot be used: {reason}") from error
 

@@ -26,10 +26,15 @@ from armscan.sweeps.command_line import words_of_trials
 from armscan.sweeps.lease import process_start
 
 LAUNCHER_FILE, STOP_FILE = "launcher.json", "stop"
-LEFT = 130
+# The exit codes of a worker that was told to leave, that its storage was away from for too long, and of all that have
+# ended by themselves.
+LEFT, AWAY = 130, 75
+ENDS = (0, LEFT, AWAY)
 GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"
 # A worker that dies again and again does no work; its trials have long been given up by then.
 MAX_RESTARTS = 100
+# One that was not killed, but has crashed, will crash again.
+MAX_ERRORS = 5
 WORKER_PROGRAM = """
 try:
     from armscan.sweeps.supervising import worker_main
@@ -105,6 +110,7 @@ def supervise(words: Sequence[str], number: int, folder: Path) -> None:
         # A Ctrl-C reaches all processes of a terminal, but it is the launcher that asks the workers to leave.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     with (folder / f"worker-{number}.log").open("ab") as log:
+        n_errors = 0
         for _ in range(MAX_RESTARTS):
             if launcher.is_gone or (folder / STOP_FILE).exists():
                 return
@@ -118,7 +124,11 @@ def supervise(words: Sequence[str], number: int, folder: Path) -> None:
                 start_new_session=True,
                 check=False,
             )
-            if ended.returncode >= 0:
+            if ended.returncode in ENDS:
+                return
+            if ended.returncode > 0:
+                n_errors += 1
+            if n_errors == MAX_ERRORS:
                 return
 
 
@@ -159,4 +169,4 @@ def worker_main() -> None:
         work(words, f"{folder.name}/{number}", is_told_to_leave, leave=lambda: os._exit(LEFT))
     except StorageAwayError as error:
         say(str(error))
-        raise SystemExit(1) from error
+        raise SystemExit(AWAY) from error

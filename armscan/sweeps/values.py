@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 PLAIN_TEXT = re.compile(r"[A-Za-z_][\w./\-]*")
+BEFORE_QUOTE = re.compile(r"(\\+)('|$)")
+OTHER_THAN_TEXTS = ("true", "false", "null", "nan", "inf")
 Value = bool | int | float | str | None
 
 
@@ -31,7 +33,13 @@ def written(value: Any) -> str:
         return f"[{','.join(map(written, value))}]"
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{key}:{written(each)}" for key, each in value.items()) + "}"
-    if isinstance(value, str) and not PLAIN_TEXT.fullmatch(value) and not value.startswith(("[", "{")):
-        escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+    if isinstance(value, str) and not _is_plain(value):
+        # Hydra takes a backslash for itself, but before a quote.
+        escaped = BEFORE_QUOTE.sub(r"\1\1\2", value).replace("'", "\\'")
         return f"'{escaped}'"
     return str(value)
+
+
+def _is_plain(text: str) -> bool:
+    """Whether a text needs no quotes, because nothing but a text is read in it, or because it is that of a list."""
+    return text.startswith(("[", "{")) or (bool(PLAIN_TEXT.fullmatch(text)) and text.lower() not in OTHER_THAN_TEXTS)

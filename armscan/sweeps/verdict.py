@@ -60,6 +60,8 @@ def verdicts(judged: Sequence[FrozenTrial], *, seed: int = 0) -> list[Verdict]:
 
 
 def _verdict(number: int, of_seeds: Sequence[Mapping[str, float]], seed: int) -> Verdict:
+    common = set.intersection(*map(set, of_seeds))
+    of_seeds = [{name: figure for name, figure in figures.items() if name in common} for figures in of_seeds]
     names = [name for name in of_seeds[0] if name.startswith("test/") and not OF_VOLUME.fullmatch(name)]
     return Verdict(number, len(of_seeds), {name: _interval(name, _scores(name, of_seeds), seed) for name in names})
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ import optuna
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from armscan.errors import StorageAwayError
+from armscan.checks import check_float
+from armscan.errors import InvalidValueError, StorageAwayError, listed
 from armscan.files import CONFIG_FILE, SUM_TAGS
 from armscan.mistakes import mistake_in_one_line
 from armscan.settings import plain
@@ -63,8 +65,7 @@ class Worker:
     def _run(self, trial: Trial) -> None:
         say(f"trial {trial.number} begins")
         try:
-            figures = self._figures(trial)
-            values = [figures[name] for name in self._phase.objectives]
+            figures = checked_figures(self._figures(trial), self._phase.objectives)
         except optuna.TrialPruned:
             self._tell(trial, TrialState.PRUNED)
         except UpdateFinishedTrialError:
@@ -76,18 +77,15 @@ class Worker:
             self._tracked = None
         except StorageAwayError:
             raise
-        # Whatever else a trial raises is the trial's, and not the study's.
-        except Exception as error:
+        # Whatever else a trial raises is the trial's, and not the study's; this process is told to leave otherwise.
+        except (Exception, SystemExit, KeyboardInterrupt) as error:
             line = mistake_in_one_line(error)
             if line is None:
                 traceback.print_exc()
             self._fail(trial, line or repr(error))
         else:
-            if wrong := [name for name in self._phase.objectives if figures[name] != figures[name]]:
-                self._fail(trial, f"its {wrong[0]} is not a number")
-            else:
-                trial.set_user_attr(FIGURES, figures)
-                self._tell(trial, TrialState.COMPLETE, values)
+            trial.set_user_attr(FIGURES, figures)
+            self._tell(trial, TrialState.COMPLETE, [figures[name] for name in self._phase.objectives])
 
     def _figures(self, trial: Trial) -> dict[str, float]:
         phase = self._phase
@@ -100,6 +98,7 @@ class Worker:
         folder.mkdir(parents=True, exist_ok=True)
         config_sum = sum_of_config(plain(config))
         self._tracked = self._begun(trial, chosen, folder, config_sum)
+        self._opened(None)
         for name, value in ((FOLDER, str(folder)), (CONFIG_SUM, config_sum)):
             if trial.user_attrs.get(name) != value:
                 trial.set_user_attr(name, value)
@@ -146,7 +145,6 @@ class Worker:
             )
             trial.set_user_attr(RUN, tracked.run_id)
             note_run(trial, phase.client, phase.experiment_id, tracked.run_id, folder)
-        self._opened(None)
         return tracked
 
     def _opened(self, training: TrackedRun | None) -> None:
@@ -184,6 +182,28 @@ class Worker:
         if self._tracked is not None:
             self._tracked.end("FAILED", reason="taken over by another worker")
         self._tracked = None
+
+
+def checked_figures(figures: Any, objectives: Sequence[str]) -> dict[str, float]:
+    """Returns what a task has returned.
+
+    Args:
+        figures: by name; those that are no objectives may be NaN.
+        objectives: the names of those that must be there, and finite.
+
+    Raises:
+        InvalidValueError: if it is anything else.
+    """
+    if not isinstance(figures, Mapping):
+        raise InvalidValueError(f"the task has returned {figures!r}, but it must be figures by their names")
+    if missing := [name for name in objectives if name not in figures]:
+        raise InvalidValueError(f"the task has not returned {missing[0]}, but only {listed(list(figures))}")
+    for name, figure in figures.items():
+        if name in objectives:
+            check_float(f"what the task has returned as {name}", figure)
+        elif not isinstance(figure, Real):
+            raise InvalidValueError(f"what the task has returned as {name} is {figure!r}, but it must be a number")
+    return {str(name): float(figure) for name, figure in figures.items()}
 
 
 def close_runs_of(trial: FrozenTrial, phase: Phase) -> None:

@@ -90,9 +90,9 @@ def _open_locked(uri: str, experiment: str, artifacts: str) -> tuple[MlflowClien
     # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
     database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
     database.parent.mkdir(parents=True, exist_ok=True)
+    # MLflow would try for minutes to open what cannot be opened, and the lock for ever to be made.
+    database.open("ab").close()
     with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
-        # MLflow would try for minutes to open what cannot be opened.
-        database.open("ab").close()
         return _open(f"{SQLITE_PREFIX}{database}", experiment, artifacts)
 
 

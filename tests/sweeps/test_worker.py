@@ -1,0 +1,108 @@
+"""A worker and its trials, which train nothing here: what they draw, what becomes of those that fail."""
+
+import os
+from pathlib import Path
+
+import optuna
+import pytest
+
+from armscan.sweeps.judging import best_trials
+from armscan.sweeps.lease import Keeper
+from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.phases import Phase
+from armscan.sweeps.space import Space
+from armscan.sweeps.storage import open_storage
+from armscan.sweeps.worker import Worker
+from armscan.tracking import open_store
+
+SPACE = {"agent.lr": {"low": 1e-4, "high": 1e-2, "log": True}, "agent.batch_size": {"choices": [64, 128, 256]}}
+TPE = {"_target_": "optuna.samplers.TPESampler", "n_startup_trials": 2, "multivariate": True}
+RANDOM = {"_target_": "optuna.samplers.RandomSampler"}
+
+
+def far_from_a_thousandth(attempt):
+    config, _ = attempt.config(attempt.seeds[0])
+    return {"mean_steps": abs(config.agent.lr - 1e-3)}
+
+
+@pytest.fixture
+def work(tmp_path):
+    """Lets one worker run a study in a folder of its own; returns the study."""
+
+    def run_study(folder, run=far_from_a_thousandth, *, sampler=RANDOM, seed=0, **limits):
+        folder = tmp_path / folder
+        storage = open_storage(str(folder / "optuna.journal"))
+        study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
+        client, experiment_id = open_store(f"sqlite:///{folder}/a.db", experiment="a", artifacts=str(folder / "b"))
+        phase = Phase(
+            name="a",
+            ledger=Ledger(study, storage, Limits(**{"n_trials": 5} | limits)),
+            space=Space.read(SPACE),
+            objectives=("mean_steps",),
+            reported=None,
+            run=run,
+            seeds_of=lambda _: (0,),
+            sampler=sampler,
+            seed=seed,
+            folder=folder,
+            artifacts=folder / "artifacts",
+            storage_uri=storage.uri,
+            client=client,
+            experiment_id=experiment_id,
+            run_id=client.create_run(experiment_id).info.run_id,
+        )
+        keeper = Keeper(
+            phase.ledger, "0", is_told_to_leave=lambda: False, leave=lambda: os._exit(1), on_death=lambda _: None
+        )
+        with keeper.at_work():
+            Worker(phase, ["data.n_training=1"], keeper).work()
+        return study
+
+    return run_study
+
+
+@pytest.mark.parametrize("sampler", [RANDOM, TPE], ids=["random", "tpe"])
+def test_worker_alone_draws_the_same_points_again_from_the_same_seed_and_others_from_another(work, sampler):
+    points = [
+        [trial.params for trial in work(folder, sampler=sampler, seed=seed).trials]
+        for folder, seed in (("first", 0), ("again", 0), ("other", 1))
+    ]
+    assert points[0] == points[1]
+    assert len({point["agent.lr"] for point in points[0] + points[2]}) == 10
+
+
+def test_worker_goes_on_after_a_trial_that_raised_and_says_what_it_raised(work):
+    seen = []
+
+    def second_raises(attempt):
+        seen.append(attempt.trial.number)
+        if len(seen) == 2:
+            raise RuntimeError("the second one")
+        return far_from_a_thousandth(attempt)
+
+    study = work("a", second_raises, n_trials=3)
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE", "FAIL", "COMPLETE", "COMPLETE"]
+    assert "the second one" in study.trials[1].user_attrs["failure"]
+    assert Path(study.trials[1].user_attrs["folder"]).name == "0001"
+
+
+def test_worker_ends_a_study_whose_configuration_fails_at_once_and_one_with_too_many_failures(work):
+    def raises(_):
+        raise RuntimeError("always")
+
+    def every_second_raises(attempt):
+        if attempt.trial.number % 2:
+            raise RuntimeError("odd")
+        return far_from_a_thousandth(attempt)
+
+    assert [trial.state.name for trial in work("a", raises, n_trials=100).trials] == ["FAIL"] * 3
+    study = work("b", every_second_raises, n_trials=100, max_failures=4)
+    assert sorted(trial.state.name for trial in study.trials) == ["COMPLETE"] * 5 + ["FAIL"] * 5
+
+
+@pytest.mark.parametrize("value", [float("nan"), None, "fast"])
+def test_worker_fails_a_trial_whose_value_is_no_number(work, value):
+    study = work("a", lambda _: {"mean_steps": value})
+    assert {trial.state.name for trial in study.trials} == {"FAIL"}
+    assert "mean_steps" in study.trials[0].user_attrs["failure"]
+    assert best_trials(study, 1) == []
