@@ -14,6 +14,7 @@ from hydra.errors import HydraException
 from mlflow import MlflowClient
 from optuna.artifacts import get_all_artifact_meta
 from optuna_dashboard._note import get_note_from_system_attrs
+from yaml import YAMLError
 
 from armscan.errors import ArmscanError, StudyError
 from armscan.mistakes import mistake_in_one_line
@@ -172,6 +173,11 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
         (["-m", "sweeps=sac_y", "hydra.searchpath=[/nowhere]"], "hydra.searchpath names '/nowhere', but there is no"),
         (["-m", "sweeps=sac_y", "study=null"], "study is a section of the configuration: give its keys, such as"),
         (["-m", "sweeps=sac_y", "agent.lr=1,2"], "'agent.lr=1,2' gives several values, but those of a study come"),
+        (["-m", "sweeps=sac_y", "study.seeds=0,1"], "'study.seeds=0,1' gives several values, but a study has one"),
+        (["-m", "sweeps=sac_y", "+tracking.foo=1"], "there is no key 'foo' in tracking, but only uri, experiment or"),
+        (["-m", "sweeps=sac_y", "study.folder=/dev/null"], "study.folder is '/dev/null', but '/dev/null' is no folder"),
+        (["-m", "sweeps=sac_y", "study.artifacts=/dev/null/a"], "study.artifacts is '/dev/null/a', but '/dev/null' is"),
+        (["-m", "sweeps=sac_y", "study.space.agent.choices=[null]"], "study.space: agent=null is not allowed: "),
         (["-m", "sweeps=sac_y", "+study.foo=1"], "there is no key 'foo' in study, but only "),
         (
             ["-m", "sweeps=sac_y", "study.n_trials=0"],
@@ -251,6 +257,18 @@ def test_study_answers_mistakes_in_one_line_before_anything_is_there(tmp_path, m
     assert "\n" not in answer
     assert "secret" not in answer
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("contents", ["a: [", "a: 1\na: 2\n", "\xff"], ids=["syntax", "twice", "no text"])
+def test_study_answers_a_damaged_file_in_one_line(tmp_path, monkeypatch, contents):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sweeps").mkdir()
+    (tmp_path / "sweeps" / "mine.yaml").write_bytes(contents.encode("latin-1"))
+    with pytest.raises((YAMLError, UnicodeDecodeError)) as raised:
+        run_study(["-m", f"hydra.searchpath=[{tmp_path}]", "sweeps=mine"], launch=pytest.fail)
+    answer = mistake_in_one_line(raised.value, [])
+    assert answer is not None
+    assert answer.startswith("a file of the configuration cannot be read: ")
 
 
 def test_what_watches_over_a_worker_loads_nothing_that_a_worker_trains_and_tracks_with():

@@ -31,6 +31,9 @@ def test_space_gives_a_trial_what_is_searched_beside_its_choices():
 
 def test_space_is_written_as_the_command_line_has_it():
     chosen = {"network": "mlp", "network.hidden_sizes": "[64,64]", "agent.lr": 1e-4, "a.b": None, "c": False}
+    texts = ["it's, odd", "a\\b", "a\\", "a\\'b", "true", "Null", "nan", "1e3"]
+    values = [OverridesParser.create().parse_override(f"a={written(text)}").value() for text in texts]
+    assert [value if isinstance(value, str) else value.text for value in values] == texts
     words = overrides_of({**chosen, "d": "it's, odd"})
     assert words[:5] == ["network=mlp", "network.hidden_sizes=[64,64]", "agent.lr=0.0001", "a.b=null", "c=false"]
     read = [override.value() for override in OverridesParser.create().parse_overrides(words)]
@@ -69,6 +72,18 @@ def test_space_without_what_is_fixed_lacks_what_needs_what_is_gone():
     assert list(Space.read(chain).extremes())[-1] == {"a": 1, "b": 2, "c": 2}
     assert Space.read(chain).without({"a": 2}).parameters == ()
     assert [each.name for each in Space.read(chain).without({"b": 2}).parameters] == ["a", "c"]
+
+
+@pytest.mark.parametrize("when", [{"agent": "ppo", "gamma": 0.5}, {"gamma": 0.5, "agent": "ppo"}], ids=str)
+def test_space_extremes_are_only_such_as_a_trial_can_have(when):
+    space = Space.read(
+        {
+            "agent": {"choices": ["sac", "ppo"]},
+            "gamma": {"choices": [0.5, 0.9], "when": {"agent": ["sac", "ppo"]}},
+            "clip": {"choices": [1], "when": when},
+        }
+    )
+    assert list(space.extremes())[-1] == {"agent": "ppo", "gamma": 0.5, "clip": 1}
 
 
 def test_space_is_changed_key_by_key_as_the_command_line_has_it():
@@ -111,6 +126,23 @@ def test_space_is_changed_key_by_key_as_the_command_line_has_it():
         ({"a": {"low": 1, "high": 9, "log": True, "step": 2}}, "study.space.a.step is 2, but a range with log has no"),
         ({"a": {"low": 1, "high": 9, "step": 0}}, "study.space.a.step is 0, but it must be a whole number of at least"),
         ({"a": {"low": 0.0, "high": 1.0, "step": 2.0}}, "study.space.a.step is 2.0, but it must be a finite number"),
+        (
+            {"b": {"choices": [1]}, "a": {"choices": [1], "when": {"b": []}}},
+            "study.space.a.when.b is [], but it",
+        ),
+        (
+            {
+                "a": {"choices": [1, 2]},
+                "b": {"choices": [1], "when": {"a": 1}},
+                "c": {"choices": [1], "when": {"b": 1, "a": 2}},
+            },
+            "study.space.c.when can never hold",
+        ),
+        (
+            {"a": {"low": 0.0, "high": 0.1, "step": 0.03}},
+            "but steps of 0.03 from 0 end at 0.09",
+        ),
+        ({"a": {"low": 1, "high": 8, "step": 5}}, "study.space.a.high is 8, but steps of 5 from 1 end at 6"),
         ({"a": {"choices": [1], "when": 3}}, "study.space.a.when is 3, but it must say which choice of which key"),
         ({"a": {"choices": [1], "when": {"b": 1}}}, "study.space.a.when names 'b', but it must be a key with choices"),
         (

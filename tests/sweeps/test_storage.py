@@ -2,13 +2,16 @@
 
 import json
 import multiprocessing
+import os
+import sqlite3
 import time
+from contextlib import closing
 
 import optuna
 import pytest
 
 from armscan.errors import StudyError
-from armscan.sweeps.storage import open_storage, without_password
+from armscan.sweeps.storage import existing_storage, open_storage, without_password
 
 
 def test_storage_keeps_a_study_for_whoever_opens_it_next(storage_uri):
@@ -75,6 +78,8 @@ def test_journal_that_is_torn_while_others_have_it_open_is_mended_by_the_next_to
         (3, "study.storage is 3, but it must be a file"),
         ("mysql://a:secret@b/c", "study.storage is 'mysql://a@b/c', but it must be a file, sqlite:///FILE or postgres"),
         ("/dev/null/a", "study.storage is '/dev/null/a', but no file can be used there"),
+        ("/proc/a", "study.storage is '/proc/a', but no file can be used there"),
+        ("sqlite:////proc/a", "study.storage is 'sqlite:////proc/a', but this storage cannot be used"),
         ("sqlite:////dev/null/a", "study.storage is 'sqlite:////dev/null/a', but this storage cannot be used"),
     ],
 )
@@ -93,6 +98,32 @@ def test_storage_refuses_a_file_that_is_no_journal_and_leaves_it_as_it_is(tmp_pa
     with pytest.raises(StudyError, match="that file is no journal of Optuna"):
         open_storage(str(tmp_path / "a"))
     assert (tmp_path / "a").read_text() == contents
+
+
+@pytest.mark.parametrize("table", ["studies", "runs"])
+@pytest.mark.parametrize("opens", [open_storage, existing_storage])
+def test_storage_refuses_a_database_of_somebody_else_and_leaves_it_as_it_is(tmp_path, opens, table):
+    with closing(sqlite3.connect(tmp_path / "a.db")) as connection:
+        connection.execute(f"CREATE TABLE {table} (a)")
+        connection.commit()
+        with pytest.raises(StudyError, match="it holds other tables"):
+            opens(f"sqlite:///{tmp_path}/a.db")
+        assert connection.execute("SELECT name FROM sqlite_master").fetchall() == [(table,)]
+
+
+def test_storage_that_is_looked_at_is_not_made(storage_uri, tmp_path):
+    assert existing_storage(storage_uri) is None
+    assert [file for file in tmp_path.iterdir() if file.name.startswith("a.")] == []
+    optuna.create_study(study_name="a", storage=open_storage(storage_uri).optuna)
+    there = existing_storage(storage_uri)
+    assert there is not None
+    assert optuna.get_all_study_names(there.optuna) == ["a"]
+
+
+def test_storage_refuses_what_is_no_file(tmp_path):
+    os.mkfifo(tmp_path / "a")
+    with pytest.raises(StudyError, match="but no file can be used there"):
+        existing_storage(str(tmp_path / "a"))
 
 
 def test_address_is_shown_without_its_password():

@@ -43,3 +43,9 @@ def test_verdict_of_one_seed_has_no_interval():
     mean, low, high = verdict.means["test/mean_steps"]
     assert mean == 2.0
     assert np.isnan([low, high]).all()
+
+
+def test_verdict_leaves_out_figures_that_some_seeds_lack():
+    uneven = [judged(0, figures_of([2.0]) | {f"test/only_{seed}": 1.0}) for seed in range(2)]
+    (verdict,) = verdicts(uneven)
+    assert verdict.means.keys() == {"test/mean_steps", "test/success_rate"}

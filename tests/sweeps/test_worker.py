@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import optuna
 import pytest
 
@@ -100,9 +101,37 @@ def test_worker_ends_a_study_whose_configuration_fails_at_once_and_one_with_too_
     assert sorted(trial.state.name for trial in study.trials) == ["COMPLETE"] * 5 + ["FAIL"] * 5
 
 
-@pytest.mark.parametrize("value", [float("nan"), None, "fast"])
-def test_worker_fails_a_trial_whose_value_is_no_number(work, value):
-    study = work("a", lambda _: {"mean_steps": value})
-    assert {trial.state.name for trial in study.trials} == {"FAIL"}
-    assert "mean_steps" in study.trials[0].user_attrs["failure"]
+@pytest.mark.parametrize(
+    ("figures", "reason"),
+    [
+        (
+            {"mean_steps": float("nan")},
+            "what the task has returned as mean_steps is nan, but it must be",
+        ),
+        ({"mean_steps": -float("inf")}, "what the task has returned as mean_steps is -inf, but it must be a finite"),
+        ({"mean_steps": None}, "what the task has returned as mean_steps is None, but it must be"),
+        (
+            {"mean_steps": 1.0, "other": "fast"},
+            "what the task has returned as other is 'fast', but it",
+        ),
+        ({"other": 1.0}, "the task has not returned mean_steps, but only other"),
+        (3.0, "the task has returned 3.0, but it must be figures by their names"),
+    ],
+    ids=str,
+)
+def test_worker_fails_a_trial_that_returns_something_else_than_figures(work, figures, reason):
+    study = work("a", lambda _: figures)
+    assert [trial.state.name for trial in study.trials] == ["FAIL"] * 3
+    assert reason in study.trials[0].user_attrs["failure"]
     assert best_trials(study, 1) == []
+
+
+@pytest.mark.parametrize("raised", [SystemExit(0), KeyboardInterrupt()], ids=repr)
+def test_worker_outlives_a_task_that_would_end_it(work, raised):
+    def second_raises(attempt):
+        if attempt.trial.number == 1:
+            raise raised
+        return {"mean_steps": np.float32(0.5), "other": float("nan")}
+
+    study = work("a", second_raises, n_trials=2)
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE", "FAIL", "COMPLETE"]
