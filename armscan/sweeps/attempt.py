@@ -15,8 +15,10 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, open_dict
 from optuna.trial import Trial
 
+from armscan.errors import InvalidValueError
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
 from armscan.settings import plain
+from armscan.sweeps.command_line import SWEEPS
 from armscan.sweeps.ledger import ENV_STEPS, RETRY_OF, SEEDS
 from armscan.sweeps.values import Value, overrides_of
 from armscan.tracking import TrackedRun
@@ -135,10 +137,20 @@ def composed(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
 
 
 def study_section(words: Sequence[str]) -> dict[str, Any]:
-    """Returns the section `study` of a configuration as plain values."""
+    """Returns the section `study` of a configuration as plain values.
+
+    Raises:
+        InvalidValueError: if the file of the study does not say that it is for the whole configuration.
+    """
     GlobalHydra.instance().clear()
     with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
-        section = compose(CONFIG_NAME, list(words)).get("study")
+        config = compose(CONFIG_NAME, list(words))
+    if config.get(SWEEPS) is not None:
+        raise InvalidValueError(
+            f"what {SWEEPS}= names is a section {SWEEPS} of the configuration, and not all of it: its file must begin "
+            "with the line '# @package _global_'"
+        )
+    section = config.get("study")
     return plain(section) if section is not None else {}
 
 

@@ -186,8 +186,9 @@ def _print_verdicts(opened: OpenStudy) -> bool:
     if not judged:
         return not opened.settings.judging.best
     n_seeds = ", ".join(sorted({str(verdict.n_seeds) for verdict in judged}))
-    title = f"result: on the test volumes, other seeds: {n_seeds} (95 % intervals)"
-    table = Table(title=title, title_justify="left")
+    # A title of the table would be as narrow as the table.
+    print(f"result: on the test volumes, other seeds: {n_seeds} (95 % intervals)")
+    table = Table()
     names = shown_of(judged[0])
     for heading in ("trial", *(name.removeprefix("test/").replace("_", " ") for name in names)):
         table.add_column(heading)

@@ -16,7 +16,7 @@ from optuna.artifacts import get_all_artifact_meta
 from optuna_dashboard._note import get_note_from_system_attrs
 from yaml import YAMLError
 
-from armscan.errors import ArmscanError, StudyError
+from armscan.errors import ArmscanError, InvalidValueError, StudyError
 from armscan.mistakes import mistake_in_one_line
 from armscan.sweeps.command import run_study
 from armscan.sweeps.storage import open_storage
@@ -269,6 +269,14 @@ def test_study_answers_a_damaged_file_in_one_line(tmp_path, monkeypatch, content
     answer = mistake_in_one_line(raised.value, [])
     assert answer is not None
     assert answer.startswith("a file of the configuration cannot be read: ")
+
+
+def test_study_answers_a_file_that_is_not_for_the_whole_configuration(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sweeps").mkdir()
+    (tmp_path / "sweeps" / "mine.yaml").write_text("study: {name: mine}\n")
+    with pytest.raises(InvalidValueError, match="its file must begin with the line '# @package _global_'"):
+        run_study(["-m", f"hydra.searchpath=[{tmp_path}]", "sweeps=mine"], launch=pytest.fail)
 
 
 def test_what_watches_over_a_worker_loads_nothing_that_a_worker_trains_and_tracks_with():
