@@ -104,9 +104,10 @@ def _composition_mistake(error: ConfigCompositionException, words: Sequence[str]
             f"{ambiguous.group(1)} gives several values, which needs -m: python -m armscan.run -m {ambiguous.group(1)}"
         )
     if unknown := re.match(r"Could not override '(.*?)'", text):
-        key = unknown.group(1)
-        parent, _, name = key.rpartition(".")
-        allowed = _keys_under(parent, words)
+        parent, _, name = unknown.group(1).rpartition(".")
+        # Its parent may not be there either.
+        while not (allowed := _keys_under(parent, words)) and parent:
+            parent, _, name = parent.rpartition(".")
         where = f"in {parent}" if parent else "at the top"
         return f"there is no key {name!r} {where}" + (f", but only {listed(allowed)}" if allowed else "")
     return text
@@ -157,6 +158,5 @@ def _keys_under(parent: str, words: Sequence[str]) -> list[str]:
                 )
         except (HydraException, OmegaConfBaseException):
             continue
-        if isinstance(node, DictConfig):
-            return [str(key) for key in node if not str(key).startswith("_")]
+        return [str(key) for key in node if not str(key).startswith("_")] if isinstance(node, DictConfig) else []
     return []

@@ -43,6 +43,7 @@ class Attempt:
         tell_progress: takes what is known of how far it is.
         opened: takes the tracked run of a training while it goes on, and None when it has ended.
         show_picture: takes a file that the dashboard is to show.
+        reported: steps that were reported before the trial was handed back.
     """
 
     trial: Trial
@@ -55,8 +56,11 @@ class Attempt:
     tell_progress: Callable[[dict[str, Any]], None]
     opened: Callable[[TrackedRun | None], None]
     show_picture: Callable[[Path], None]
+    reported: frozenset[int] = frozenset()
     env_steps: int = field(default=0, init=False)
-    _reported: set[int] = field(default_factory=set, init=False)
+
+    def __post_init__(self) -> None:
+        self._reported = set(self.reported)
 
     @property
     def folder(self) -> Path:
@@ -95,7 +99,7 @@ class Attempt:
         """Reports how a training is going.
 
         Args:
-            figures: of the last validation.
+            figures: of the last validation: the objective, and `mean_return` for the screen, where it is known.
             seed: of the training.
             n_env_steps: it has taken.
             grid: environment steps between two reports: trials are compared at the same step, whatever theirs are.
@@ -106,7 +110,8 @@ class Attempt:
         """
         done = [one for each, one in self.seeds_done.items() if each in self.seeds]
         self.env_steps = sum(int(one[ENV_STEPS]) for one in done) + n_env_steps
-        self.tell_progress({"seed": seed, ENV_STEPS: self.env_steps, "return": figures["mean_return"]})
+        progress = {"seed": seed, ENV_STEPS: self.env_steps}
+        self.tell_progress(progress | ({"return": figures["mean_return"]} if "mean_return" in figures else {}))
         if self.objective is None or self.objective not in figures:
             return
         step = self.seeds.index(seed) * total + n_env_steps // grid * grid

@@ -19,6 +19,8 @@ from armscan.sweeps.values import overrides_of
 def check_space(settings: StudySettings, task: Task, words: Sequence[str], config: DictConfig) -> None:
     """Builds what is run as it is without the space, then with each choice and both ends of each range.
 
+    Choices of groups and of keys at the top are tried beside values of all others, too, as a trial has them.
+
     Args:
         settings: of the study.
         task: what its trials do.
@@ -29,7 +31,10 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
         InvalidValueError: if a key is unknown, or a value not allowed.
     """
     task.check(config)
-    for chosen in settings.space.extremes():
+    tried = list(settings.space.extremes())
+    # What one of them changes may leave no place for another.
+    tried += [settings.space.completed(chosen) for chosen in tried if "." not in list(chosen)[-1]]
+    for chosen in tried:
         overrides = overrides_of(chosen)
         try:
             with_it, _ = composed([*words, *overrides])

@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -67,6 +68,9 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     # Before anything is made: a study or a storage that would be refused.
     existing_study(settings, plain(config))
     opened = open_for_work(given.of_trials)
+    for phase in opened.begun():
+        if n_failed := phase.ledger.forgive():
+            print(f"{phase.name}: {n_failed} trials have failed before, which count no more from now on")
     folder = opened.folder / "workers" / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
     folder.mkdir(parents=True)
     Process.current().write(folder / LAUNCHER_FILE)
@@ -80,8 +84,12 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
         started.insert(1, f"hydra.launcher.timeout_min={MINUTES_WITHOUT_END}")
         waiting = _interrupted_alone()
         keep_gpus()
-    with _leaving(opened, folder), Screen(opened, folder), waiting:
-        launch(started)
+    try:
+        with _leaving(opened, folder), Screen(opened, folder), waiting:
+            launch(started)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on with the study", file=sys.stderr)
+        return 130
     return print_result(opened)
 
 

@@ -141,6 +141,7 @@ class Keeper:
         with self._changing:
             if self._trial is not None:
                 self._ledger.hand_back(self._trial, self._lease)
+                say(f"trial {self._trial.number} is handed back")
             if self._close is not None:
                 self._close()
             self._trial = self._close = None

@@ -23,6 +23,8 @@ RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
 # Of those, what a retry has from the attempt before: the seeds that are done, and what it is to be judged for.
 JUDGED, JUDGED_SEED = "judged", "judged_seed"
 KEPT_BY_RETRY = (SEEDS, JUDGED, JUDGED_SEED)
+# Of a study: its trials whose failures count no more.
+FORGIVEN = "forgiven"
 # In a lease: who holds the trial.
 HOLDER = ("worker", "host", "pid", "started")
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
@@ -178,12 +180,27 @@ class Ledger:
     def broken(self, tally: Tally) -> str | None:
         """Returns why so many trials have failed that the study ends; None where they are few enough."""
         limits, failed = self._limits, tally.failed
+        if failed:
+            forgiven = self.study.user_attrs.get(FORGIVEN, ())
+            failed = tuple(trial for trial in failed if trial.number not in forgiven)
         if len(failed) > limits.max_failures:
             return f"{len(failed)} trials have failed, and at most {limits.max_failures} may: {_reason(failed[-1])}"
         got_nowhere = not tally.finished and not any(trial.intermediate_values for trial in tally.all)
         if len(failed) >= FAILURES_AT_ONCE and got_nowhere:
             return f"the first {len(failed)} trials failed before they reported anything: {_reason(failed[0])}"
         return None
+
+    def forgive(self) -> int:
+        """Lets failures count no more, where there were too many: somebody starts the study again all the same.
+
+        Returns:
+            How many there were; 0 where the study goes on without.
+        """
+        tally = self.tally()
+        if self.broken(tally) is None:
+            return 0
+        self.study.set_user_attr(FORGIVEN, [trial.number for trial in tally.failed])
+        return len(tally.failed)
 
     def hand_back(self, trial: Trial, lease: Mapping[str, Any]) -> None:
         """Leaves a trial of one's own for another to go on with; the lease says how far it is."""

@@ -40,7 +40,9 @@ def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
     console.print(f"objective  {objectives}, over the seeds {', '.join(map(str, settings.seeds))}")
     console.print(f"limits     {', '.join(limits)}; {settings.workers} workers; then {n_judging} trainings that judge")
     done = len(tally.finished) if tally else 0
-    console.print(f"done       {done} trials" + (f", {len(tally.failed)} failed" if tally and tally.failed else ""))
+    others = {"failed": tally.failed, "handed back, to be gone on with": tally.waiting} if tally else {}
+    also = "".join(f", {len(trials)} {what}" for what, trials in others.items() if trials)
+    console.print(f"done       {done} trials{also}")
     if not tally or not done:
         console.print("cost       not known before the first trial has finished")
         return

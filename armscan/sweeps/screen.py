@@ -20,7 +20,7 @@ from armscan.errors import StorageAwayError
 from armscan.settings import report_command
 from armscan.sweeps.dashboard import dashboard_command
 from armscan.sweeps.judging import best_trials
-from armscan.sweeps.ledger import ENV_STEPS, FAILURE, LEASE, RETRIED, Ledger, Tally
+from armscan.sweeps.ledger import ENV_STEPS, FAILURE, JUDGED, JUDGED_SEED, LEASE, RETRIED, Ledger, Tally
 from armscan.sweeps.opening import OpenStudy
 from armscan.sweeps.patience import impatient
 from armscan.sweeps.settings import StudySettings
@@ -96,20 +96,24 @@ class Screen:
             if (trial.number, is_judging) not in self._told:
                 self._told.add((trial.number, is_judging))
                 names = (self._opened.task.judged,) if is_judging else tuple(self._opened.settings.objectives)
-                print(f"{'judging ' if is_judging else ''}{sentence(trial, names)}", flush=True)
+                print(sentence(trial, names), flush=True)
 
     def _table(self) -> Table:
         tally, settings = self._ledger.tally(), self._opened.settings
-        table = Table(title=Text(summary(self._ledger, tally, settings)), title_justify="left")
+        judging = self._opened.judged()
+        of_judging = Tally.of(judging.get_trials(deepcopy=False)) if judging is not None else Tally.of(())
+        # As wide as the terminal, whatever the table has.
+        table = Table(title=Text(summary(self._ledger, tally, settings)), title_justify="left", expand=True)
+        if of_judging.all:
+            table.caption = f"judging: {len(of_judging.finished)} of {len(of_judging.all)} done"
         for heading in ("worker", "trial", "seed", "environment steps", "return"):
             table.add_column(heading, justify="left" if heading == "worker" else "right")
-        judging = self._opened.judged()
         running = [("", trial) for trial in tally.running]
-        if judging is not None:
-            running += [("judging ", trial) for trial in Tally.of(judging.get_trials(deepcopy=False)).running]
+        running += [(f"judging {trial.user_attrs[JUDGED]}: ", trial) for trial in of_judging.running]
         for what, trial in running:
             lease = trial.user_attrs.get(LEASE, {})
-            shown = (lease.get("seed", "-"), lease.get(ENV_STEPS, "-"), f"{lease.get('return', float('nan')):.2f}")
+            figure = f"{lease['return']:.2f}" if "return" in lease else "-"
+            shown = (lease.get("seed", "-"), lease.get(ENV_STEPS, "-"), figure)
             table.add_row(lease.get("worker", "?").rpartition("/")[2], f"{what}{trial.number}", *map(str, shown))
         return table
 
@@ -124,7 +128,7 @@ def summary(ledger: Ledger, tally: Tally, settings: StudySettings) -> str:
     if best := best_trials(ledger.study, 1):
         parts.append(f"best {_values(best[0], tuple(settings.objectives))} (trial {best[0].number})")
     durations = [trial.duration.total_seconds() for trial in tally.finished if trial.duration is not None]
-    if durations:
+    if durations and len(tally.finished) < settings.n_trials:
         left_s = (settings.n_trials - len(tally.finished)) * sum(durations) / len(durations) / settings.workers
         parts.append(f"{left_s // 60:.0f} min left")
     return "; ".join(parts)
@@ -132,13 +136,15 @@ def summary(ledger: Ledger, tally: Tally, settings: StudySettings) -> str:
 
 def sentence(trial: FrozenTrial, objectives: Sequence[str]) -> str:
     """Returns what became of a trial, whose values are those of these objectives, in one line."""
-    tried = " ".join(overrides_of(trial.params))
+    told, tried = trial.user_attrs, " ".join(overrides_of(trial.params))
+    name = f"trial {trial.number}"
+    if JUDGED in told:
+        name = f"judging trial {told[JUDGED]} with seed {told[JUDGED_SEED]}"
     if trial.state == TrialState.FAIL:
-        again = ", taken up again" if RETRIED in trial.user_attrs else ""
-        return f"trial {trial.number} failed{again}: {trial.user_attrs.get(FAILURE)} [{tried}]"
+        return f"{name} failed{', taken up again' if RETRIED in told else ''}: {told.get(FAILURE)} [{tried}]"
     if trial.state == TrialState.PRUNED:
-        return f"trial {trial.number} pruned after {trial.user_attrs.get(ENV_STEPS)} environment steps [{tried}]"
-    return f"trial {trial.number} done: {_values(trial, objectives)} [{tried}]"
+        return f"{name} pruned after {told.get(ENV_STEPS)} environment steps [{tried}]"
+    return f"{name} done: {_values(trial, objectives)} [{tried}]"
 
 
 def print_result(opened: OpenStudy) -> int:
@@ -187,13 +193,15 @@ def _print_verdicts(opened: OpenStudy) -> bool:
         return not opened.settings.judging.best
     n_seeds = ", ".join(sorted({str(verdict.n_seeds) for verdict in judged}))
     # A title of the table would be as narrow as the table.
-    print(f"result: on the test volumes, other seeds: {n_seeds} (95 % intervals)")
+    print(f"result: on the test volumes, with {n_seeds} other seed(s) each (95 % intervals)")
     table = Table()
     names = shown_of(judged[0])
-    for heading in ("trial", *(name.removeprefix("test/").replace("_", " ") for name in names)):
+    for heading in ("trial", *(name.removeprefix("test/").replace("_", " ") for name in names), "values"):
         table.add_column(heading)
+    trials = opened.searching().ledger.study.get_trials(deepcopy=False)
     for verdict in judged:
-        table.add_row(str(verdict.number), *(verdict.text(name).replace(" (", "\n(") for name in names))
+        figures = (verdict.text(name).replace(" (", "\n(") for name in names)
+        table.add_row(str(verdict.number), *figures, " ".join(overrides_of(trials[verdict.number].params)))
     Console().print(table)
     return True
 

@@ -154,6 +154,14 @@ class Space:
                 assert chosen is not None
                 yield chosen
 
+    def completed(self, chosen: Mapping[str, Value]) -> dict[str, Value]:
+        """Returns choices with a value of every other parameter that is searched beside them, as a trial has them."""
+        complete: dict[str, Value] = {}
+        for parameter in self.parameters:
+            if parameter.name in chosen or parameter.applies(complete):
+                complete[parameter.name] = chosen.get(parameter.name, parameter.extremes()[0])
+        return complete
+
     def _with_needs(self, chosen: Mapping[str, Value]) -> dict[str, Value] | None:
         """Returns choices with those that they need beside them, None where no choice is allowed by all."""
         for parameter in self.parameters:

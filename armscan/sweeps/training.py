@@ -196,6 +196,7 @@ def _begun(
             return stage, TrackedRun.go_on(client, run_id, config=plain(config), tags=tags), earlier
     job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
     tracked = start_tracking(config, Invocation(folder, attempt.overrides, choices, job), stage)
+    tracked.set_tags({"study": attempt.trial.study.study_name, "trial": str(attempt.trial.number)})
     write_whole(begun, lambda file: file.write(json.dumps({"run_id": tracked.run_id}).encode()))
     return stage, tracked, []
 

@@ -63,7 +63,7 @@ class Worker:
             time.sleep(WAIT_S)
 
     def _run(self, trial: Trial) -> None:
-        say(f"trial {trial.number} begins")
+        say(f"{self._phase.name}: {_beginning(trial)}")
         try:
             figures = checked_figures(self._figures(trial), self._phase.objectives)
         except optuna.TrialPruned:
@@ -97,6 +97,7 @@ class Worker:
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)
         config_sum = sum_of_config(plain(config))
+        is_gone_on_with = RUN in trial.user_attrs
         self._tracked = self._begun(trial, chosen, folder, config_sum)
         self._opened(None)
         for name, value in ((FOLDER, str(folder)), (CONFIG_SUM, config_sum)):
@@ -113,6 +114,7 @@ class Worker:
             tell_progress=self._keeper.tell_progress,
             opened=self._opened,
             show_picture=partial(show_picture, trial, artifacts=phase.artifacts),
+            reported=_steps_of(trial) if is_gone_on_with else frozenset(),
         )
         try:
             return phase.run(attempt)
@@ -143,8 +145,9 @@ class Worker:
                 tags=tags,
                 parent_id=phase.run_id,
             )
-            trial.set_user_attr(RUN, tracked.run_id)
+            # Before the trial knows its run: who goes on with it makes no note any more.
             note_run(trial, phase.client, phase.experiment_id, tracked.run_id, folder)
+            trial.set_user_attr(RUN, tracked.run_id)
         return tracked
 
     def _opened(self, training: TrackedRun | None) -> None:
@@ -163,7 +166,7 @@ class Worker:
         shown = ", ".join(f"{name} {value:.4g}" for name, value in named.items())
         say(f"trial {trial.number} {state.name.lower()} {shown}".rstrip())
         if self._tracked is not None:
-            self._tracked.log_figures(named, n_env_steps=0)
+            self._tracked.log_figures(trial.user_attrs.get(FIGURES, {}), n_env_steps=0)
             if state == TrialState.PRUNED:
                 self._phase.client.set_tag(self._tracked.run_id, "pruned", "true")
             self._tracked.end("FINISHED")
@@ -218,6 +221,18 @@ def close_runs_of(trial: FrozenTrial, phase: Phase) -> None:
     for each in (*(child.info.run_id for child in children), run_id):
         client.set_tag(each, "failure", reason)
         client.set_terminated(each, "FAILED")
+
+
+def _steps_of(trial: Trial) -> frozenset[int]:
+    return frozenset(trial.storage.get_trial(trial._trial_id).intermediate_values)
+
+
+def _beginning(trial: Trial) -> str:
+    attributes = trial.user_attrs
+    if RUN in attributes:
+        return f"trial {trial.number} is gone on with"
+    again = f", in the place of trial {attributes[RETRY_OF]}" if RETRY_OF in attributes else ""
+    return f"trial {trial.number} begins{again}"
 
 
 def _close(runs: Sequence[TrackedRun]) -> None:

@@ -82,13 +82,17 @@ class TrackedRun:
             client.delete_tag(run_id, "failure")
         code = {f"resumed.{key}": value for key, value in source_tags().items() if key.startswith("git.")}
         resumed = {"resumed": str(int(run.data.tags.get("resumed", "0")) + 1)}
-        for key, value in (dict(tags) | code | resumed).items():
-            client.set_tag(run_id, key, value)
         client.update_run(run_id, status="RUNNING")
         logged = {(name, point.step) for name in run.data.metrics for point in client.get_metric_history(run_id, name)}
         tracked = cls(client, run_id, name=run.info.run_name or run_id, logged=logged)
+        tracked.set_tags(dict(tags) | code | resumed)
         tracked.log_config(config)
         return tracked
+
+    def set_tags(self, tags: Mapping[str, str]) -> None:
+        """Sets tags."""
+        for key, value in tags.items():
+            self._client.set_tag(self.run_id, key, value)
 
     def log_config(self, config: Mapping[str, Any]) -> None:
         """Logs a configuration's leaves as parameters; those that are there already stay as they are."""

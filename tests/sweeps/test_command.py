@@ -85,7 +85,7 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
     assert ended.stdout.count("\ntrial ") == 2
-    assert "judging trial 0 done: test/mean_steps" in ended.stdout
+    assert " with seed 1000 done: test/mean_steps" in ended.stdout
     client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
     runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
     by_id = {each.info.run_id: each for each in runs}
@@ -153,7 +153,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
     runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
     assert "RUNNING" not in {each.info.status for each in runs}
     printed = (tmp_path / "printed").read_text()
-    assert printed.endswith("interrupted\n")
+    assert printed.endswith("interrupted; the same command goes on with the study\n")
     assert "Traceback" not in printed
 
 
@@ -241,6 +241,13 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
             "study.space.agent.lr.choices=[...] on the command line replaces a range",
         ),
         (["-m", "sweeps=sac_y", "study.space.seed.choices=[1,2]"], "study.space.seed: 'seed' says how a study is run"),
+        (
+            [
+                *("-m", "sweeps=sac_y", "study.space.network.choices=[auto,mlp]"),
+                "study.space.network.vector.hidden_sizes.choices=[[8]]",
+            ],
+            "is not allowed: there is no key 'vector' in network, but only hidden_sizes or activation",
+        ),
         (["-m", "sweeps=sac_y", "agent=random"], "but the trials of this study need one that learns"),
         (["-m", "sweeps=sac_y", "training.env_steps=-1"], "training.env_steps is -1, but it must be a whole number"),
     ],

@@ -54,6 +54,17 @@ def test_space_extremes_have_every_choice_and_both_ends():
         assert [one[name] for one in extremes if name in one] == list(values)
 
 
+def test_space_completes_choices_as_a_trial_has_them():
+    completed = Space.read(DESCRIBED).completed({"network": "multimodal", "agent.lr": 1e-2})
+    assert completed == {
+        "network": "multimodal",
+        "agent.lr": 1e-2,
+        "agent.batch_size": 64,
+        "agent.gamma": 0,
+        "training.solved": None,
+    }
+
+
 @pytest.mark.parametrize(("network", "is_there"), [("mlp", True), ("multimodal", False), ("auto", False)])
 def test_space_without_what_is_fixed_keeps_what_this_allows(network, is_there):
     space = Space.read(DESCRIBED).without({"network": network, "agent.lr": 1})

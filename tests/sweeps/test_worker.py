@@ -59,6 +59,7 @@ def work(tmp_path):
             Worker(phase, ["data.n_training=1"], keeper).work()
         return study
 
+    run_study.storage = lambda folder: open_storage(str(tmp_path / folder / "optuna.journal"))
     return run_study
 
 
@@ -135,3 +136,22 @@ def test_worker_outlives_a_task_that_would_end_it(work, raised):
 
     study = work("a", second_raises, n_trials=2)
     assert [trial.state.name for trial in study.trials] == ["COMPLETE", "FAIL", "COMPLETE"]
+
+
+def test_worker_goes_on_with_a_broken_study_once_its_failures_are_forgiven(work):
+    def raises(_):
+        raise RuntimeError("a mistake that somebody mends then")
+
+    study = work("a", raises)
+    assert [trial.state.name for trial in work("a").trials] == ["FAIL"] * 3
+    ledger = Ledger(study, work.storage("a"), Limits(n_trials=5))
+    assert [ledger.forgive(), ledger.forgive()] == [3, 0]
+    assert [trial.state.name for trial in work("a").trials] == ["FAIL"] * 3 + ["COMPLETE"] * 5
+
+
+def test_worker_needs_of_a_report_only_what_is_pruned_by(work):
+    def reports(attempt):
+        attempt.report({"mean_steps": 1.0}, seed=0, n_env_steps=1, grid=1, total=1)
+        return {"mean_steps": 1.0}
+
+    assert {trial.state.name for trial in work("a", reports).trials} == {"COMPLETE"}
