@@ -64,7 +64,8 @@ def write_report(study: optuna.Study, judged: Sequence[FrozenTrial], folder: Pat
         _write_csv(folder / f"{name}.csv", rows)
     parts = [
         _summary(study, trials, objectives),
-        "<h2>Result</h2><p>The best settings, trained again with seeds that chose nothing, on the test volumes.</p>",
+        "<h2>Result</h2><p>The best settings with seeds that chose nothing, on the test volumes: "
+        "interquartile means over seeds and volumes, of success rates means, and 95 % intervals.</p>",
         _table(_result_rows(found, trials)) if found else "<p>Nothing has been judged yet.</p>",
         _films(judged),
         *charts(study, objectives, tables["importances"]),

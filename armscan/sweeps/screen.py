@@ -193,16 +193,20 @@ def _print_verdicts(opened: OpenStudy) -> bool:
         return not opened.settings.judging.best
     n_seeds = ", ".join(sorted({str(verdict.n_seeds) for verdict in judged}))
     # A title of the table would be as narrow as the table.
-    print(f"result: on the test volumes, with {n_seeds} other seed(s) each (95 % intervals)")
+    print(
+        f"result, with {n_seeds} other seed(s) each: interquartile means over seeds and test volumes, of success rates "
+        "means; 95 % intervals"
+    )
     table = Table()
     names = shown_of(judged[0])
-    for heading in ("trial", *(name.removeprefix("test/").replace("_", " ") for name in names), "values"):
+    for heading in ("trial", *(name.removeprefix("test/").replace("_", " ") for name in names)):
         table.add_column(heading)
     trials = opened.searching().ledger.study.get_trials(deepcopy=False)
     for verdict in judged:
-        figures = (verdict.text(name).replace(" (", "\n(") for name in names)
-        table.add_row(str(verdict.number), *figures, " ".join(overrides_of(trials[verdict.number].params)))
+        table.add_row(str(verdict.number), *(verdict.text(name).replace(" (", "\n(") for name in names))
     Console().print(table)
+    for verdict in judged:
+        print(f"trial {verdict.number}: {' '.join(overrides_of(trials[verdict.number].params))}")
     return True
 
 
