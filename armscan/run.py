@@ -81,7 +81,10 @@ def _is_repeated(words: list[str]) -> bool:
     said = [word for word in words if word.startswith(f"{RESUME}=")]
     for word in said:
         if word.partition("=")[2].lower() != "true":
-            raise InvalidValueError(f"{word!r} is for a single run; a grid is repeated with {RESUME}=true")
+            option = next(each for each in words if each in MULTIRUN)
+            raise InvalidValueError(
+                f"{word!r} is for a single run, without {option}; a grid is repeated with {RESUME}=true"
+            )
         words.remove(word)
     return bool(said)
 
