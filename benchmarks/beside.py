@@ -22,7 +22,7 @@ from typing import Any, Self
 from optuna.trial import FrozenTrial
 
 from armscan.sweeps.attempt import Attempt
-from armscan.sweeps.ledger import FIGURES
+from armscan.sweeps.tally import FIGURES
 from armscan.sweeps.training import Training
 from benchmarks.studies import by_worker, finish
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from armscan.sweeps.ledger import RETRY_OF
 from armscan.sweeps.supervising import local_workers
+from armscan.sweeps.tally import RETRY_OF
 from benchmarks.studies import JOURNAL, NAME, SLEEPING, started, tally_in
 from tests.postgres import postgres_server
 

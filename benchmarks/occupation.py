@@ -13,7 +13,7 @@ from typing import Self
 
 from optuna.trial import FrozenTrial
 
-from armscan.sweeps.ledger import FIGURES, Tally
+from armscan.sweeps.tally import FIGURES, Tally
 from benchmarks.studies import N_WORKERS, SLEEPING, by_worker, finish
 from benchmarks.waiting import Waited
 

@@ -17,8 +17,8 @@ from pathlib import Path
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.sweeps.ledger import Tally, env_steps_of
 from armscan.sweeps.storage import open_storage
+from armscan.sweeps.tally import Tally, env_steps_of
 
 STUDIES = {"plain": ["study/pruner=none"], "pruned": []}
 

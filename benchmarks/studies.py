@@ -10,8 +10,8 @@ from pathlib import Path
 import optuna
 from optuna.trial import FrozenTrial
 
-from armscan.sweeps.ledger import LEASE, Tally
 from armscan.sweeps.storage import open_storage
+from armscan.sweeps.tally import LEASE, Tally
 
 N_WORKERS = 4
 NAME, JOURNAL = "benchmark", "optuna.journal"

@@ -19,7 +19,7 @@ from armscan.errors import InvalidValueError
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
 from armscan.settings import plain
 from armscan.sweeps.command_line import SWEEPS
-from armscan.sweeps.ledger import ENV_STEPS, RETRY_OF, SEEDS
+from armscan.sweeps.tally import ENV_STEPS, RETRY_OF, SEEDS
 from armscan.sweeps.values import Value, overrides_of
 from armscan.tracking import TrackedRun
 

@@ -12,7 +12,7 @@ from hydra.core.override_parser.types import Override, QuotedString
 
 from armscan.errors import InvalidValueError
 from armscan.settings import MULTIRUN, RESUME
-from armscan.sweeps.space import NOT_SEARCHED
+from armscan.sweeps.describing import NOT_SEARCHED
 from armscan.sweeps.values import written
 
 PLAN, SWEEPS, STUDY = "--plan", "sweeps", "study"

@@ -7,9 +7,9 @@ import json
 import optuna
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from armscan.sweeps.ledger import JUDGED, JUDGED_SEED
 from armscan.sweeps.settings import FIRST_SEED_ABOVE, StudySettings
 from armscan.sweeps.storage import Storage
+from armscan.sweeps.tally import JUDGED, JUDGED_SEED
 
 
 def judging_seeds(settings: StudySettings) -> tuple[int, ...]:

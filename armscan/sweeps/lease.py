@@ -13,8 +13,9 @@ from typing import Any
 
 from optuna.trial import FrozenTrial, Trial
 
-from armscan.sweeps.ledger import HOLDER, LEASE, Ledger
+from armscan.sweeps.ledger import Ledger
 from armscan.sweeps.log import say
+from armscan.sweeps.tally import HOLDER, LEASE
 
 BEAT_S, TICK_S = 10.0, 0.25
 # Missed beats before a worker counts as dead: a busy storage may hold up some.

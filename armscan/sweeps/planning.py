@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from armscan.sweeps.ledger import Tally
 from armscan.sweeps.settings import StudySettings
 from armscan.sweeps.space import Parameter
+from armscan.sweeps.tally import Tally
 
 BYTES_A_MIB = 2**20
 

@@ -16,7 +16,7 @@ from plotly.offline import get_plotlyjs
 from armscan.sweeps.attempt import FOLDER, RUN
 from armscan.sweeps.charts import charts, importances
 from armscan.sweeps.judging import best_trials
-from armscan.sweeps.ledger import ENV_STEPS, FAILURE, FIGURES, JUDGED, RETRIED, RETRY_OF, Tally
+from armscan.sweeps.tally import ENV_STEPS, FAILURE, FIGURES, JUDGED, RETRIED, RETRY_OF, Tally
 from armscan.sweeps.values import overrides_of
 from armscan.sweeps.verdict import Verdict, shown_of, verdicts
 

@@ -22,7 +22,7 @@ from armscan.multirun import Job
 from armscan.settings import plain
 from armscan.stage import Stage
 from armscan.sweeps.attempt import Attempt
-from armscan.sweeps.ledger import ENV_STEPS
+from armscan.sweeps.tally import ENV_STEPS
 from armscan.sweeps.tasks import VolumesInMemory
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store
 from armscan.tracking.run import CURVE_FILE, EVALUATION_FILE

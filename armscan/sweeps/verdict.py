@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.sweeps.ledger import FIGURES, JUDGED
+from armscan.sweeps.tally import FIGURES, JUDGED
 
 N_RESAMPLES = 2000
 OF_VOLUME = re.compile(r"test/volume/(.+)/(\w+)")

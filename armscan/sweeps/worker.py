@@ -23,10 +23,10 @@ from armscan.settings import plain
 from armscan.sweeps.attempt import CONFIG_SUM, FOLDER, RUN, Attempt, composed, sum_of_config, trial_folder
 from armscan.sweeps.dashboard import note_run, show_picture
 from armscan.sweeps.lease import Keeper, LimitReachedError
-from armscan.sweeps.ledger import ENV_STEPS, FIGURES, RETRY_OF
 from armscan.sweeps.log import say
 from armscan.sweeps.parts import make_sampler
 from armscan.sweeps.phases import Phase
+from armscan.sweeps.tally import ENV_STEPS, FIGURES, RETRY_OF
 from armscan.sweeps.values import overrides_of
 from armscan.tracking import TrackedRun
 

@@ -11,7 +11,7 @@ import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps.lease import Witness, process_start
-from armscan.sweeps.ledger import ATTEMPT, FAILURE, LEASE, RETRIED, RETRY_OF, Tally
+from armscan.sweeps.tally import ATTEMPT, FAILURE, LEASE, RETRIED, RETRY_OF, Tally
 
 
 def states(ledger):

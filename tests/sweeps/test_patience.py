@@ -16,8 +16,9 @@ from sqlalchemy.exc import SQLAlchemyError
 from armscan.errors import StorageAwayError
 from armscan.sweeps import lease, patience, screen
 from armscan.sweeps.lease import Keeper, Witness, process_start
-from armscan.sweeps.ledger import LEASE, RETRY_OF, Ledger, Limits
+from armscan.sweeps.ledger import Ledger, Limits
 from armscan.sweeps.storage import open_storage
+from armscan.sweeps.tally import LEASE, RETRY_OF
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 from optuna.trial import TrialState, create_trial
 from rliable.metrics import aggregate_iqm
 
-from armscan.sweeps.ledger import FIGURES, JUDGED
+from armscan.sweeps.tally import FIGURES, JUDGED
 from armscan.sweeps.verdict import verdicts
 
 
