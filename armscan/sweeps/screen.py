@@ -191,6 +191,11 @@ def _print_verdicts(opened: OpenStudy) -> bool:
         print(f"error: {len(tally.failed)} of the trials that judge have failed: {reason}", file=sys.stderr)
     judged = verdicts(tally.finished)
     if not judged:
+        if opened.settings.judging.best:
+            print(
+                "error: nothing has been judged, because no trial has run to its end, or none that judges has",
+                file=sys.stderr,
+            )
         return not opened.settings.judging.best
     n_seeds = ", ".join(sorted({str(verdict.n_seeds) for verdict in judged}))
     # A title of the table would be as narrow as the table.
