@@ -20,6 +20,8 @@ CHANGES = {
     "device": "compute.device",
 }
 RESUME, TRACKING_URI = "resume", "tracking.uri"
+# What names a study, and the option that only shows what it would run.
+SWEEPS, PLAN = "sweeps", "--plan"
 # Hydra's options for several runs.
 MULTIRUN = ("-m", "--multirun")
 # The phantoms, where a command asks for volumes.

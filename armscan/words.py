@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from armscan.errors import ArmscanError, InvalidValueError, is_interruption, listed
+from armscan.errors import InvalidValueError, is_interruption, listed
 
 
 def read_words(words: Sequence[str], allowed: Sequence[str], texts: Collection[str]) -> dict[str, Any]:
@@ -67,10 +67,11 @@ def answered(command: Callable[[Sequence[str]], int], words: Sequence[str] | Non
         if is_interruption(error):
             print(f"\ninterrupted; {left}", file=sys.stderr)
             return 130
-        if isinstance(error, OSError) and error.filename is not None:
-            print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
-            return 2
-        if not isinstance(error, ArmscanError):
+        # Deferred: it loads Hydra, which only who has made a mistake needs here.
+        from armscan.mistakes import mistake_in_one_line
+
+        line = mistake_in_one_line(error, words)
+        if line is None:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {line}", file=sys.stderr)
         return 2

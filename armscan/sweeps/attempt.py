@@ -17,8 +17,7 @@ from optuna.trial import Trial
 
 from armscan.errors import InvalidValueError
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
-from armscan.settings import plain
-from armscan.sweeps.command_line import SWEEPS
+from armscan.settings import SWEEPS, plain
 from armscan.sweeps.tally import ENV_STEPS, RETRY_OF, SEEDS
 from armscan.sweeps.values import Value, overrides_of
 from armscan.tracking import TrackedRun
@@ -43,7 +42,7 @@ class Attempt:
         tell_progress: takes what is known of how far it is.
         opened: takes the tracked run of a training while it goes on, and None when it has ended.
         show_picture: takes a file that the dashboard is to show.
-        reported: steps that were reported before the trial was handed back.
+        reported: steps that have been reported, also before the trial was handed back.
     """
 
     trial: Trial
@@ -56,11 +55,8 @@ class Attempt:
     tell_progress: Callable[[dict[str, Any]], None]
     opened: Callable[[TrackedRun | None], None]
     show_picture: Callable[[Path], None]
-    reported: frozenset[int] = frozenset()
+    reported: set[int]
     env_steps: int = field(default=0, init=False)
-
-    def __post_init__(self) -> None:
-        self._reported = set(self.reported)
 
     @property
     def folder(self) -> Path:
@@ -115,9 +111,9 @@ class Attempt:
         if self.objective is None or self.objective not in figures:
             return
         step = self.seeds.index(seed) * total + n_env_steps // grid * grid
-        if step in self._reported:
+        if step in self.reported:
             return
-        self._reported.add(step)
+        self.reported.add(step)
         values = [one[self.objective] for one in done] + [figures[self.objective]]
         self.trial.report(sum(values) / len(values), step)
         if self.trial.should_prune():

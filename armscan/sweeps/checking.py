@@ -32,7 +32,7 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
     """
     task.check(config)
     tried = list(settings.space.extremes())
-    # What one of them changes may leave no place for another.
+    # What one of them changes, the last, may leave no place for another.
     tried += [settings.space.completed(chosen) for chosen in tried if "." not in list(chosen)[-1]]
     for chosen in tried:
         overrides = overrides_of(chosen)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import signal
 import socket
@@ -57,28 +58,35 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     settings, task, config = read_settings(given.of_trials)
     # Words are written into files, logs and the tracking store.
     hand_over_password(settings.storage)
-    given = given.with_storage(without_password(settings.storage))
+    settings = dataclasses.replace(settings, storage=without_password(settings.storage))
+    given = given.with_storage(settings.storage)
     launcher = composed(given.launching)[1][LAUNCHER]
     if launcher in LAUNCHERS_ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))
     check_space(settings, task, given.of_trials, config)
-    if given.is_plan or settings.plan:
-        print_plan(settings, existing_study(settings, plain(config)))
-        return 0
     # Before anything is made: a study or a storage that would be refused.
-    existing_study(settings, plain(config))
-    opened = open_for_work(given.of_trials)
+    existing = existing_study(settings, plain(config))
+    if given.is_plan or settings.plan:
+        print_plan(settings, existing)
+        return 0
+    opened = open_for_work(settings, task, config, given.of_trials)
     for phase in opened.begun():
         if n_failed := phase.ledger.forgive():
             print(f"{phase.name}: {n_failed} trials have failed before, which count no more from now on")
+    return _launched(opened, given, launcher, launch)
+
+
+def _launched(opened: OpenStudy, given: CommandLine, launcher: str, launch: Callable[[Sequence[str]], object]) -> int:
+    """Has the workers of a study launched, watches them to their end, and tells the result; returns the exit code."""
     folder = opened.folder / "workers" / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
     folder.mkdir(parents=True)
     Process.current().write(folder / LAUNCHER_FILE)
-    numbers = ",".join(map(str, range(settings.workers)))
+    n_workers = opened.settings.workers
+    numbers = ",".join(map(str, range(n_workers)))
     started = ["-m", *given.launching, f"{WORKER_KEY}={numbers}", f"hydra.sweep.dir={folder}"]
     waiting: AbstractContextManager[None] = contextlib.nullcontext()
     if launcher == "joblib":
-        started.append(f"hydra.launcher.n_jobs={settings.workers}")
+        started.append(f"hydra.launcher.n_jobs={n_workers}")
     opened.client.update_run(opened.run_id, status="RUNNING")
     if launcher == USUAL_LAUNCHER:
         started.insert(1, f"hydra.launcher.timeout_min={MINUTES_WITHOUT_END}")

@@ -11,11 +11,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, QuotedString
 
 from armscan.errors import InvalidValueError
-from armscan.settings import MULTIRUN, RESUME
+from armscan.settings import MULTIRUN, PLAN, RESUME, SWEEPS
 from armscan.sweeps.describing import NOT_SEARCHED
 from armscan.sweeps.values import written
 
-PLAN, SWEEPS, STUDY = "--plan", "sweeps", "study"
+STUDY = "study"
 LAUNCHER, USUAL_LAUNCHER = "hydra/launcher", "submitit_local"
 WORKER_KEY, SPACE, STORAGE, SEARCH_PATH = "study.worker", "study.space", "study.storage", "hydra.searchpath"
 

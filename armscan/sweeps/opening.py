@@ -127,7 +127,9 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
     if not section:
         raise InvalidValueError("there is no study in the configuration: give sweeps=NAME of a file with one")
     settings = StudySettings.read(section, fixed_by(words))
-    make_sampler(settings.sampler, settings.seed), make_pruner(settings.pruner)
+    # What cannot be made is refused here, and not by the first trial.
+    make_sampler(settings.sampler, settings.seed)
+    make_pruner(settings.pruner)
     for name in ("folder", "artifacts"):
         check_folder(f"study.{name}", getattr(settings, name))
     task = make_task(settings.task)
@@ -157,19 +159,22 @@ def make_folder(where: str, folder: str) -> None:
         raise StudyError(f"{where} is {folder!r}, but no folder can be made there ({error.strerror})") from error
 
 
-def open_for_work(words: Sequence[str], *, is_patient: bool = False) -> OpenStudy:
+def open_for_work(
+    settings: StudySettings, task: Task, config: DictConfig, words: Sequence[str], *, is_patient: bool = False
+) -> OpenStudy:
     """Opens a study, and makes it where there is none.
 
     Args:
-        words: of the study.
+        settings: as `read_settings` returns them.
+        task: likewise.
+        config: likewise.
+        words: that these were read from, without a password.
         is_patient: see `open_storage`.
 
     Raises:
-        InvalidValueError: if something in the words is not allowed.
         StudyError: if the storage cannot be used, or the study that exists is another.
         TrackingError: if the tracking store cannot be used.
     """
-    settings, task, config = read_settings(words)
     client, experiment_id = open_store(**plain(config.tracking))
     for name in ("folder", "artifacts"):
         make_folder(f"study.{name}", getattr(settings, name))

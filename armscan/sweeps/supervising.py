@@ -26,8 +26,8 @@ from armscan.sweeps.command_line import words_of_trials
 from armscan.sweeps.lease import process_start
 
 LAUNCHER_FILE, STOP_FILE = "launcher.json", "stop"
-# The exit codes of a worker that was told to leave, that its storage was away from for too long, and of all that have
-# ended by themselves.
+# The exit codes of a worker that was told to leave, of one whose storage was away for too long, and of all that have
+# ended by themselves and are not started again.
 LEFT, AWAY = 130, 75
 ENDS = (0, LEFT, AWAY)
 GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"

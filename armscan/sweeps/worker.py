@@ -114,7 +114,7 @@ class Worker:
             tell_progress=self._keeper.tell_progress,
             opened=self._opened,
             show_picture=partial(show_picture, trial, artifacts=phase.artifacts),
-            reported=_steps_of(trial) if is_gone_on_with else frozenset(),
+            reported=_steps_of(trial) if is_gone_on_with else set(),
         )
         try:
             return phase.run(attempt)
@@ -223,8 +223,8 @@ def close_runs_of(trial: FrozenTrial, phase: Phase) -> None:
         client.set_terminated(each, "FAILED")
 
 
-def _steps_of(trial: Trial) -> frozenset[int]:
-    return frozenset(trial.storage.get_trial(trial._trial_id).intermediate_values)
+def _steps_of(trial: Trial) -> set[int]:
+    return set(trial.storage.get_trial(trial._trial_id).intermediate_values)
 
 
 def _beginning(trial: Trial) -> str:

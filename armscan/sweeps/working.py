@@ -8,7 +8,7 @@ from functools import partial
 from armscan.mistakes import quieten_libraries
 from armscan.sweeps.lease import Keeper
 from armscan.sweeps.log import say
-from armscan.sweeps.opening import open_for_work
+from armscan.sweeps.opening import open_for_work, read_settings
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.worker import Worker, close_runs_of
 
@@ -26,7 +26,7 @@ def work(words: Sequence[str], name: str, is_told_to_leave: Callable[[], bool], 
         StorageAwayError: if the storage is away for longer than a worker waits.
     """
     quieten_libraries()
-    opened = open_for_work(words, is_patient=True)
+    opened = open_for_work(*read_settings(words), words, is_patient=True)
 
     def worked(phase: Phase) -> str:
         keeper = Keeper(
