@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,10 +81,22 @@ def _interval(name: str, scores: NDArray[np.float64], seed: int) -> tuple[float,
     mean = metrics.aggregate_mean if "success_rate" in name else metrics.aggregate_iqm
     if len(scores) < 2 or np.isnan(scores).any():
         return float(mean(scores)), float("nan"), float("nan")
-    points, ends = library.get_interval_estimates(
-        {"it": scores},
-        lambda each: np.array([mean(each)]),
-        reps=N_RESAMPLES,
-        random_state=np.random.RandomState(seed),
-    )
+    with _numpy_seeded(seed):
+        points, ends = library.get_interval_estimates(
+            {"it": scores}, lambda each: np.array([mean(each)]), reps=N_RESAMPLES
+        )
     return float(points["it"][0]), float(ends["it"][0, 0]), float(ends["it"][1, 0])
+
+
+@contextmanager
+def _numpy_seeded(seed: int) -> Iterator[None]:
+    """Seeds NumPy's global generator, and gives it back as it was.
+
+    rliable's bootstrap draws from that one, whatever `random_state` it is given (seen in 1.2.0).
+    """
+    before = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(before)  # noqa: NPY002

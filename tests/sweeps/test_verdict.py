@@ -31,10 +31,12 @@ def test_verdict_is_over_seeds_and_test_volumes():
 
 
 def test_verdict_of_the_same_trials_is_the_same_and_lacks_those_that_have_not_finished():
-    trials = [judged(number, figures_of([number, seed, 3.0])) for number in (1, 2) for seed in range(3)]
+    scores = np.random.default_rng(0).gamma(2.0, 2.0, (2, 3, 8))
+    trials = [judged(number, figures_of(list(scores[number - 1, seed]))) for number in (1, 2) for seed in range(3)]
     trials.append(judged(2, figures_of([0.0]), TrialState.FAIL))
     first, second = verdicts(trials), verdicts(trials)
     assert first == second
+    assert first != verdicts(trials, seed=1)
     assert [verdict.n_seeds for verdict in first] == [3, 3]
 
 
@@ -49,3 +51,10 @@ def test_verdict_leaves_out_figures_that_some_seeds_lack():
     uneven = [judged(0, figures_of([2.0]) | {f"test/only_{seed}": 1.0}) for seed in range(2)]
     (verdict,) = verdicts(uneven)
     assert verdict.means.keys() == {"test/mean_steps", "test/success_rate"}
+
+
+def test_verdict_leaves_the_draws_of_others_alone():
+    trials = [judged(0, figures_of([float(seed), 3.0])) for seed in range(3)]
+    before = np.random.get_state()  # noqa: NPY002
+    verdicts(trials)
+    np.testing.assert_equal(np.random.get_state(), before)  # noqa: NPY002
