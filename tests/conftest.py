@@ -107,6 +107,26 @@ def unseen_windows():
     pyplot.switch_backend(before)
 
 
+@pytest.fixture(scope="session")
+def postgres():
+    """A server for all tests of this process."""
+    from tests.postgres import postgres_server, programs
+
+    if programs() is None:
+        pytest.skip("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
+    with postgres_server() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def tracking_server(postgres, tmp_path_factory):
+    """An MLflow server that keeps its runs in PostgreSQL, for all tests of this process."""
+    from tests.mlflow_server import mlflow_server
+
+    with mlflow_server(tmp_path_factory.mktemp("mlflow"), postgres.make_database()) as server:
+        yield server
+
+
 @pytest.fixture
 def answer(tmp_path, monkeypatch, capsys):
     """Runs the command in this process, in an empty folder; returns its exit code and what it printed."""

@@ -5,16 +5,6 @@ import pytest
 
 from armscan.sweeps.ledger import Ledger, Limits
 from armscan.sweeps.storage import open_storage
-from tests.postgres import postgres_server, programs
-
-
-@pytest.fixture(scope="session")
-def postgres():
-    """A server for all tests of this process."""
-    if programs() is None:
-        pytest.skip("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
-    with postgres_server() as server:
-        yield server
 
 
 @pytest.fixture(params=["journal", "sqlite", "postgresql"])
