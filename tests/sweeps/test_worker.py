@@ -34,7 +34,9 @@ def work(tmp_path):
         folder = tmp_path / folder
         storage = open_storage(str(folder / "optuna.journal"))
         study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
-        client, experiment_id = open_store(f"sqlite:///{folder}/a.db", experiment="a", artifacts=str(folder / "b"))
+        client, experiment_id = open_store(
+            f"sqlite:///{folder}/a.db", experiment="a", artifacts=str(folder / "b"), wait_s=60.0
+        )
         phase = Phase(
             name="a",
             ledger=Ledger(study, storage, Limits(**{"n_trials": 5} | limits)),
