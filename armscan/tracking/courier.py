@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from armscan.tracking.spool import LANES, Lane, Spool
 # MLflow takes no more of each in one request.
 AT_ONCE = {"metrics": 1000, "params": 100, "tags": 100}
 ENTRIES_AT_ONCE = 200
-LONGEST_PAUSE_S = 5.0
+LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
 
 
 class Courier:
@@ -55,12 +56,14 @@ class Courier:
         Returns:
             Why not everything is delivered; None where it is.
         """
-        is_soon, failure = self._is_done.wait(min(wait_s, 1.0)), self._failure
-        is_away = failure is not None and why_away(failure) is not None
-        if not is_soon and is_away:
-            say(f"run {self._spool.address.run_id}: waiting up to {wait_s:g} s for {self._store.uri}")
-        if not is_soon and (is_away or failure is None):
-            self._is_done.wait(wait_s)
+        until_s, is_told = time.monotonic() + wait_s, False
+        while not self._is_done.wait(min(LOOK_S, max(0.0, until_s - time.monotonic()))):
+            is_refused = self._failure is not None and why_away(self._failure) is None
+            if is_refused or time.monotonic() > until_s:
+                break
+            if self._failure is not None and not is_told:
+                is_told = True
+                say(f"run {self._spool.address.run_id}: waiting up to {wait_s:g} s for {self._store.uri}")
         self._stopped.set()
         self._woken.set()
         # It ends by itself, unless it hangs in a request; this process does not wait for that.

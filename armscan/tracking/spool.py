@@ -146,7 +146,7 @@ class Spool:
     @property
     def status(self) -> str | None:
         """What the run was last said to be, None where nothing was said yet."""
-        said = [entry["status"] for entry in self.entries() if "status" in entry]
+        said = [entry["status"][0] for entry in self.entries() if "status" in entry]
         return said[-1] if said else None
 
     def close(self) -> None:

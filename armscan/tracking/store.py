@@ -33,7 +33,12 @@ LOCK_TIMEOUT_S = 120
 # Where there is no configuration that says it.
 USUAL_WAIT_S = 120.0
 # A server that is away should be said to be away within seconds, not after minutes of retries.
-HTTP_DEFAULTS = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2", "MLFLOW_HTTP_REQUEST_TIMEOUT": "20"}
+DEFAULTS = {
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
+    # Between the lines of a worker's log nobody looks for addresses.
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+}
 
 
 def open_store(
@@ -116,15 +121,16 @@ def _check_texts(**values: object) -> None:
 @contextmanager
 def usable_store(uri: str) -> Iterator[None]:
     """What a store is used in: it answers in time and quietly, and what goes wrong is a `TrackingError` of one line."""
-    for name, value in HTTP_DEFAULTS.items():
+    for name, value in DEFAULTS.items():
         os.environ.setdefault(name, value)
     if SERVER_PASSWORD not in os.environ and (password := password_of(SERVER_PASSWORD)):
         os.environ[SERVER_PASSWORD] = password
     # The making of a new database is told table by table.
     for library in ("alembic", "mlflow"):
         logging.getLogger(library).setLevel(logging.WARNING)
-    # Told with a trace, although it is raised as well.
-    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
+    # What they tell of a store that is away is raised as well.
+    for library in ("mlflow.store.db.utils", "urllib3.connectionpool"):
+        logging.getLogger(library).setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
             # SQLAlchemy tells MLflow's users of MLflow's own deprecated calls.

@@ -52,7 +52,7 @@ def work(tmp_path):
             storage_uri=storage.uri,
             client=client,
             experiment_id=experiment_id,
-            run_id=client.create_run(experiment_id).info.run_id,
+            run_id=client.create_run(experiment_id, name="study", tags={}).info.run_id,
         )
         keeper = Keeper(
             phase.ledger, "0", is_told_to_leave=lambda: False, leave=lambda: os._exit(1), on_death=lambda _: None
