@@ -11,6 +11,7 @@ from optuna.artifacts import FileSystemArtifactStore, upload_artifact
 from optuna.trial import Trial
 
 from armscan.console import from_here
+from armscan.log import say
 from armscan.tracking import TrackingStore
 
 # Where `mlflow ui` answers, for stores that are no server themselves.
@@ -43,8 +44,12 @@ def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:
         picture: a file.
         artifacts: folder of the pictures of all studies.
     """
-    artifacts.mkdir(parents=True, exist_ok=True)
-    upload_artifact(study_or_trial=trial, file_path=str(picture), artifact_store=FileSystemArtifactStore(artifacts))
+    try:
+        artifacts.mkdir(parents=True, exist_ok=True)
+        upload_artifact(study_or_trial=trial, file_path=str(picture), artifact_store=FileSystemArtifactStore(artifacts))
+    except OSError as error:
+        # No reason for a trial to fail: it is in its folder, too.
+        say(f"{picture} cannot be shown in Optuna's dashboard: {error}")
 
 
 def dashboard_command(storage: str, artifacts: str) -> str:

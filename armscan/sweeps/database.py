@@ -95,9 +95,15 @@ class DatabaseStorage:
 
     def alone(self, decide: Callable[[], T]) -> T:
         """See `Storage.alone`; for a database that has a lock."""
-        return self._patience.through(partial(self._alone_once, decide))
+        return self._patience.through(partial(self._at_once, decide, is_alone=True))
 
-    def _alone_once(self, decide: Callable[[], T]) -> T:
+    def together(self, operate: Callable[[], T]) -> T:
+        """See `Storage.together`; for a database that has transactions of several statements."""
+        if getattr(self._here, "inside", None) is not None:
+            return operate()
+        return self._patience.through(partial(self._at_once, operate, is_alone=False))
+
+    def _at_once(self, decide: Callable[[], T], *, is_alone: bool) -> T:
         # One transaction on one connection holds the lock and all that is decided. So nothing is done without the lock:
         # who loses the connection loses both, and nothing is left half done. Only whether it was all done or nothing is
         # not known where the connection is lost while it is committed; whoever decides again looks first.
@@ -108,7 +114,8 @@ class DatabaseStorage:
         with self._rdb.engine.connect() as connection:
             try:
                 with connection.begin():
-                    _lock(connection)
+                    if is_alone:
+                        _lock(connection)
                     sessions.remove()
                     # What Optuna commits in this thread are savepoints of the transaction.
                     sessions(bind=connection, join_transaction_mode="create_savepoint")

@@ -57,6 +57,20 @@ class Storage:
         assert isinstance(self.optuna, DatabaseStorage)
         return self.optuna.alone(decide)
 
+    def together(self, operate: Callable[[], T]) -> T:
+        """Asks for several things at once, where there is a way to go for each: one there and back for all of them.
+
+        Args:
+            operate: asks; see `alone`.
+
+        Returns:
+            What it returns.
+        """
+        if self.lock_file is not None:
+            return operate()
+        assert isinstance(self.optuna, DatabaseStorage)
+        return self.optuna.together(operate)
+
 
 def open_storage(uri: str, *, where: str = "study.storage", is_patient: bool = False) -> Storage:
     """Opens a storage, and makes one where there is none.
