@@ -204,9 +204,7 @@ def main() -> None:
         server.execute("CREATE EXTENSION pg_stat_statements")
         backend = server.make_database()
         tracking = mlflow_server(Path(name), backend) if values.get("tracking") else nullcontext()
-        print(
-            "| workers | trials/min | transactions | statements | database busy | MLflow: statements | database busy |"
-        )
+        print("| workers | trials/min | transactions | statements | busy | MLflow: statements | busy |")
         print("| --- | --- | --- | --- | --- | --- | --- |")
         with tracking as mlflow:
             for n_workers in numbers:

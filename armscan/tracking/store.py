@@ -36,6 +36,8 @@ USUAL_WAIT_S = 120.0
 DEFAULTS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
+    # Nobody has asked for it, and on a cluster it goes nowhere.
+    "MLFLOW_DISABLE_TELEMETRY": "true",
     # Between the lines of a worker's log nobody looks for addresses.
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
 }
