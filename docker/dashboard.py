@@ -9,12 +9,14 @@ from __future__ import annotations
 import os
 import sys
 
-from armscan.sweeps.storage import open_storage, without_password
+from sqlalchemy import make_url
+
+from armscan.sweeps.storage import open_storage
 
 PROGRAM = "optuna-dashboard"
 
 uri = os.environ["ARMSCAN_STORAGE"]
 open_storage(uri, where="ARMSCAN_STORAGE", is_patient=True)
-# Without a password: everybody can read the words of a process.
-address = without_password(uri).replace("postgresql://", "postgresql+psycopg://", 1)
+# Everybody can read the words of a process: a password that stands in the address is not passed on with them.
+address = make_url(uri).set(drivername="postgresql+psycopg").render_as_string(hide_password=True)
 os.execvp(PROGRAM, [PROGRAM, address, *sys.argv[1:]])

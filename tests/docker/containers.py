@@ -104,7 +104,7 @@ class Containers:
             process = self._processes.get(name)
             assert process is None or process.poll() is None, self.log(name)
             assert time.monotonic() < until_s, self.log(name)
-            time.sleep(0.2)
+            time.sleep(0.5)
 
     def stop(self, name: str) -> int:
         """Stops a service as an engine does, which waits for as long as the file says; returns its exit code."""

@@ -20,11 +20,10 @@ from tests.docker.containers import Containers
 from tests.docker.files import FOLDER
 from tests.postgres import PASSWORD, postgres_server, programs
 
-# Trials that only wait, between one and five seconds; a space of their own, because nothing is trained.
+# Trials that only wait, between one and five seconds, and of which only one key is searched.
 TRIALS = (
     "study.task._target_=benchmarks.sleeping.Sleeping study/pruner=none study.n_trials=2 study.judging.best=0 "
-    "data.n_training=1 data.n_validation=1 data.n_test=1 "
-    "'+study.space={training.env_steps:{low:100,high:200},agent.lr:{low:1.0e-4,high:1.0e-2}}'"
+    "agent.gamma=0.5 agent.updates_per_env_step=0.1 agent.batch_size=64 'study.space.agent.lr={low: 0.001, high: 0.01}'"
 )
 # A worker's database connections, beside which others have a place: see POSTGRES_CONNECTIONS.
 MOST_CONNECTIONS = 6
