@@ -30,7 +30,7 @@ SECTIONS = (
     "compute",
 )
 SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
-EVALUATION_KEYS, TRACKING_KEYS = ("episodes",), ("uri", "experiment", "artifacts")
+EVALUATION_KEYS, TRACKING_KEYS = ("episodes",), ("uri", "experiment", "artifacts", "wait_s")
 
 
 @dataclass(frozen=True, kw_only=True)

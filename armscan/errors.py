@@ -64,15 +64,23 @@ class DisplayError(ArmscanError, RuntimeError):
     """There is no screen, notebook or library that could show a window."""
 
 
+class AwayError(ArmscanError, RuntimeError):
+    """A service cannot be reached, and is not waited for any longer."""
+
+
 class TrackingError(ArmscanError, RuntimeError):
     """The tracking store cannot be reached or used."""
+
+
+class TrackingAwayError(TrackingError, AwayError):
+    """The tracking store cannot be reached, and is not waited for any longer."""
 
 
 class StudyError(ArmscanError, RuntimeError):
     """A study cannot be started or gone on with."""
 
 
-class StorageAwayError(StudyError):
+class StorageAwayError(StudyError, AwayError):
     """The storage of a study cannot be reached, and is not waited for any longer."""
 
 

@@ -16,8 +16,8 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from armscan.errors import FolderInUseError, InvalidValueError
-from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, write_whole
+from armscan.errors import FolderInUseError, InvalidValueError, TrackingError
+from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, SPOOLS, write_whole
 from armscan.mistakes import mistake_in_one_line
 from armscan.settings import plain, resume_command
 
@@ -92,7 +92,7 @@ class Multirun(Callback):
         (folder / OUTCOME_FOLDER).mkdir(parents=True)
         command = " ".join(overrides)
         tags = {**source_tags(), "overrides": command}
-        parent = client.create_run(experiment_id, run_name=f"multirun {command}"[:250], tags=tags)
+        parent = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
         word = {"run_id": parent.info.run_id, "tracking": tracking, "overrides": overrides}
         word["is_repeated"] = Multirun.is_repeated
         (folder / PARENT_FILE).write_text(json.dumps(word))
@@ -169,8 +169,12 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         number: outcome for number, outcome in outcomes.items() if outcome.is_failed(is_interrupted=is_interrupted)
     }
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
-    runs = _close_parent(Multirun.folder, status, failed)
     word = json.loads((Multirun.folder / PARENT_FILE).read_text())
+    try:
+        runs, is_known = _close_parent(Multirun.folder, word, status, failed), True
+    except TrackingError as error:
+        print(f"{error}; python -m armscan.track sync {Multirun.folder} delivers the rest", file=sys.stderr)
+        runs, is_known = [], False
     if outcomes:
         from armscan.console import print_jobs, print_where_to_look
 
@@ -184,32 +188,37 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         if run.info.status != "FINISHED" and (Path(run.data.tags["folder"]) / LAST_CHECKPOINT).exists():
             again = resume_command(run.info.run_id, word["tracking"]["uri"])
             print(f"resume job {run.data.tags[JOB_TAG]} with: {again}", file=sys.stderr)
-    if not runs:
+    if is_known and not runs:
         remove_run_folder(Multirun.folder)
     return 1 if failed or not outcomes else 0
 
 
-def _close_parent(folder: Path, status: str, failed: Mapping[str, Outcome]) -> list[Run]:
+def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Mapping[str, Outcome]) -> list[Run]:
     """Closes the parent run and what a killed job left open; deletes it where no job got as far as a run of its own.
 
     Returns:
         The runs of those that got as far as that, in the order of the jobs.
-    """
-    from armscan.tracking import open_store
 
-    word = json.loads((folder / PARENT_FILE).read_text())
-    client, experiment_id = open_store(**word["tracking"])
-    children = client.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
+    Raises:
+        TrackingError: if the store is away for longer than a run waits for it at its end.
+    """
+    from armscan.tracking import TrackedRun, open_store, sync
+
+    store, experiment_id = open_store(**word["tracking"], patience_s=word["tracking"]["wait_s"])
+    parent = TrackedRun.joined(store, word["run_id"], name="multirun", folder=folder)
+    tags = {f"failure.{number}": f"{each.varied}: {each.failure}"[:MAX_TAG_CHARS] for number, each in failed.items()}
+    parent.set_tags(tags)
+    parent.end(status)
+    # What jobs have left because the store was away.
+    sync(folder, lambda _: store)
+    children = store.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
     for child in children:
         if child.info.status == "RUNNING":
             is_killed = status == "KILLED"
-            client.set_tag(child.info.run_id, "failure", INTERRUPTED if is_killed else NO_OUTCOME)
-            client.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
-    for number, outcome in failed.items():
-        client.set_tag(word["run_id"], f"failure.{number}", f"{outcome.varied}: {outcome.failure}"[:MAX_TAG_CHARS])
-    client.set_terminated(word["run_id"], status)
+            store.set_tag(child.info.run_id, "failure", INTERRUPTED if is_killed else NO_OUTCOME)
+            store.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
     if not children:
-        client.delete_run(word["run_id"])
+        store.delete_run(word["run_id"])
     return sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))
 
 
@@ -225,7 +234,7 @@ def remove_run_folder(folder: Path) -> None:
 
     Nothing else is touched: the folder may be one that somebody named, with other files in it.
     """
-    for ours in (folder / ".hydra", folder / OUTCOME_FOLDER):
+    for ours in (folder / ".hydra", folder / OUTCOME_FOLDER, folder / SPOOLS):
         shutil.rmtree(ours, ignore_errors=True)
     for ours in (folder / PARENT_FILE, folder / "multirun.yaml", folder / LOCK_FILE):
         ours.unlink(missing_ok=True)

@@ -39,7 +39,7 @@ def plain(config: DictConfig | ListConfig) -> dict[str, Any]:
     return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
 
 
-def usual_tracking() -> dict[str, str]:
+def usual_tracking() -> dict[str, Any]:
     """Returns the section `tracking` as it is where nobody says anything else."""
     with (resources.files(CONFIG_MODULE) / "tracking" / "mlflow.yaml").open() as file:
         return plain(OmegaConf.load(file))

@@ -15,8 +15,9 @@ from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
 
-from armscan.errors import StorageAwayError
+from armscan.errors import AwayError, StorageAwayError
 from armscan.mistakes import quieten_libraries
+from armscan.patience import impatient
 from armscan.settings import plain
 from armscan.sweeps.attempt import composed
 from armscan.sweeps.checking import check_space
@@ -24,13 +25,14 @@ from armscan.sweeps.command_line import LAUNCHER, USUAL_LAUNCHER, WORKER_KEY, Co
 from armscan.sweeps.database import hand_over_password
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy, open_for_work, read_settings
-from armscan.sweeps.patience import impatient
 from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import Screen, print_result
 from armscan.sweeps.storage import without_password
 from armscan.sweeps.study import existing_study
 from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, keep_gpus, local_workers
-from armscan.sweeps.worker import close_runs_of
+from armscan.sweeps.worker import close_orphans, close_runs_of
+from armscan.tracking import TrackedRun, sync
+from armscan.tracking.run import SHORT_WAIT_S
 
 LAUNCHERS_ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
 LEAVE_S = 4.0
@@ -87,13 +89,14 @@ def _launched(opened: OpenStudy, given: CommandLine, launcher: str, launch: Call
     waiting: AbstractContextManager[None] = contextlib.nullcontext()
     if launcher == "joblib":
         started.append(f"hydra.launcher.n_jobs={n_workers}")
-    opened.client.update_run(opened.run_id, status="RUNNING")
+    tracked = TrackedRun.joined(opened.client, opened.run_id, name=opened.settings.name, folder=folder)
+    tracked.set_status("RUNNING")
     if launcher == USUAL_LAUNCHER:
         started.insert(1, f"hydra.launcher.timeout_min={MINUTES_WITHOUT_END}")
         waiting = _interrupted_alone()
         keep_gpus()
     try:
-        with _leaving(opened, folder), Screen(opened, folder), waiting:
+        with _leaving(opened, folder, tracked), Screen(opened, folder), waiting:
             launch(started)
     except KeyboardInterrupt:
         print("interrupted; the same command goes on with the study", file=sys.stderr)
@@ -102,7 +105,7 @@ def _launched(opened: OpenStudy, given: CommandLine, launcher: str, launch: Call
 
 
 @contextlib.contextmanager
-def _leaving(opened: OpenStudy, folder: Path) -> Iterator[None]:
+def _leaving(opened: OpenStudy, folder: Path, tracked: TrackedRun) -> Iterator[None]:
     """What the workers are launched in: on the way out none of them is left, and nothing that they ran is open."""
     status, is_asked = "FINISHED", threading.Event()
     patience = threading.Timer(LEAVE_S, os.kill, (os.getpid(), signal.SIGINT))
@@ -136,11 +139,24 @@ def _leaving(opened: OpenStudy, folder: Path) -> Iterator[None]:
             for phase in opened.begun():
                 for trial in phase.ledger.reclaim(Witness().is_dead):
                     close_runs_of(trial, phase)
-        opened.client.set_terminated(opened.run_id, "KILLED" if is_asked.is_set() else status)
+        _deliver(opened, tracked, "KILLED" if is_asked.is_set() else status)
         for each, handler in before.items():
             signal.signal(each, handler)
     if is_asked.is_set():
         raise KeyboardInterrupt
+
+
+def _deliver(opened: OpenStudy, tracked: TrackedRun, status: str) -> None:
+    """Ends the study's own run, and delivers what the runs of its trials have left because their store was away."""
+    is_there = tracked.end(status, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
+    left = []
+    if is_there:
+        left = [each.folder for each in sync(opened.folder, lambda _: opened.client) if each.left]
+        with contextlib.suppress(AwayError), impatient():
+            for phase in opened.begun():
+                close_orphans(phase)
+    if not is_there or left:
+        print(f"not all is tracked: python -m armscan.track sync {opened.folder} delivers the rest", file=sys.stderr)
 
 
 @contextlib.contextmanager

@@ -7,18 +7,17 @@ import sys
 from pathlib import Path
 
 import optuna
-from mlflow import MlflowClient
 from optuna.artifacts import FileSystemArtifactStore, upload_artifact
 from optuna.trial import Trial
 
 from armscan.console import from_here
-from armscan.sweeps.storage import without_password
+from armscan.tracking import TrackingStore
 
 # Where `mlflow ui` answers, for stores that are no server themselves.
 USUAL_UI = "http://127.0.0.1:5000"
 
 
-def note_run(noted: optuna.Study | Trial, client: MlflowClient, experiment_id: str, run_id: str, folder: Path) -> None:
+def note_run(noted: optuna.Study | Trial, client: TrackingStore, experiment_id: str, run_id: str, folder: Path) -> None:
     """Leaves a note with the link to the tracked run, and the folder.
 
     Args:
@@ -31,8 +30,7 @@ def note_run(noted: optuna.Study | Trial, client: MlflowClient, experiment_id: s
     # Deferred: it takes a second, and only who works at a study needs it.
     from optuna_dashboard import save_note
 
-    uri = str(client.tracking_uri)
-    address = without_password(uri).rstrip("/") if uri.startswith("http") else USUAL_UI
+    address = client.uri.rstrip("/") if client.uri.startswith("http") else USUAL_UI
     link = f"[its run in MLflow]({address}/#/experiments/{experiment_id}/runs/{run_id})"
     save_note(noted, f"{link}, {run_id}\n\nits folder: `{folder.resolve()}`")
 

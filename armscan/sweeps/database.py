@@ -14,7 +14,9 @@ from optuna.storages import BaseStorage, RDBStorage, get_storage
 from optuna.trial import TrialState
 from sqlalchemy import URL, Connection, create_engine, inspect, make_url, text
 
-from armscan.sweeps.patience import ConnectionLostError, Patience
+from armscan.errors import StorageAwayError
+from armscan.patience import Patience
+from armscan.sweeps.away import ConnectionLostError, why_away
 
 T = TypeVar("T")
 # One of a PostgreSQL database's advisory locks.
@@ -153,7 +155,8 @@ def open_database(url: URL, shown: str, *, is_patient: bool, is_made: bool = Tru
         is_patient: whether to wait for it.
         is_made: whether the tables are made where there are none.
     """
-    opened = DatabaseStorage(url, Patience(shown), is_patient=is_patient, is_made=is_made)
+    patience = Patience("the storage", f"study.storage is {shown!r}", why_away, StorageAwayError)
+    opened = DatabaseStorage(url, patience, is_patient=is_patient, is_made=is_made)
     return cast(BaseStorage, opened)
 
 

@@ -13,8 +13,8 @@ from typing import Any
 
 from optuna.trial import FrozenTrial, Trial
 
+from armscan.log import say
 from armscan.sweeps.ledger import Ledger
-from armscan.sweeps.log import say
 from armscan.sweeps.tally import HOLDER, LEASE
 
 BEAT_S, TICK_S = 10.0, 0.25

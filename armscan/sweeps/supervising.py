@@ -20,7 +20,7 @@ from typing import Self
 
 from omegaconf import DictConfig
 
-from armscan.errors import StorageAwayError
+from armscan.errors import AwayError
 from armscan.files import write_whole
 from armscan.sweeps.command_line import words_of_trials
 from armscan.sweeps.lease import process_start
@@ -162,11 +162,11 @@ def worker_main() -> None:
         is_alone = os.getppid() != parent_pid or launcher.is_gone
         return is_asked.is_set() or is_alone or (folder / STOP_FILE).exists()
 
-    from armscan.sweeps.log import say
+    from armscan.log import say
     from armscan.sweeps.working import work
 
     try:
         work(words, f"{folder.name}/{number}", is_told_to_leave, leave=lambda: os._exit(LEFT))
-    except StorageAwayError as error:
+    except AwayError as error:
         say(str(error))
         raise SystemExit(AWAY) from error

@@ -16,19 +16,20 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.checks import check_float
-from armscan.errors import InvalidValueError, StorageAwayError, listed
+from armscan.errors import InvalidValueError, StorageAwayError, TrackingAwayError, listed
 from armscan.files import CONFIG_FILE, SUM_TAGS
+from armscan.log import say
 from armscan.mistakes import mistake_in_one_line
 from armscan.settings import plain
 from armscan.sweeps.attempt import CONFIG_SUM, FOLDER, RUN, Attempt, composed, sum_of_config, trial_folder
 from armscan.sweeps.dashboard import note_run, show_picture
 from armscan.sweeps.lease import Keeper, LimitReachedError
-from armscan.sweeps.log import say
 from armscan.sweeps.parts import make_sampler
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.tally import ENV_STEPS, FIGURES, RETRY_OF
 from armscan.sweeps.values import overrides_of
-from armscan.tracking import TrackedRun
+from armscan.tracking import TrackedRun, abandon
+from armscan.tracking.run import FAILURE_TAG, SHORT_WAIT_S
 
 WAIT_S = 1.0
 MAX_REASON_CHARS = 2000
@@ -75,6 +76,10 @@ class Worker:
             say(f"trial {trial.number} is handed back: {limit}")
             self._keeper.hand_back()
             self._tracked = None
+        except TrackingAwayError:
+            # For whoever finds the tracking store back.
+            self._keeper.hand_back()
+            raise
         except StorageAwayError:
             raise
         # Whatever else a trial raises is the trial's, and not the study's; this process is told to leave otherwise.
@@ -135,7 +140,7 @@ class Worker:
         if RETRY_OF in attributes:
             tags["trial.retry_of"] = str(attributes[RETRY_OF])
         if RUN in attributes:
-            tracked = TrackedRun.go_on(phase.client, attributes[RUN], config={}, tags=tags)
+            tracked = TrackedRun.go_on(phase.client, attributes[RUN], folder=folder, config={}, tags=tags)
         else:
             tracked = TrackedRun.start(
                 phase.client,
@@ -143,6 +148,7 @@ class Worker:
                 name=f"{phase.name}-{trial.number:04d}",
                 config=chosen,
                 tags=tags,
+                folder=folder,
                 parent_id=phase.run_id,
             )
             # Before the trial knows its run: who goes on with it makes no note any more.
@@ -168,7 +174,7 @@ class Worker:
         if self._tracked is not None:
             self._tracked.log_figures(trial.user_attrs.get(FIGURES, {}), n_env_steps=0)
             if state == TrialState.PRUNED:
-                self._phase.client.set_tag(self._tracked.run_id, "pruned", "true")
+                self._tracked.set_tags({"pruned": "true"})
             self._tracked.end("FINISHED")
         self._tracked = None
 
@@ -210,17 +216,21 @@ def checked_figures(figures: Any, objectives: Sequence[str]) -> dict[str, float]
 
 
 def close_runs_of(trial: FrozenTrial, phase: Phase) -> None:
-    """Closes what a dead worker has left open in the tracking store."""
-    run_id = trial.user_attrs.get(RUN)
-    if run_id is None:
-        return
-    client, reason = phase.client, "its worker died"
-    children = client.search_runs(
-        [phase.experiment_id], f"tags.mlflow.parentRunId = '{run_id}' AND attributes.status = 'RUNNING'"
+    """Closes what a dead worker has left open in the tracking store, but for what a retry has taken over since."""
+    abandon(trial_folder(phase.folder, trial.number), phase.client, "its worker died")
+
+
+def close_orphans(phase: Phase) -> None:
+    """Closes runs of trials that failed, because their workers died before they could leave word of the run."""
+    running = phase.client.search_runs(
+        [phase.experiment_id], f"tags.study = '{phase.name}' AND attributes.status = 'RUNNING'"
     )
-    for each in (*(child.info.run_id for child in children), run_id):
-        client.set_tag(each, "failure", reason)
-        client.set_terminated(each, "FAILED")
+    tally = phase.ledger.tally()
+    failed = {str(trial.number) for trial in (*tally.failed, *tally.retried)}
+    for run in running:
+        if run.data.tags.get("trial") in failed:
+            phase.client.set_tag(run.info.run_id, FAILURE_TAG, "its worker died")
+            phase.client.set_terminated(run.info.run_id, "FAILED")
 
 
 def _steps_of(trial: Trial) -> set[int]:
@@ -237,4 +247,4 @@ def _beginning(trial: Trial) -> str:
 
 def _close(runs: Sequence[TrackedRun]) -> None:
     for run in runs:
-        run.end("KILLED", reason="handed back")
+        run.end("KILLED", reason="handed back", wait_s=SHORT_WAIT_S)
