@@ -6,7 +6,7 @@ import json
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any, Self
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from armscan.errors import FolderInUseError, InvalidValueError, TrackingError
 from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, SPOOLS, write_whole
 from armscan.mistakes import mistake_in_one_line
-from armscan.settings import plain, resume_command
+from armscan.passwords import check_written
+from armscan.settings import TRACKING_URI, plain, resume_command
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -67,14 +68,29 @@ class Multirun(Callback):
     # Whether what has finished of an earlier one is not run again.
     is_repeated = False
 
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Checks what a single run would write down."""
+        self._answered(self._check, config)
+
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Opens the store, starts the parent run, and leaves word of it for the jobs."""
+        self._answered(self._check, config)
+        self._answered(self._start, config)
+
+    @staticmethod
+    def _answered(begin: Callable[[DictConfig], None], config: DictConfig) -> None:
         try:
-            self._start(config)
+            begin(config)
         # Hydra would turn any exception of a callback into a warning, and start the jobs all the same.
         except Exception as error:
             print(f"error: {mistake_in_one_line(error) or repr(error)}", file=sys.stderr)
             raise SystemExit(2) from error
+
+    @staticmethod
+    def _check(config: DictConfig) -> None:
+        for key in (TRACKING_URI, "study.storage"):
+            if isinstance(uri := OmegaConf.select(config, key), str):
+                check_written(key, uri)
 
     @staticmethod
     def _start(config: DictConfig) -> None:

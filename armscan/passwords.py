@@ -90,13 +90,25 @@ def masked(text: str) -> str:
     return text
 
 
+def check_written(key: str, uri: str) -> None:
+    """Raises `InvalidValueError` where an address has a password in a configuration, which is written into files."""
+    if password_in(uri) is not None:
+        raise InvalidValueError(
+            f"{key} is {without_password(uri)!r} with a password, which would be written into the files of each run: "
+            f"set {_variable_of(key)}, or give the whole address in conf/local/services.yaml"
+        )
+
+
 def check_words(words: Sequence[str]) -> None:
     """Raises `InvalidValueError` for words of a command line with a password, which everybody on a machine can read."""
     for word in words:
         key, _, value = word.partition("=")
         if password_in(value.strip("'\"")) is not None:
-            where = STORAGE_PASSWORD if key.endswith("storage") else f"{SERVER_PASSWORD} or {TRACKING_PASSWORD}"
             raise InvalidValueError(
-                f"{key} has a password, which everybody on this machine could read on the command line: set {where}, "
-                "or give the whole address in conf/local/services.yaml"
+                f"{key} has a password, which everybody on this machine could read on the command line: set "
+                f"{_variable_of(key)}, or give the whole address in conf/local/services.yaml"
             )
+
+
+def _variable_of(key: str) -> str:
+    return STORAGE_PASSWORD if key.endswith("storage") else f"{SERVER_PASSWORD} or {TRACKING_PASSWORD}"

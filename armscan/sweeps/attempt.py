@@ -17,7 +17,7 @@ from optuna.trial import Trial
 
 from armscan.errors import InvalidValueError
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
-from armscan.settings import SWEEPS, plain
+from armscan.settings import CLUSTER, SWEEPS, plain
 from armscan.sweeps.tally import ENV_STEPS, RETRY_OF, SEEDS
 from armscan.sweeps.values import Value, overrides_of
 from armscan.tracking import TrackedRun
@@ -132,7 +132,9 @@ def composed(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
         config = compose(CONFIG_NAME, list(words), return_hydra_config=True)
     choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
     with open_dict(config):
-        for section in ("study", "hydra"):
+        # Where runs are tracked is the same whatever said so.
+        config.tracking = plain(config.tracking)
+        for section in ("study", "hydra", CLUSTER):
             config.pop(section, None)
     return config, choices
 

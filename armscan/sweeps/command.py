@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import signal
 import socket
@@ -17,17 +16,16 @@ from pathlib import Path
 
 from armscan.errors import AwayError, StorageAwayError
 from armscan.mistakes import quieten_libraries
+from armscan.passwords import check_written
 from armscan.patience import impatient
-from armscan.settings import plain
+from armscan.settings import TRACKING_URI, plain
 from armscan.sweeps.attempt import composed
 from armscan.sweeps.checking import check_space
-from armscan.sweeps.command_line import LAUNCHER, USUAL_LAUNCHER, WORKER_KEY, CommandLine
-from armscan.sweeps.database import hand_over_password
+from armscan.sweeps.command_line import LAUNCHER, STORAGE, USUAL_LAUNCHER, WORKER_KEY, CommandLine
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy, open_for_work, read_settings
 from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import Screen, print_result
-from armscan.sweeps.storage import without_password
 from armscan.sweeps.study import existing_study
 from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, keep_gpus, local_workers
 from armscan.sweeps.worker import close_orphans, close_runs_of
@@ -58,10 +56,9 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     given = CommandLine.read(words)
     quieten_libraries()
     settings, task, config = read_settings(given.of_trials)
-    # Words are written into files, logs and the tracking store.
-    hand_over_password(settings.storage)
-    settings = dataclasses.replace(settings, storage=without_password(settings.storage))
-    given = given.with_storage(settings.storage)
+    for key, uri in ((STORAGE, settings.storage), (TRACKING_URI, config.tracking.uri)):
+        check_written(key, uri)
+    given = given.with_services({STORAGE: settings.storage, TRACKING_URI: config.tracking.uri})
     launcher = composed(given.launching)[1][LAUNCHER]
     if launcher in LAUNCHERS_ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -15,6 +14,7 @@ from optuna.trial import TrialState
 from sqlalchemy import URL, Connection, create_engine, inspect, make_url, text
 
 from armscan.errors import StorageAwayError
+from armscan.passwords import STORAGE_PASSWORD, password_of
 from armscan.patience import Patience
 from armscan.sweeps.away import ConnectionLostError, why_away
 
@@ -31,8 +31,6 @@ TCP = {
     "keepalives_count": 3,
     "tcp_user_timeout": 25_000,
 }
-# Where the address has no password: the command hands it to its workers so, and not in words that are written down.
-PASSWORD_VARIABLE = "ARMSCAN_STORAGE_PASSWORD"
 
 
 def url_of(uri: str) -> URL:
@@ -41,7 +39,7 @@ def url_of(uri: str) -> URL:
     if url.drivername == "postgresql":
         url = url.set(drivername="postgresql+psycopg")
     if url.get_backend_name() == "postgresql" and url.password is None:
-        url = url.set(password=os.environ.get(PASSWORD_VARIABLE))
+        url = url.set(password=password_of(STORAGE_PASSWORD))
     return url
 
 
@@ -135,15 +133,6 @@ class DatabaseStorage:
 
 
 BaseStorage.register(DatabaseStorage)
-
-
-def hand_over_password(uri: str) -> None:
-    """Keeps the password of an address, where it has one, for this process and those that it starts."""
-    if not uri.startswith("postgresql"):
-        return
-    url = make_url(uri)
-    if password := url.password or url.query.get("password"):
-        os.environ[PASSWORD_VARIABLE] = str(password)
 
 
 def open_database(url: URL, shown: str, *, is_patient: bool, is_made: bool = True) -> BaseStorage:

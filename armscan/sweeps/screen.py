@@ -17,6 +17,7 @@ from rich.text import Text
 
 from armscan.console import print_where_to_look
 from armscan.errors import StorageAwayError
+from armscan.passwords import without_password
 from armscan.patience import impatient
 from armscan.settings import report_command
 from armscan.sweeps.dashboard import dashboard_command
@@ -24,7 +25,6 @@ from armscan.sweeps.judging import best_trials
 from armscan.sweeps.ledger import Ledger
 from armscan.sweeps.opening import OpenStudy
 from armscan.sweeps.settings import StudySettings
-from armscan.sweeps.storage import without_password
 from armscan.sweeps.tally import ENV_STEPS, FAILURE, JUDGED, JUDGED_SEED, LEASE, RETRIED, Tally
 from armscan.sweeps.values import overrides_of
 from armscan.sweeps.verdict import shown_of, verdicts
