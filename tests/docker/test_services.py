@@ -132,7 +132,7 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     assert states(postgres_there) == ["WAITING"]
     assert not containers.is_healthy("worker")
 
-    assert containers.start("worker").wait(120) == 0, containers.log("worker")
+    assert containers.start("worker").wait(300) == 0, containers.log("worker")
     assert states(postgres_there) == ["COMPLETE"] * 2
     shown = json.loads(asked(f"{dashboard}/api/studies")[1])
     assert [study["study_name"] for study in shown["study_summaries"]] == ["sac_y"]
