@@ -63,7 +63,7 @@ class Containers:
                 replaced[rf"\b{inside}\b"] = str(self.ports[name])
             for volume in service.get("volumes", []):
                 source, target = volume.split(":")[:2]
-                if target not in self._image.copied and not source.startswith("."):
+                if not source.startswith("."):
                     (self.folder / source).mkdir(exist_ok=True)
                     replaced[rf"(?<![\w/.]){target}\b"] = str(self.folder / source)
         return replaced
