@@ -1,8 +1,12 @@
 """Tracking stores that are away for a while, or for good: training goes on, and nothing is lost."""
 
+import os
+import shutil
+import subprocess
 import threading
 import time
 from collections import Counter
+from pathlib import Path
 
 import pytest
 from mlflow import MlflowClient
@@ -162,7 +166,7 @@ def test_store_is_waited_for_where_somebody_has_patience(server, capfd):
 
 
 def test_figures_are_kept_where_files_cannot_be_because_the_disk_is_full(tmp_path, monkeypatch, capfd):
-    """A folder that cannot be written to stands for the disk: what a store raises is an `OSError` in both cases."""
+    """Something in the way of the folder stands for the disk: what is raised is an `OSError` in both cases."""
     uri, artifacts = f"sqlite:///{tmp_path}/runs.db", tmp_path / "artifacts"
     store, experiment_id = open_store(uri, experiment="test", artifacts=str(artifacts), wait_s=1.0)
     artifacts.write_text("in the way")
@@ -177,6 +181,39 @@ def test_figures_are_kept_where_files_cannot_be_because_the_disk_is_full(tmp_pat
     artifacts.unlink()
     assert track(["sync", str(tmp_path / "run")]) == 0
     assert [file.path for file in MlflowClient(uri).list_artifacts(tracked.run_id)] == ["best.pt"]
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A folder on a disk of its own, of 256 KiB; and what makes that larger."""
+    folder = tmp_path / "server" / "artifacts"
+    folder.mkdir(parents=True)
+    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("a small disk cannot be mounted here: it needs root")
+    yield folder, lambda: subprocess.run(["mount", "-o", "remount,size=16m", str(folder)], check=True)
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def test_run_ends_where_the_servers_disk_is_full_and_its_files_are_delivered_later(small_disk, tmp_path, capfd):
+    artifacts, make_larger = small_disk
+    with mlflow_server(tmp_path / "server", f"sqlite:///{tmp_path}/runs.db") as server:
+        assert server.artifacts == artifacts
+        store, experiment_id = open_store(server.uri, experiment="test", artifacts="-", wait_s=20.0)
+        tracked = begun((store, experiment_id), tmp_path / "run")
+        weights = tmp_path / "run" / "best.pt"
+        weights.write_bytes(os.urandom(2**20))
+        tracked.log_files(weights)
+        tracked.log_figures({"x": 1.0}, n_env_steps=7)
+        assert not tracked.end("FINISHED")
+        assert capfd.readouterr().out.count("cannot be reached or written to") == 1
+        assert histories(server.uri, tracked.run_id) == {"x": [(7, 1.0)]}
+        client = MlflowClient(server.uri)
+        assert client.get_run(tracked.run_id).info.status == "FINISHED"
+        make_larger()
+        assert track(["sync", str(tmp_path / "run")]) == 0
+        kept = client.download_artifacts(tracked.run_id, "best.pt", str(tmp_path))
+        assert Path(kept).read_bytes() == weights.read_bytes()
 
 
 def test_run_that_was_deleted_meanwhile_is_not_waited_for(opened, server, tmp_path, capfd):
