@@ -27,7 +27,8 @@ from armscan.patience import Patience
 from armscan.sweeps import worker as worker_module
 from armscan.sweeps.attempt import Attempt
 from armscan.sweeps.lease import Keeper
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.space import Space
 from armscan.sweeps.storage import open_storage

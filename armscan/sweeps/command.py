@@ -21,6 +21,7 @@ from armscan.patience import impatient
 from armscan.settings import TRACKING_URI, plain
 from armscan.sweeps.attempt import composed
 from armscan.sweeps.checking import check_space
+from armscan.sweeps.clearing import close_orphans, close_runs_of
 from armscan.sweeps.command_line import LAUNCHER, STORAGE, USUAL_LAUNCHER, WORKER_KEY, CommandLine
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy, open_for_work, read_settings
@@ -28,7 +29,6 @@ from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import Screen, print_result
 from armscan.sweeps.study import existing_study
 from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, Process, keep_gpus, local_workers
-from armscan.sweeps.worker import close_orphans, close_runs_of
 from armscan.tracking import TrackedRun, sync
 from armscan.tracking.run import SHORT_WAIT_S
 

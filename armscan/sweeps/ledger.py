@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import optuna
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.outcome import Notes, Outcome
 from armscan.sweeps.storage import Storage
 from armscan.sweeps.tally import (
@@ -32,27 +32,6 @@ from armscan.sweeps.tally import (
 )
 
 T = TypeVar("T")
-# After this many failures, with no trial that got anywhere, the fault is in the configuration and not in a trial.
-FAILURES_AT_ONCE = 3
-
-
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """When a study has enough.
-
-    Args:
-        n_trials: that finish.
-        max_failures: trials that may fail for good.
-        max_retries: of a trial whose worker died.
-        hours: wall time in which trials run; None for no limit.
-        env_steps: of all trials; None for no limit.
-    """
-
-    n_trials: int
-    max_failures: int = 10
-    max_retries: int = 1
-    hours: float | None = None
-    env_steps: int | None = None
 
 
 class Ledger:
@@ -141,26 +120,13 @@ class Ledger:
         return self.spent(tally)
 
     def spent(self, tally: Tally) -> str | None:
-        """Returns why no trial is to be gone on with, for time or environment steps; None where there are some left."""
-        limits = self._limits
-        if limits.hours is not None and tally.busy_hours >= limits.hours:
-            return f"the {limits.hours:g} hours of study.hours are over"
-        if limits.env_steps is not None and tally.env_steps >= limits.env_steps:
-            return f"the {limits.env_steps} environment steps of study.env_steps are taken"
-        return None
+        """See `Limits.spent`."""
+        return self._limits.spent(tally)
 
     def broken(self, tally: Tally) -> str | None:
-        """Returns why so many trials have failed that the study ends; None where they are few enough."""
-        limits, failed = self._limits, tally.failed
-        if failed:
-            forgiven = self.study.user_attrs.get(FORGIVEN, ())
-            failed = tuple(trial for trial in failed if trial.number not in forgiven)
-        if len(failed) > limits.max_failures:
-            return f"{len(failed)} trials have failed, and at most {limits.max_failures} may: {_reason(failed[-1])}"
-        got_nowhere = not tally.finished and not any(trial.intermediate_values for trial in tally.all)
-        if len(failed) >= FAILURES_AT_ONCE and got_nowhere:
-            return f"the first {len(failed)} trials failed before they reported anything: {_reason(failed[0])}"
-        return None
+        """See `Limits.broken`; failures that were forgiven do not count."""
+        forgiven = self.study.user_attrs.get(FORGIVEN, ()) if tally.failed else ()
+        return self._limits.broken(tally, forgiven)
 
     def forgive(self) -> int:
         """Lets failures count no more, where there were too many: somebody starts the study again all the same.
@@ -269,7 +235,3 @@ class Ledger:
             return storage.set_trial_state_values(trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
             return False
-
-
-def _reason(trial: FrozenTrial) -> str:
-    return f"trial {trial.number}: {trial.user_attrs.get(FAILURE, 'no reason is known')}"

@@ -18,7 +18,8 @@ from armscan.sweeps.attempt import composed, study_section
 from armscan.sweeps.command_line import fixed_by
 from armscan.sweeps.dashboard import note_run
 from armscan.sweeps.judging import make_judging_study, seed_of_judged
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.parts import make_pruner, make_sampler, make_task
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.settings import StudySettings

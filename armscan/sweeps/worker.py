@@ -4,33 +4,32 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
 from optuna.exceptions import UpdateFinishedTrialError
-from optuna.trial import FrozenTrial, Trial, TrialState
+from optuna.trial import Trial, TrialState
 
-from armscan.checks import check_float
-from armscan.errors import InvalidValueError, StorageAwayError, TrackingAwayError, listed
+from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.files import CONFIG_FILE, SUM_TAGS
 from armscan.log import say
 from armscan.mistakes import mistake_in_one_line
 from armscan.settings import plain
 from armscan.sweeps.attempt import CONFIG_SUM, FOLDER, RUN, Attempt, composed, sum_of_config, trial_folder
 from armscan.sweeps.dashboard import note_run, show_picture
+from armscan.sweeps.figures import checked_figures
 from armscan.sweeps.lease import Keeper, LimitReachedError
 from armscan.sweeps.outcome import Once, Outcome
 from armscan.sweeps.parts import make_sampler
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.tally import ENV_STEPS, FAILURE, FIGURES, RETRY_OF
 from armscan.sweeps.values import overrides_of
-from armscan.tracking import TrackedRun, abandon
-from armscan.tracking.run import FAILURE_TAG, SHORT_WAIT_S
+from armscan.tracking import TrackedRun
+from armscan.tracking.run import SHORT_WAIT_S
 
 WAIT_S = 1.0
 MAX_REASON_CHARS = 2000
@@ -214,46 +213,6 @@ class Worker:
         say(f"trial {trial.number} was taken over by another worker")
         if tracked is not None:
             tracked.end("FAILED", reason="taken over by another worker")
-
-
-def checked_figures(figures: Any, objectives: Sequence[str]) -> dict[str, float]:
-    """Returns what a task has returned.
-
-    Args:
-        figures: by name; those that are no objectives may be NaN.
-        objectives: the names of those that must be there, and finite.
-
-    Raises:
-        InvalidValueError: if it is anything else.
-    """
-    if not isinstance(figures, Mapping):
-        raise InvalidValueError(f"the task has returned {figures!r}, but it must be figures by their names")
-    if missing := [name for name in objectives if name not in figures]:
-        raise InvalidValueError(f"the task has not returned {missing[0]}, but only {listed(list(figures))}")
-    for name, figure in figures.items():
-        if name in objectives:
-            check_float(f"what the task has returned as {name}", figure)
-        elif not isinstance(figure, Real):
-            raise InvalidValueError(f"what the task has returned as {name} is {figure!r}, but it must be a number")
-    return {str(name): float(figure) for name, figure in figures.items()}
-
-
-def close_runs_of(trial: FrozenTrial, phase: Phase) -> None:
-    """Closes what a dead worker has left open in the tracking store, but for what a retry has taken over since."""
-    abandon(trial_folder(phase.folder, trial.number), phase.client, "its worker died")
-
-
-def close_orphans(phase: Phase) -> None:
-    """Closes runs of trials that failed, because their workers died before they could leave word of the run."""
-    running = phase.client.search_runs(
-        [phase.experiment_id], f"tags.study = '{phase.name}' AND attributes.status = 'RUNNING'"
-    )
-    tally = phase.ledger.tally()
-    failed = {str(trial.number) for trial in (*tally.failed, *tally.retried)}
-    for run in running:
-        if run.data.tags.get("trial") in failed:
-            phase.client.set_tag(run.info.run_id, FAILURE_TAG, "its worker died")
-            phase.client.set_terminated(run.info.run_id, "FAILED")
 
 
 def _steps_of(trial: Trial) -> set[int]:

@@ -7,10 +7,11 @@ from functools import partial
 
 from armscan.log import say
 from armscan.mistakes import quieten_libraries
+from armscan.sweeps.clearing import close_runs_of
 from armscan.sweeps.lease import Keeper
 from armscan.sweeps.opening import open_for_work, read_settings
 from armscan.sweeps.phases import Phase
-from armscan.sweeps.worker import Worker, close_runs_of
+from armscan.sweeps.worker import Worker
 
 
 def work(words: Sequence[str], name: str, is_told_to_leave: Callable[[], bool], *, leave: Callable[[], None]) -> None:

@@ -4,7 +4,8 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.outcome import Notes, Outcome
 from armscan.sweeps.storage import open_storage
 from armscan.sweeps.tally import FAILURE

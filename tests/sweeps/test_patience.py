@@ -18,7 +18,8 @@ from armscan.errors import StorageAwayError
 from armscan.sweeps import lease, screen
 from armscan.sweeps.away import is_away
 from armscan.sweeps.lease import Keeper, Witness, process_start
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.storage import open_storage
 from armscan.sweeps.tally import LEASE, RETRY_OF
 

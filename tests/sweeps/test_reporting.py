@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 from armscan import report
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.storage import open_storage
 from tests.sweeps.conftest import fail
 

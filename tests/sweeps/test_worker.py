@@ -9,7 +9,8 @@ import pytest
 
 from armscan.sweeps.judging import best_trials
 from armscan.sweeps.lease import Keeper
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.space import Space
 from armscan.sweeps.storage import open_storage
