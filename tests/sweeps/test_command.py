@@ -168,13 +168,16 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
         (["-m", "sweeps=sac_y", "resume=true"], "'resume=true' is not for a study, which goes on where it stands"),
         (
             ["-m", "sweeps=sac_y", "hydra/launcher=foo"],
-            "hydra/launcher is 'foo', but it must be basic, joblib, submitit",
+            "hydra/launcher is 'foo', but it must be basic, joblib",
         ),
         (["-m", "sweeps=sac_y", "hydra.searchpath=[/nowhere]"], "hydra.searchpath names '/nowhere', but there is no"),
         (["-m", "sweeps=sac_y", "study=null"], "study is a section of the configuration: give its keys, such as"),
         (["-m", "sweeps=sac_y", "agent.lr=1,2"], "'agent.lr=1,2' gives several values, but those of a study come"),
         (["-m", "sweeps=sac_y", "study.seeds=0,1"], "'study.seeds=0,1' gives several values, but a study has one"),
-        (["-m", "sweeps=sac_y", "+tracking.foo=1"], "there is no key 'foo' in tracking, but only uri, experiment or"),
+        (
+            ["-m", "sweeps=sac_y", "+tracking.foo=1"],
+            "there is no key 'foo' in tracking, but only uri, experiment, artifacts or",
+        ),
         (["-m", "sweeps=sac_y", "study.folder=/dev/null"], "study.folder is '/dev/null', but '/dev/null' is no folder"),
         (["-m", "sweeps=sac_y", "study.artifacts=/dev/null/a"], "study.artifacts is '/dev/null/a', but '/dev/null' is"),
         (["-m", "sweeps=sac_y", "study.space.agent.choices=[null]"], "study.space: agent=null is not allowed: "),
@@ -226,7 +229,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
         (["-m", "sweeps=sac_y", "study.workers=999"], "study.workers is 999, but this machine has "),
         (
             ["-m", "sweeps=sac_y", "study.storage=postgresql://me:secret@127.0.0.1:1/db"],
-            "study.storage is 'postgresql://me@127.0.0.1:1/db', but this storage cannot be used",
+            "study.storage is 'postgresql://me@127.0.0.1:1/db' with a password, which would be written",
         ),
         (
             ["-m", "sweeps=sac_y", "study.space.agent.lrr.choices=[1]"],
