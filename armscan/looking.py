@@ -113,6 +113,7 @@ def place_of_runs(request: Request) -> Place:
         health="/health",
         told={"store": url_of(request.tracking).render_as_string(hide_password=False)},
         secrets=_secrets_of(request.tracking),
+        hint="   under Model training, at its top left",
     )
     return Place(key="tracking", what="runs", shown=shown, is_there=is_there, server=server)
 

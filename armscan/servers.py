@@ -37,6 +37,7 @@ class Server:
         port: that it answers on.
         health: what it is asked to know whether it answers.
         told: the other arguments of the program.
+        hint: for who opens it, beside its address.
         secrets: what must not be shown of its log.
     """
 
@@ -47,6 +48,7 @@ class Server:
     health: str
     told: Mapping[str, Any] = field(repr=False)
     secrets: Collection[str] = field(repr=False)
+    hint: str = ""
 
     @property
     def address(self) -> str:
@@ -120,7 +122,8 @@ class Process:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(END_S)
         self._tell(signal.SIGKILL)
-        self._process.wait()
+        # Waits, and closes its standard input.
+        self._process.communicate()
 
     def _tell(self, number: signal.Signals) -> None:
         # The whole group, of which some may be left when the first is gone.

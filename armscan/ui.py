@@ -100,7 +100,7 @@ def _serve(servers: Sequence[Server]) -> int:
         with running(servers) as processes:
             for process in processes:
                 wait_until_answering(process, processes)
-                print(f"{process.server.program:<10}{process.server.address}", flush=True)
+                print(f"{process.server.program:<10}{process.server.address}{process.server.hint}", flush=True)
             print(f"Ctrl-C ends {'both' if len(processes) > 1 else 'it'}", flush=True)
             watch(processes)
     except ServerError as error:
