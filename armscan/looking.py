@@ -7,7 +7,7 @@ from pathlib import Path
 from urllib.parse import quote, urlsplit
 
 from armscan.errors import TrackingError
-from armscan.servers import HOST, Server, is_answered, without
+from armscan.servers import HOST, Server, is_answered
 
 # Where the notes of trials say that MLflow's UI is (`armscan.sweeps.dashboard`), where runs are kept by no server.
 USUAL_UI = f"http://{HOST}:5000"
@@ -136,8 +136,7 @@ def _has_runs(uri: str) -> bool:
         return A_TABLE in tables_in(url_of(uri))
     except (SQLAlchemyError, ImportError, OSError, ValueError) as error:
         # Of a statement that has failed: why, but not the statement.
-        reason = " ".join(str(getattr(error, "orig", None) or error).split())
-        reason = without(_secrets_of(uri), reason)[:MAX_REASON_CHARS]
+        reason = " ".join(str(getattr(error, "orig", None) or error).split()).replace(uri, shown)[:MAX_REASON_CHARS]
         raise TrackingError(f"tracking is {shown!r}, but this store cannot be used: {reason}") from error
 
 

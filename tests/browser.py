@@ -60,8 +60,9 @@ def chromium(profile: Path, *, width: int = 1400, height: int = 900) -> Iterator
     try:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": BEFORE_EACH_PAGE})
-        yield Browser(driver)
+        browser = Browser(driver)
+        browser.before_each_page(BEFORE_EACH_PAGE)
+        yield browser
     finally:
         driver.quit()
 
@@ -83,6 +84,10 @@ class Browser:
             StaleElementReferenceException,
         )
         self._wait = WebDriverWait(driver, WAIT_S, poll_frequency=0.1, ignored_exceptions=passing)
+
+    def before_each_page(self, program: str) -> None:
+        """Runs JavaScript before those of a page."""
+        self.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": program})
 
     def open(self, address: str) -> None:
         """Goes to an address."""

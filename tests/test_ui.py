@@ -5,10 +5,12 @@ import os
 import shutil
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
 import urllib.request
+from contextlib import closing
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
@@ -49,7 +51,7 @@ def free_ports(n=2):
 
 
 def make_study(uri):
-    study = optuna.create_study(study_name="a", storage=open_storage(uri).optuna)
+    study = optuna.create_study(study_name="a", storage=open_storage(uri).optuna, load_if_exists=True)
     study.optimize(lambda trial: trial.suggest_float("x", 0, 1), n_trials=2)
 
 
@@ -159,6 +161,10 @@ def both(tmp_path_factory):
             [f"tracking=postgresql://me:{PASSWORD}@127.0.0.1:1/db"],
             "tracking is 'postgresql://me@127.0.0.1:1/db', but this store cannot be used: ",
         ),
+        (
+            ["tracking=postgresql://me@there:port/db"],
+            "tracking is 'postgresql://me@there:port/db', but this store cannot",
+        ),
         ([], "there is nothing to look at, no studies in 'optuna.journal' and no runs in 'sqlite:///mlruns.db': give"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -223,6 +229,19 @@ def test_ui_ends_the_other_server_and_says_so_when_one_ends_by_itself(both, look
     assert processes_in(both) == []
 
 
+def test_ui_shows_the_end_of_the_log_of_a_server_that_cannot_start(both, tmp_path, look):
+    shutil.copy(both / "mlruns.db", tmp_path)
+    with closing(sqlite3.connect(tmp_path / "mlruns.db")) as database, database:
+        database.execute("UPDATE alembic_version SET version_num = '451aebb31d03'")
+    looked = look(tmp_path)
+    assert looked.process.wait(END_S) == 1
+    _, error, log = looked.printed.partition(
+        "error: MLflow has ended by itself, with exit code 1; the end of its log:\n"
+    )
+    assert error
+    assert "out-of-date database schema" in log
+
+
 def test_ui_tells_of_a_server_that_does_not_answer_in_time(both, monkeypatch, capsys):
     monkeypatch.chdir(both)
     monkeypatch.setattr(servers, "START_S", 0.0)
@@ -248,6 +267,19 @@ def test_ui_shows_the_one_that_is_there_and_says_that_the_other_is_not(both, tmp
     assert lines[-1] == "Ctrl-C ends it"
     assert looked.end() == 130
     assert not (tmp_path / missing).exists()
+
+
+@pytest.mark.parametrize(("storage", "study_id"), [("{}/a.journal", 0), ("sqlite:///{}/a.db", 1)])
+def test_dashboard_shows_trials_that_come_later(tmp_path, look, storage, study_id):
+    def n_trials():
+        return len(json.loads(answer_of(f"{looked.dashboard}/api/studies/{study_id}"))["trials"])
+
+    uri = storage.format(tmp_path)
+    make_study(uri)
+    looked = look(tmp_path, f"storage={uri}")
+    assert n_trials() == 2
+    make_study(uri)
+    wait_for(lambda: n_trials() == 4)
 
 
 def test_ui_leaves_runs_to_the_server_that_keeps_them(both, look):
