@@ -27,10 +27,10 @@ PICTURES = Path(__file__).parent.parent / "docs" / "images"
 STUDY = ["-m", "sweeps=sac_y", "study.n_trials=24", "training.env_steps=6000", "study.judging.best=0"]
 NAME, N_TRIALS, BEST = "sac_y", 24, "mean_steps"
 COLUMNS = (
-    *("metrics.`mean_steps`", "metrics.`success_rate`", "metrics.`mean_distance_mm`", "params.`agent.lr`"),
-    *("params.`agent.gamma`", "params.`agent.updates_per_env_step`", "params.`agent.batch_size`"),
+    *("metrics.`mean_steps`", "metrics.`success_rate`", "params.`agent.lr`", "params.`agent.gamma`"),
+    *("params.`agent.updates_per_env_step`", "params.`agent.batch_size`"),
 )
-WIDTH_PX, N_COLOURS = 1400, 128
+WIDTH_PX, N_COLOURS = 1400, 256
 
 
 def look_at_study(address: str, file: Path) -> None:
@@ -60,11 +60,10 @@ def look_at_runs(address: str, file: Path) -> None:
     # Where MLflow remembers what somebody has chosen to see.
     key = f'MLflowLocalStorage-1.1-ExperimentPage-["{experiment.experiment_id}"]-ReactComponentState'
     remembered = f"localStorage.setItem({json.dumps(key)}, {json.dumps(json.dumps(shown))})"
-    with tempfile.TemporaryDirectory() as profile, chromium(Path(profile), height=1000) as browser:
+    with tempfile.TemporaryDirectory() as profile, chromium(Path(profile), height=940) as browser:
         browser.before_each_page(remembered)
         browser.open(f"{address}/#/experiments/{experiment.experiment_id}/runs?workflowType=machine_learning")
         browser.find("a", text=training.info.run_name)
-        browser.click("[aria-label='Toggle sidebar']")
         browser.keep(file)
 
 
