@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import optuna
 import pytest
@@ -20,6 +19,7 @@ from armscan.errors import ArmscanError, InvalidValueError, StudyError
 from armscan.mistakes import mistake_in_one_line
 from armscan.sweeps.command import run_study
 from armscan.sweeps.storage import open_storage
+from tests.processes import processes_in
 
 TINY = [
     *("-m", "sweeps=sac_y", "data.n_training=1", "data.n_validation=1", "data.n_test=1", "training.env_steps=400"),
@@ -60,19 +60,6 @@ def wait_for(moment, process, timeout_s=240):
         assert process.poll() is None
         assert time.monotonic() < until_s
         time.sleep(0.1)
-
-
-def processes_in(folder):
-    """The processes whose working folder this is."""
-    listing = subprocess.run(["ps", "-eo", "pid="], capture_output=True, text=True, check=True).stdout.split()
-    found = []
-    for pid in listing:
-        try:
-            if Path(f"/proc/{pid}/cwd").readlink() == folder:
-                found.append(int(pid))
-        except OSError:
-            continue
-    return found
 
 
 def workers_in(folder):
