@@ -7,6 +7,7 @@ from pathlib import Path
 from urllib.parse import quote, urlsplit
 
 from armscan.errors import TrackingError
+from armscan.passwords import STORAGE_PASSWORD, TRACKING_PASSWORD, database_url, without_password
 from armscan.servers import HOST, Server, is_answered
 
 # Where the notes of trials say that MLflow's UI is (`armscan.sweeps.dashboard`), where runs are kept by no server.
@@ -69,7 +70,7 @@ def place_of_studies(request: Request) -> Place:
         StudyError: if the storage cannot be reached or used.
     """
     # Deferred: a mistake on the command line should be answered before these are loaded.
-    from armscan.sweeps.storage import existing_storage, is_journal, without_password
+    from armscan.sweeps.storage import existing_storage, is_journal
 
     is_there = existing_storage(request.storage, where="storage") is not None
     ui = f"http://{HOST}:{request.mlflow_port}"
@@ -84,7 +85,7 @@ def place_of_studies(request: Request) -> Place:
             "artifacts": str(request.artifacts),
             "links": {} if ui == USUAL_UI else {USUAL_UI: ui},
         },
-        secrets=() if is_journal(request.storage) else _secrets_of(request.storage),
+        secrets=() if is_journal(request.storage) else _secrets_of(request.storage, STORAGE_PASSWORD),
     )
     return Place(
         key="storage", what="studies", shown=without_password(request.storage), is_there=is_there, server=server
@@ -101,9 +102,6 @@ def place_of_runs(request: Request) -> Place:
         parts = urlsplit(request.tracking)
         address = parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl().rstrip("/")
         return Place(key="tracking", what="runs", shown=address, is_there=is_answered(f"{address}/health"), server=None)
-    from armscan.sweeps.database import url_of
-    from armscan.sweeps.storage import without_password
-
     shown, is_there = without_password(request.tracking), _has_runs(request.tracking)
     server = Server(
         program="runs",
@@ -111,8 +109,8 @@ def place_of_runs(request: Request) -> Place:
         port_key="mlflow_port",
         port=request.mlflow_port,
         health="/health",
-        told={"store": url_of(request.tracking).render_as_string(hide_password=False)},
-        secrets=_secrets_of(request.tracking),
+        told={"store": database_url(request.tracking, TRACKING_PASSWORD).render_as_string(hide_password=False)},
+        secrets=_secrets_of(request.tracking, TRACKING_PASSWORD),
         hint="   under Model training, at its top left",
     )
     return Place(key="tracking", what="runs", shown=shown, is_there=is_there, server=server)
@@ -122,8 +120,7 @@ def _has_runs(uri: str) -> bool:
     """Whether a database has the tables of MLflow, which would make them where there are none."""
     from sqlalchemy.exc import SQLAlchemyError
 
-    from armscan.sweeps.database import tables_in, url_of
-    from armscan.sweeps.storage import without_password
+    from armscan.sweeps.database import tables_in
 
     shown = without_password(uri)
     if not uri.startswith((SQLITE_PREFIX, "postgresql")):
@@ -133,16 +130,14 @@ def _has_runs(uri: str) -> bool:
     if uri.startswith(SQLITE_PREFIX) and not Path(uri.removeprefix(SQLITE_PREFIX)).is_file():
         return False
     try:
-        return A_TABLE in tables_in(url_of(uri))
+        return A_TABLE in tables_in(database_url(uri, TRACKING_PASSWORD))
     except (SQLAlchemyError, ImportError, OSError, ValueError) as error:
         # Of a statement that has failed: why, but not the statement.
         reason = " ".join(str(getattr(error, "orig", None) or error).split()).replace(uri, shown)[:MAX_REASON_CHARS]
         raise TrackingError(f"tracking is {shown!r}, but this store cannot be used: {reason}") from error
 
 
-def _secrets_of(uri: str) -> tuple[str, ...]:
+def _secrets_of(uri: str, variable: str) -> tuple[str, ...]:
     """Returns what must not be shown of a database: its password, as it is and as it is written in an address."""
-    from armscan.sweeps.database import url_of
-
-    password = url_of(uri).password
+    password = database_url(uri, variable).password
     return (password, quote(password, safe=" +")) if password else ()

@@ -6,9 +6,13 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
 from armscan.errors import InvalidValueError
+
+if TYPE_CHECKING:
+    from sqlalchemy import URL
 
 # Of the database with the studies; of an MLflow server, as MLflow itself reads them; of a database with runs.
 STORAGE_PASSWORD = "ARMSCAN_STORAGE_PASSWORD"
@@ -56,6 +60,24 @@ def password_of(variable: str) -> str | None:
     except OSError as error:
         name = variable + IN_A_FILE
         raise InvalidValueError(f"{name} is {file!r}, but it cannot be read ({error.strerror})") from error
+
+
+def database_url(uri: str, variable: str) -> URL:
+    """Returns the address of a database with its driver, and with its password where it has none.
+
+    Args:
+        uri: of SQLite or PostgreSQL.
+        variable: that holds the password.
+    """
+    # Deferred: most commands are answered without.
+    from sqlalchemy import make_url
+
+    url = make_url(uri)
+    if url.drivername == "postgresql":
+        url = url.set(drivername="postgresql+psycopg")
+    if url.get_backend_name() == "postgresql" and url.password is None:
+        url = url.set(password=password_of(variable))
+    return url
 
 
 def hand_over_storage(uri: str) -> str:

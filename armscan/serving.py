@@ -18,6 +18,7 @@ from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from armscan.errors import ArmscanError, StudyError
+from armscan.passwords import without_password
 from armscan.servers import END_S, HOST
 
 Application = Callable[[dict[str, Any], Callable[..., Any]], Iterable[bytes]]
@@ -51,7 +52,7 @@ def serve_studies(*, storage: str, artifacts: str, links: Mapping[str, str], por
     from optuna.artifacts import FileSystemArtifactStore
     from optuna_dashboard import wsgi
 
-    from armscan.sweeps.storage import existing_storage, without_password
+    from armscan.sweeps.storage import existing_storage
 
     opened = existing_storage(storage, where="storage")
     if opened is None:

@@ -66,6 +66,14 @@ def report_command(study: str, storage: str) -> str:
     return _command_at("armscan.report", f"study={study}", "storage", storage, usual_storage())
 
 
+def ui_command(*, tracking: str | None = None, storage: str | None = None) -> str:
+    """Returns what one types to look at runs and studies in the browser; what is None is where it usually is."""
+    usual = {"storage": usual_storage(), "tracking": usual_tracking()["uri"]}
+    given = {"storage": storage, "tracking": tracking}
+    words = [f"{key}={uri}" for key, uri in given.items() if uri not in (None, usual[key])]
+    return shlex.join(["python", "-m", "armscan.ui", *words])
+
+
 def _command(module: str, of_run: str, key_of_store: str, tracking_uri: str) -> str:
     return _command_at(module, of_run, key_of_store, tracking_uri, usual_tracking()["uri"])
 

@@ -3,8 +3,8 @@
     python -m armscan.ui                          the studies and runs of this folder, in the browser
 
 storage=URI             of the studies: a journal file, sqlite:///FILE or postgresql://..., with its password in
-                        ARMSCAN_STORAGE_PASSWORD; optuna.journal where nothing is said
-tracking=URI            of the runs: sqlite:///FILE, postgresql://... (likewise), or the address of an MLflow server,
+                        ARMSCAN_STORAGE_PASSWORD; ARMSCAN_STORAGE or optuna.journal where nothing is said
+tracking=URI            of the runs: sqlite:///FILE, postgresql://... (ARMSCAN_TRACKING_PASSWORD), or an MLflow server,
                         which has a UI of its own; MLFLOW_TRACKING_URI or sqlite:///mlruns.db where nothing is said
 artifacts=FOLDER        of the pictures in the dashboard; optuna.artifacts where nothing is said
 mlflow_port=NUMBER      of 127.0.0.1; 5000 where nothing is said
@@ -24,7 +24,7 @@ from armscan.checks import check_int
 from armscan.errors import InvalidValueError, ServerError
 from armscan.looking import Place, Request, place_of_runs, place_of_studies
 from armscan.servers import Server, running, wait_until_answering, watch
-from armscan.settings import USUAL_STORAGE, usual_tracking
+from armscan.settings import usual_storage, usual_tracking
 from armscan.words import answered, read_words
 
 TEXTS = ("storage", "tracking", "artifacts")
@@ -44,7 +44,7 @@ def parse(words: Sequence[str]) -> Request:
         check_int(key, values.get(key, usual), at_least=1, at_most=MAX_PORT) for key, usual in USUAL_PORTS.items()
     )
     request = Request(
-        storage=values.get("storage", USUAL_STORAGE),
+        storage=values.get("storage") or usual_storage(),
         tracking=values.get("tracking") or usual_tracking()["uri"],
         artifacts=Path(values.get("artifacts", USUAL_ARTIFACTS)),
         mlflow_port=mlflow_port,

@@ -21,9 +21,10 @@ from mlflow import MlflowClient
 
 from armscan import servers
 from armscan.looking import USUAL_UI
+from armscan.passwords import STORAGE_PASSWORD, TRACKING_PASSWORD, without_password
 from armscan.servers import HOST
 from armscan.sweeps import dashboard
-from armscan.sweeps.database import PASSWORD_VARIABLE, tables_in, url_of
+from armscan.sweeps.database import tables_in, url_of
 from armscan.sweeps.storage import open_storage
 from armscan.ui import USUAL_PORTS, main
 from tests.browser import chromium, programs
@@ -306,14 +307,14 @@ def test_ui_leaves_runs_to_the_server_that_keeps_them(both, look):
     assert len(looked.servers) == 1
 
 
-def test_ui_shows_what_is_in_postgresql_and_no_password(postgres, tmp_path, look):
+def test_ui_shows_what_is_in_postgresql_and_no_password(postgres, tmp_path, look, monkeypatch, capsys):
     storage, tracking, empty = (postgres.make_database() for _ in range(3))
     make_study(storage)
     make_experiment(tracking.replace("postgresql://", "postgresql+psycopg://"))
     words = [
         f"{key}={uri.replace(f':{PASSWORD}', '')}" for key, uri in {"storage": storage, "tracking": tracking}.items()
     ]
-    looked = look(tmp_path, *words, **{PASSWORD_VARIABLE: PASSWORD})
+    looked = look(tmp_path, *words, **{STORAGE_PASSWORD: PASSWORD, TRACKING_PASSWORD: PASSWORD})
     assert "Ctrl-C ends both" in looked.printed
     assert studies_at(looked.dashboard) == ["a"]
     assert "mine" in experiments_at(looked.mlflow)
@@ -321,7 +322,9 @@ def test_ui_shows_what_is_in_postgresql_and_no_password(postgres, tmp_path, look
     assert looked.end() == 130
     assert PASSWORD not in looked.printed
     assert [path.name for path in tmp_path.iterdir()] == ["printed"]
-    assert main([f"tracking={empty}"]) == 2
+    monkeypatch.setenv(TRACKING_PASSWORD, PASSWORD)
+    assert main([f"tracking={without_password(empty)}"]) == 2
+    assert "there are no runs there" in capsys.readouterr().err
     assert tables_in(url_of(empty)) == []
 
 

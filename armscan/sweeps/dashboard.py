@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from pathlib import Path
 
 import optuna
 from optuna.artifacts import FileSystemArtifactStore, upload_artifact
 from optuna.trial import Trial
 
-from armscan.console import from_here
 from armscan.log import say
 from armscan.tracking import TrackingStore
 
@@ -50,9 +47,3 @@ def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:
     except OSError as error:
         # No reason for a trial to fail: it is in its folder, too.
         say(f"{picture} cannot be shown in Optuna's dashboard: {error}")
-
-
-def dashboard_command(storage: str, artifacts: str) -> str:
-    """Returns what one types to look at the studies of a storage."""
-    program = from_here(Path(sys.executable).with_name("optuna-dashboard"))
-    return shlex.join([str(program), storage, "--artifact-dir", artifacts])

@@ -11,10 +11,10 @@ from optuna.distributions import BaseDistribution
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.storages import BaseStorage, RDBStorage, get_storage
 from optuna.trial import TrialState
-from sqlalchemy import URL, Connection, create_engine, inspect, make_url, text
+from sqlalchemy import URL, Connection, create_engine, inspect, text
 
 from armscan.errors import StorageAwayError
-from armscan.passwords import STORAGE_PASSWORD, password_of
+from armscan.passwords import STORAGE_PASSWORD, database_url
 from armscan.patience import Patience
 from armscan.sweeps.away import ConnectionLostError, why_away
 
@@ -35,12 +35,7 @@ TCP = {
 
 def url_of(uri: str) -> URL:
     """Returns the address of a database with its driver and password."""
-    url = make_url(uri)
-    if url.drivername == "postgresql":
-        url = url.set(drivername="postgresql+psycopg")
-    if url.get_backend_name() == "postgresql" and url.password is None:
-        url = url.set(password=password_of(STORAGE_PASSWORD))
-    return url
+    return database_url(uri, STORAGE_PASSWORD)
 
 
 class DatabaseStorage:

@@ -13,7 +13,6 @@ from pathlib import Path
 from filelock import FileLock
 from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
-from sqlalchemy import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.checks import check_float
@@ -21,6 +20,7 @@ from armscan.errors import TrackingError
 from armscan.passwords import (
     SERVER_PASSWORD,
     TRACKING_PASSWORD,
+    database_url,
     hand_over_tracking,
     password_of,
     without_password,
@@ -104,14 +104,9 @@ def _store(uri: str, wait_s: float, patience_s: float | None) -> TrackingStore:
 
 def _address(uri: str) -> str:
     """Returns the address of a store with its driver and password."""
-    if "://" not in uri or uri.startswith(("http", SQLITE_PREFIX, "file:")):
+    if not uri.startswith("postgresql"):
         return uri
-    url = make_url(uri)
-    if url.drivername == "postgresql":
-        url = url.set(drivername="postgresql+psycopg")
-    if url.password is None:
-        url = url.set(password=password_of(TRACKING_PASSWORD))
-    return url.render_as_string(hide_password=False)
+    return database_url(uri, TRACKING_PASSWORD).render_as_string(hide_password=False)
 
 
 def _check_texts(**values: object) -> None:
