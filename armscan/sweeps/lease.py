@@ -71,8 +71,10 @@ class Keeper:
         ledger: of the study.
         worker: what this worker is called.
         is_told_to_leave: asked several times a second.
-        leave: called, in another thread than the worker's, to end the process; what is at hand is handed back then.
+        leave: called, mostly in another thread than the worker's, to end the process; what is at hand is handed back
+            then.
         on_death: told of each trial whose worker had died.
+        is_told_to_leave_soon: asked when a trial is claimed, and when it tells its progress: it loses nothing then.
     """
 
     def __init__(
@@ -83,6 +85,7 @@ class Keeper:
         is_told_to_leave: Callable[[], bool],
         leave: Callable[[], None],
         on_death: Callable[[FrozenTrial], None],
+        is_told_to_leave_soon: Callable[[], bool] = lambda: False,
     ) -> None:
         pid = os.getpid()
         self._lease: dict[str, Any] = {
@@ -94,6 +97,7 @@ class Keeper:
         }
         self._ledger, self._witness = ledger, Witness()
         self._is_told_to_leave, self._leave, self._on_death = is_told_to_leave, leave, on_death
+        self._is_told_to_leave_soon = is_told_to_leave_soon
         self._trial: Trial | None = None
         self._close: Callable[[], None] | None = None
         self._spent: str | None = None
@@ -117,6 +121,7 @@ class Keeper:
 
     def claim(self) -> Trial | None:
         """Takes a trial, as `Ledger.claim` does, and holds it from then on."""
+        self._leave_where_told_to()
         with self._changing:
             # How far the trial before was is not said of this one.
             self._lease = {key: self._lease[key] for key in (*HOLDER, "beat")}
@@ -134,6 +139,7 @@ class Keeper:
             LimitReachedError: if no trial is to be gone on with.
         """
         self._lease = self._lease | figures
+        self._leave_where_told_to()
         if self._spent is not None:
             raise LimitReachedError(self._spent)
 
@@ -153,6 +159,11 @@ class Keeper:
         with self._changing:
             yield
             self._trial = self._close = None
+
+    def _leave_where_told_to(self) -> None:
+        if self._is_told_to_leave_soon():
+            self.hand_back()
+            self._leave()
 
     def _watch(self) -> None:
         while not self._stopped.wait(TICK_S):

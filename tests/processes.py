@@ -1,0 +1,48 @@
+"""Processes that a test has started through others: found again by what only they have."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+END_S = 10.0
+
+
+def with_variable(name: str, value: str) -> list[int]:
+    """Returns the ids of the processes that were started with a variable in their environment."""
+    wanted, found = f"{name}={value}".encode(), []
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit() and int(folder.name) != os.getpid():
+            try:
+                variables = (folder / "environ").read_bytes().split(b"\0")
+            # It has ended, or is somebody else's.
+            except OSError:
+                continue
+            if wanted in variables:
+                found.append(int(folder.name))
+    return found
+
+
+def kill(pids: Iterable[int], how: signal.Signals = signal.SIGKILL) -> None:
+    """Sends a signal to those that are still there."""
+    for pid in pids:
+        try:
+            os.kill(pid, how)
+        except ProcessLookupError:
+            continue
+
+
+def end_all(found: Callable[[], list[int]]) -> None:
+    """Kills processes until none is found any more.
+
+    Args:
+        found: returns their ids.
+    """
+    until_s = time.monotonic() + END_S
+    while pids := found():
+        assert time.monotonic() < until_s, f"processes {pids} do not end"
+        kill(pids)
+        time.sleep(0.1)
