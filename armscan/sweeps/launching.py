@@ -96,6 +96,10 @@ def _launch_elsewhere(opened: OpenStudy, folder: Path, launcher: str, launch: Ca
     try:
         with vigil.interrupting():
             launch()
+    except SystemExit:
+        # What Ray has put in the place of our answer to SIGTERM.
+        signal.raise_signal(signal.SIGINT)
+        vigil.see_off()
     # What a worker's machine has said, after all of them have ended.
     except ArmscanError as error:
         print(f"error: {error}", file=sys.stderr)

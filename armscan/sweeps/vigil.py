@@ -69,6 +69,12 @@ class Vigil:
                 time.sleep(LOOK_S)
         return False
 
+    def see_off(self) -> None:
+        """Waits until the workers, who have been asked to leave, have handed back what they ran."""
+        with contextlib.suppress(StorageAwayError), impatient():
+            while any(phase.ledger.tally().running for phase in self._opened.begun()):
+                time.sleep(1.0)
+
     @contextlib.contextmanager
     def interrupting(self) -> Iterator[None]:
         """What launching is done in by a launcher that may wait on when the study is over: then it is interrupted."""

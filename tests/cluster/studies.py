@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import optuna
 from mlflow import MlflowClient
@@ -79,21 +80,27 @@ class StartedStudy:
             return []
         return optuna.load_study(study_name=name, storage=self._storage).trials
 
-    def holder(self, number: int) -> dict[str, object]:
-        """Waits until a worker is in the middle of a trial; returns its lease."""
+    def holder(self, number: int) -> dict[str, Any]:
+        """Waits until a worker is in the middle of a trial; returns its lease, with the number of the trial."""
 
-        def leases() -> list[dict[str, object]]:
+        def leases() -> list[dict[str, Any]]:
             running = [trial for trial in self.trials() if trial.state == TrialState.RUNNING]
-            held = [trial.user_attrs.get(LEASE, {}) for trial in running if len(trial.intermediate_values) > 1]
+            held = [
+                trial.user_attrs.get(LEASE, {}) | {"trial": trial.number}
+                for trial in running
+                if len(trial.intermediate_values) > 1
+            ]
             return [lease for lease in held if str(lease.get("worker", "")).endswith(f"/{number}")]
 
         self.wait(lambda: bool(leases()))
         found = leases()
         return found[0] if found else self.holder(number)
 
-    def kill_worker(self, number: int) -> None:
-        """Kills a worker in the middle of a trial."""
-        os.kill(int(str(self.holder(number)["pid"])), signal.SIGKILL)
+    def kill_worker(self, number: int) -> int:
+        """Kills a worker in the middle of a trial; returns the number of the trial."""
+        lease = self.holder(number)
+        os.kill(lease["pid"], signal.SIGKILL)
+        return lease["trial"]
 
     def wait(self, is_there: Callable[[], bool]) -> None:
         """Waits for a moment while it is at work."""
@@ -155,7 +162,7 @@ class StartedStudy:
         files = [file for file in self.folder.rglob("*") if file.is_file()]
         assert [file for file in files if PASSWORD.encode() in file.read_bytes()] == []
 
-    def worker(self, number: int) -> dict[str, object]:
+    def worker(self, number: int) -> dict[str, Any]:
         """Returns what a worker has left word of."""
         return json.loads((self.workers_folder / f"worker-{number}.json").read_text())
 

@@ -168,7 +168,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
         (["-m", "sweeps=sac_y", "resume=true"], "'resume=true' is not for a study, which goes on where it stands"),
         (
             ["-m", "sweeps=sac_y", "hydra/launcher=foo"],
-            "hydra/launcher is 'foo', but it must be basic, joblib, submitit",
+            "hydra/launcher is 'foo', but it must be basic, joblib, ray",
         ),
         (["-m", "sweeps=sac_y", "hydra.searchpath=[/nowhere]"], "hydra.searchpath names '/nowhere', but there is no"),
         (["-m", "sweeps=sac_y", "study=null"], "study is a section of the configuration: give its keys, such as"),
