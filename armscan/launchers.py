@@ -6,7 +6,7 @@ import logging
 import shutil
 from importlib.util import find_spec
 
-from armscan.errors import StudyError
+from armscan.errors import InvalidValueError
 
 LAUNCHER = "hydra/launcher"
 ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
@@ -22,14 +22,18 @@ def check_launcher(name: str) -> None:
     """Checks that a launcher can do its work on this machine.
 
     Raises:
-        StudyError: if something that it needs is not installed.
+        InvalidValueError: if something that it needs is not installed.
     """
     extra, packages = IMPORTED.get(name, ("", ()))
     for package in packages:
         if find_spec(package) is None:
-            raise StudyError(f"{LAUNCHER} is {name!r}, but {package} is not installed: pip install 'armscan[{extra}]'")
+            raise InvalidValueError(
+                f"{LAUNCHER} is {name!r}, but {package} is not installed: pip install 'armscan[{extra}]'"
+            )
     if name == SLURM and shutil.which("sbatch") is None:
-        raise StudyError(f"{LAUNCHER} is {name!r}, but this machine has no sbatch: start it where Slurm takes jobs")
+        raise InvalidValueError(
+            f"{LAUNCHER} is {name!r}, but this machine has no sbatch: start it where Slurm takes jobs"
+        )
 
 
 def quieten_launcher(name: str) -> None:
