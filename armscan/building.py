@@ -13,6 +13,7 @@ from armscan.agents import Agent, AgentSetup
 from armscan.checks import check_int, check_seed
 from armscan.envs import EnvMaker
 from armscan.errors import InvalidValueError, listed
+from armscan.settings import CLUSTER
 from armscan.training import Budget, Split
 from armscan.training.familiar import smallest_slice, with_crops
 from armscan.volumes import LabelVolume
@@ -30,7 +31,7 @@ SECTIONS = (
     "compute",
 )
 SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
-EVALUATION_KEYS, TRACKING_KEYS = ("episodes",), ("uri", "experiment", "artifacts")
+EVALUATION_KEYS, TRACKING_KEYS = ("episodes",), ("uri", "experiment", "artifacts", "wait_s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +131,7 @@ def check_keys(config: DictConfig) -> None:
     """
     check_sections(config)
     for node, where, allowed in (
-        (config, "at the top", (*SECTIONS, *SINGLE_KEYS)),
+        (config, "at the top", (*SECTIONS, *SINGLE_KEYS, CLUSTER)),
         (config.evaluation, "in evaluation", EVALUATION_KEYS),
         (config.tracking, "in tracking", TRACKING_KEYS),
     ):

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Column, Table
 
 from armscan.multirun import INTERRUPTED, Outcome
+from armscan.settings import ui_command
 from armscan.training import TEST, Callback, EpochReport, Evaluation
 
 # Of a run's id, where there is no room for all of it.
@@ -133,17 +134,20 @@ def print_jobs(outcomes: Mapping[str, Outcome], run_ids: Mapping[str, str]) -> N
     Console().print(table)
 
 
-def print_where_to_look(folder: Path, tracking_uri: str, *, files: Sequence[str] = ("",)) -> None:
+def print_where_to_look(
+    folder: Path, tracking_uri: str, *, storage: str | None = None, files: Sequence[str] = ("",)
+) -> None:
     """Prints where the results lie, and the command that opens the UI over all runs.
 
     Args:
         folder: of the run or multirun.
         tracking_uri: of the store.
+        storage: of the study, None where there is none.
         files: what is worth looking at in the folder; the folder itself where none is named.
     """
     for file in files:
         print(f"look at   {from_here(folder / file)}")
-    print(f"all runs  {from_here(Path(sys.executable))} -m mlflow ui --backend-store-uri {tracking_uri}")
+    print(f"all runs  {ui_command(tracking=tracking_uri, storage=storage)}")
 
 
 def from_here(path: Path) -> Path:

@@ -64,16 +64,37 @@ class DisplayError(ArmscanError, RuntimeError):
     """There is no screen, notebook or library that could show a window."""
 
 
+class AwayError(ArmscanError, RuntimeError):
+    """A service cannot be reached, and is not waited for any longer."""
+
+
 class TrackingError(ArmscanError, RuntimeError):
     """The tracking store cannot be reached or used."""
+
+
+class TrackingAwayError(TrackingError, AwayError):
+    """The tracking store cannot be reached, and is not waited for any longer."""
 
 
 class StudyError(ArmscanError, RuntimeError):
     """A study cannot be started or gone on with."""
 
 
-class StorageAwayError(StudyError):
+class StorageAwayError(StudyError, AwayError):
     """The storage of a study cannot be reached, and is not waited for any longer."""
+
+
+class ServerError(ArmscanError, RuntimeError):
+    """A server that a command has started does not answer, or has ended by itself.
+
+    Args:
+        message: of one line.
+        log: the end of what the server has said.
+    """
+
+    def __init__(self, message: str, *, log: str) -> None:
+        super().__init__(message)
+        self.log = log
 
 
 def is_interruption(error: BaseException | None) -> bool:

@@ -30,7 +30,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from armscan.checks import check_int
 from armscan.errors import InvalidValueError
@@ -94,7 +94,7 @@ def evaluate(request: Request) -> Path:
 
 
 def _tracked(
-    request: Request, subject: Subject, trial: Trial, notes: Sequence[str], store: Mapping[str, str]
+    request: Request, subject: Subject, trial: Trial, notes: Sequence[str], store: Mapping[str, Any]
 ) -> tuple[Judgement, Path]:
     """Plays, and keeps what comes of it: in a JSON file, and in a tracked run, a child of the run that is evaluated."""
     from armscan.judging import Judgement, data_name
@@ -120,6 +120,7 @@ def _tracked(
         name=f"evaluation: {subject.name} on {data}",
         config={**plain(subject.config), "evaluation": facts},
         tags={EVALUATED_TAG: of},
+        folder=FOLDER,
         parent_id=subject.run.run_id if subject.run else None,
     ) as tracked:
         evaluations = trial.played(request.n_episodes, request.seed, tell=partial(print, flush=True))
@@ -137,7 +138,7 @@ def _tracked(
     return judgement, file
 
 
-def _store(request: Request) -> dict[str, str]:
+def _store(request: Request) -> dict[str, Any]:
     """Returns where runs are tracked: as the configuration says, where the words say nothing else."""
     said = {"uri": request.tracking, "experiment": request.tracking_experiment}
     return usual_tracking() | {name: value for name, value in said.items() if value is not None}

@@ -76,10 +76,12 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
         return carry_out(stage, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
 
 
-def start_tracking(config: DictConfig, invocation: Invocation, stage: Stage) -> TrackedRun:
-    """Writes down what is run, opens the tracking store and starts a run in it."""
+def start_tracking(
+    config: DictConfig, invocation: Invocation, stage: Stage, *, patience_s: float | None = None
+) -> TrackedRun:
+    """Writes down what is run, opens the tracking store and starts a run in it; see `open_store`."""
     resolved = plain(config)
-    client, experiment_id = open_store(**resolved["tracking"])
+    client, experiment_id = open_store(**resolved["tracking"], patience_s=patience_s)
     choices, job = invocation.choices, invocation.job
     files = started_with(resolved, stage)
     # Another run's, left in a folder that somebody named: they would be taken for this one's.
@@ -104,6 +106,7 @@ def start_tracking(config: DictConfig, invocation: Invocation, stage: Stage) -> 
             **{SUM_TAGS[name]: sum_of(contents) for name, contents in files.items()},
             **({JOB_TAG: str(job.number)} if job else {}),
         },
+        folder=invocation.folder,
         parent_id=job.parent_run_id if job else None,
     )
     tracked.log_files(*(invocation.folder / name for name in files))

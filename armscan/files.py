@@ -21,6 +21,8 @@ CONFIG_FILE, VOLUMES_FILE = "config.yaml", "volumes.json"
 # The tags of a run that hold the sums of what it was started with.
 SUM_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
 LOCK_FILE = ".lock"
+# The folder of what is to be tracked, in that of a run.
+SPOOLS = "tracking"
 UNFINISHED = "unfinished"
 
 

@@ -19,13 +19,14 @@ from hydra.errors import (
     OverrideParseException,
 )
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 from yaml import YAMLError
 
 from armscan.errors import ArmscanError, listed
 
 CONFIG_MODULE, CONFIG_NAME = "armscan.conf", "config"
 GROUP = re.compile(r"[a-z_/]+")
+OURS_IN_A_RESOLVER = re.compile(r"InvalidValueError raised while resolving interpolation: (.*)")
 
 
 def mistake_in_one_line(error: BaseException, words: Sequence[str] | None = None) -> str | None:
@@ -51,6 +52,9 @@ def mistake_in_one_line(error: BaseException, words: Sequence[str] | None = None
             return f"{error.full_key} is not set, but it must be: give {error.full_key}=VALUE"
         case InstantiationException():
             return _instantiation_mistake(error, words)
+        case InterpolationResolutionError() if said := OURS_IN_A_RESOLVER.match(str(error)):
+            # Of an error that a resolver raises, OmegaConf keeps nothing but the text.
+            return said[1]
         case HydraException() | OmegaConfBaseException():
             return " ".join(str(error).split())
         case ValueError() if _is_raised_by_hydra(error) and (emptied := _emptied_group(words)):

@@ -6,7 +6,7 @@ import json
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any, Self
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from armscan.errors import FolderInUseError, InvalidValueError
-from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, write_whole
+from armscan.errors import FolderInUseError, InvalidValueError, TrackingError
+from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, SPOOLS, write_whole
 from armscan.launchers import LAUNCHER, check_launcher
 from armscan.mistakes import mistake_in_one_line
-from armscan.settings import plain, resume_command
+from armscan.passwords import check_written
+from armscan.settings import TRACKING_URI, plain, resume_command
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -68,14 +69,29 @@ class Multirun(Callback):
     # Whether what has finished of an earlier one is not run again.
     is_repeated = False
 
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Checks what a single run would write down."""
+        self._answered(self._check, config)
+
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Opens the store, starts the parent run, and leaves word of it for the jobs."""
+        self._answered(self._check, config)
+        self._answered(self._start, config)
+
+    @staticmethod
+    def _answered(begin: Callable[[DictConfig], None], config: DictConfig) -> None:
         try:
-            self._start(config)
+            begin(config)
         # Hydra would turn any exception of a callback into a warning, and start the jobs all the same.
         except Exception as error:
             print(f"error: {mistake_in_one_line(error) or repr(error)}", file=sys.stderr)
             raise SystemExit(2) from error
+
+    @staticmethod
+    def _check(config: DictConfig) -> None:
+        for key in (TRACKING_URI, "study.storage"):
+            if isinstance(uri := OmegaConf.select(config, key), str):
+                check_written(key, uri)
 
     @staticmethod
     def _start(config: DictConfig) -> None:
@@ -94,7 +110,7 @@ class Multirun(Callback):
         (folder / OUTCOME_FOLDER).mkdir(parents=True)
         command = " ".join(overrides)
         tags = {**source_tags(), "overrides": command}
-        parent = client.create_run(experiment_id, run_name=f"multirun {command}"[:250], tags=tags)
+        parent = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
         word = {"run_id": parent.info.run_id, "tracking": tracking, "overrides": overrides}
         word["is_repeated"] = Multirun.is_repeated
         (folder / PARENT_FILE).write_text(json.dumps(word))
@@ -171,8 +187,12 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         number: outcome for number, outcome in outcomes.items() if outcome.is_failed(is_interrupted=is_interrupted)
     }
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
-    runs = _close_parent(Multirun.folder, status, failed)
     word = json.loads((Multirun.folder / PARENT_FILE).read_text())
+    try:
+        runs, is_known = _close_parent(Multirun.folder, word, status, failed), True
+    except TrackingError as error:
+        print(f"{error}; python -m armscan.track sync {Multirun.folder} delivers the rest", file=sys.stderr)
+        runs, is_known = [], False
     if outcomes:
         from armscan.console import print_jobs, print_where_to_look
 
@@ -186,32 +206,37 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         if run.info.status != "FINISHED" and (Path(run.data.tags["folder"]) / LAST_CHECKPOINT).exists():
             again = resume_command(run.info.run_id, word["tracking"]["uri"])
             print(f"resume job {run.data.tags[JOB_TAG]} with: {again}", file=sys.stderr)
-    if not runs:
+    if is_known and not runs:
         remove_run_folder(Multirun.folder)
     return 1 if failed or not outcomes else 0
 
 
-def _close_parent(folder: Path, status: str, failed: Mapping[str, Outcome]) -> list[Run]:
+def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Mapping[str, Outcome]) -> list[Run]:
     """Closes the parent run and what a killed job left open; deletes it where no job got as far as a run of its own.
 
     Returns:
         The runs of those that got as far as that, in the order of the jobs.
-    """
-    from armscan.tracking import open_store
 
-    word = json.loads((folder / PARENT_FILE).read_text())
-    client, experiment_id = open_store(**word["tracking"])
-    children = client.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
+    Raises:
+        TrackingError: if the store is away for longer than a run waits for it at its end.
+    """
+    from armscan.tracking import TrackedRun, open_store, sync
+
+    store, experiment_id = open_store(**word["tracking"], patience_s=word["tracking"]["wait_s"])
+    parent = TrackedRun.joined(store, word["run_id"], name="multirun", folder=folder)
+    tags = {f"failure.{number}": f"{each.varied}: {each.failure}"[:MAX_TAG_CHARS] for number, each in failed.items()}
+    parent.set_tags(tags)
+    parent.end(status)
+    # What jobs have left because the store was away.
+    sync(folder, lambda _: store)
+    children = store.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
     for child in children:
         if child.info.status == "RUNNING":
             is_killed = status == "KILLED"
-            client.set_tag(child.info.run_id, "failure", INTERRUPTED if is_killed else NO_OUTCOME)
-            client.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
-    for number, outcome in failed.items():
-        client.set_tag(word["run_id"], f"failure.{number}", f"{outcome.varied}: {outcome.failure}"[:MAX_TAG_CHARS])
-    client.set_terminated(word["run_id"], status)
+            store.set_tag(child.info.run_id, "failure", INTERRUPTED if is_killed else NO_OUTCOME)
+            store.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
     if not children:
-        client.delete_run(word["run_id"])
+        store.delete_run(word["run_id"])
     return sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))
 
 
@@ -227,7 +252,7 @@ def remove_run_folder(folder: Path) -> None:
 
     Nothing else is touched: the folder may be one that somebody named, with other files in it.
     """
-    for ours in (folder / ".hydra", folder / OUTCOME_FOLDER):
+    for ours in (folder / ".hydra", folder / OUTCOME_FOLDER, folder / SPOOLS):
         shutil.rmtree(ours, ignore_errors=True)
     for ours in (folder / PARENT_FILE, folder / "multirun.yaml", folder / LOCK_FILE):
         ours.unlink(missing_ok=True)

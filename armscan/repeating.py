@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mlflow import MlflowClient
 from mlflow.entities import Run
 from omegaconf import DictConfig
 
@@ -19,7 +18,7 @@ from armscan.multirun import JOB_TAG, Job
 from armscan.resume import go_on
 from armscan.settings import plain
 from armscan.stage import Stage
-from armscan.tracking import open_store
+from armscan.tracking import TrackingStore, open_store
 from armscan.training import TEST, TRAINING
 
 Figures = dict[str, dict[str, float]]
@@ -49,14 +48,14 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Figures:
     return run_experiment(config, invocation)
 
 
-def _earlier_runs(client: MlflowClient, experiment_id: str, stage: Stage, config: DictConfig) -> list[Run]:
+def _earlier_runs(client: TrackingStore, experiment_id: str, stage: Stage, config: DictConfig) -> list[Run]:
     """Returns the runs of this configuration on these volumes, the latest first."""
     sums = {SUM_TAGS[name]: sum_of(contents) for name, contents in started_with(plain(config), stage).items()}
     wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
     return list(client.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"]))
 
 
-def _adopt(client: MlflowClient, run: Run, job: Job) -> None:
+def _adopt(client: TrackingStore, run: Run, job: Job) -> None:
     """Makes a run a child of the grid that is repeated."""
     client.set_tag(run.info.run_id, "mlflow.parentRunId", job.parent_run_id)
     client.set_tag(run.info.run_id, JOB_TAG, str(job.number))

@@ -3,7 +3,7 @@
     python -m armscan.report study=sac_y                  reports/sac_y/report.html, with its numbers as CSV beside it
 
 study=NAME          of the study
-storage=URI         that it is in; optuna.journal where nothing is said
+storage=URI         that it is in; ARMSCAN_STORAGE or optuna.journal where nothing is said
 out=FOLDER          takes the report; reports/NAME where nothing is said
 
 It can be made while the study is going on.
@@ -17,7 +17,7 @@ from pathlib import Path
 
 from armscan.errors import InvalidValueError, StudyError, listed
 from armscan.mistakes import quieten_libraries
-from armscan.settings import USUAL_STORAGE
+from armscan.settings import usual_storage
 from armscan.words import answered, read_words
 
 KEYS = ("study", "storage", "out")
@@ -35,13 +35,14 @@ def _run(words: Sequence[str]) -> int:
     # Deferred: a mistake on the command line should be answered before these are loaded.
     import optuna
 
+    from armscan.passwords import without_password
     from armscan.sweeps.reporting import write_report
     from armscan.sweeps.settings import JUDGED_SUFFIX, check_study_name
-    from armscan.sweeps.storage import existing_storage, without_password
+    from armscan.sweeps.storage import existing_storage
     from armscan.sweeps.study import is_ours
 
     quieten_libraries()
-    name, uri = check_study_name("study", values["study"]), values.get("storage", USUAL_STORAGE)
+    name, uri = check_study_name("study", values["study"]), values.get("storage", usual_storage())
     storage = existing_storage(uri, where="storage")
     if storage is None:
         raise StudyError(f"storage is {without_password(uri)!r}, but nothing is there: give the one that it is in")

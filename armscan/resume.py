@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from mlflow import MlflowClient
 from mlflow.entities import Run
 from omegaconf import DictConfig, OmegaConf
 
@@ -33,7 +32,7 @@ from armscan.files import (
 )
 from armscan.settings import RESUME, TRACKING_URI, plain, usual_tracking
 from armscan.stage import Stage
-from armscan.tracking import TrackedRun, find_run, jobs_of, open_existing_store
+from armscan.tracking import TrackedRun, TrackingStore, find_run, jobs_of, open_existing_store, sync
 from armscan.training import Fingerprints, check_unchanged, take_up
 
 
@@ -59,7 +58,7 @@ def resume(words: Sequence[str]) -> dict[str, dict[str, float]]:
     return go_on(client, find_run(client, wanted).info.run_id)
 
 
-def go_on(client: MlflowClient, run_id: str, *, job_label: str | None = None) -> dict[str, dict[str, float]]:
+def go_on(client: TrackingStore, run_id: str, *, job_label: str | None = None) -> dict[str, dict[str, float]]:
     """Goes on with a run; see `resume`.
 
     Args:
@@ -69,7 +68,8 @@ def go_on(client: MlflowClient, run_id: str, *, job_label: str | None = None) ->
     """
     folder = _folder_of(client, client.get_run(run_id))
     with held(folder):
-        # It may have ended just before the folder was free.
+        # What it has left because the store was away; it may have ended just before the folder was free.
+        sync(folder, lambda _: client)
         run = client.get_run(run_id)
         if run.info.status == "FINISHED":
             raise ResumeError(f"run {run_id} has finished: there is nothing to resume")
@@ -82,8 +82,9 @@ def go_on(client: MlflowClient, run_id: str, *, job_label: str | None = None) ->
         _check_volumes(run, folder, stage.fingerprints)
         agent, split = stage.experiment.agent, stage.experiment.split
         earlier = take_up(agent, folder, stage.origin(run_id)) if isinstance(agent, Learner) else []
-        tracked = TrackedRun.go_on(client, run_id, config=plain(config), tags=volume_tags(split) | place_tags(folder))
-        return carry_out(stage, tracked, folder, client.tracking_uri, job_label=job_label, earlier=earlier)
+        tags = volume_tags(split) | place_tags(folder)
+        tracked = TrackedRun.go_on(client, run_id, folder=folder, config=plain(config), tags=tags)
+        return carry_out(stage, tracked, folder, client.uri, job_label=job_label, earlier=earlier)
 
 
 def _read(words: Sequence[str]) -> tuple[str, str]:
@@ -102,7 +103,7 @@ def _read(words: Sequence[str]) -> tuple[str, str]:
     return values[RESUME], values[TRACKING_URI]
 
 
-def _folder_of(client: MlflowClient, run: Run) -> Path:
+def _folder_of(client: TrackingStore, run: Run) -> Path:
     """Returns the folder of a run that this version can go on with."""
     run_id, tags = run.info.run_id, run.data.tags
     if "folder" not in tags:

@@ -27,6 +27,8 @@ from armscan.invocation import Invocation
 from armscan.jobs import start_job
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME, mistake_in_one_line, quieten_libraries
 from armscan.multirun import INTERRUPTED, Multirun, end_multirun, remove_if_untracked
+from armscan.passwords import check_words
+from armscan.services import hand_over_local
 from armscan.settings import MULTIRUN, PLAN, RESUME, SWEEPS
 
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
@@ -104,6 +106,8 @@ def main() -> int:
     # Hydra reads its options only before the first override, and people write them anywhere.
     sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in MULTIRUN)
     try:
+        check_words(sys.argv[1:])
+        hand_over_local()
         if any(word == PLAN or word.startswith(f"{SWEEPS}=") for word in sys.argv[1:]):
             from armscan.sweeps.command import run_study
 

@@ -9,6 +9,7 @@ from typing import Any, cast
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from armscan.mistakes import CONFIG_MODULE
+from armscan.services import STORAGE, address_of
 
 # The rules that an evaluation may change in one word, and where they stand in the configuration.
 CHANGES = {
@@ -22,12 +23,12 @@ CHANGES = {
 RESUME, TRACKING_URI = "resume", "tracking.uri"
 # What names a study, and the option that only shows what it would run.
 SWEEPS, PLAN = "sweeps", "--plan"
+# The services that many machines share.
+CLUSTER = "cluster"
 # Hydra's options for several runs.
 MULTIRUN = ("-m", "--multirun")
 # The phantoms, where a command asks for volumes.
 PHANTOM = "phantom"
-# Where studies are kept.
-USUAL_STORAGE = "optuna.journal"
 
 
 def plain(config: DictConfig | ListConfig) -> dict[str, Any]:
@@ -39,10 +40,15 @@ def plain(config: DictConfig | ListConfig) -> dict[str, Any]:
     return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
 
 
-def usual_tracking() -> dict[str, str]:
+def usual_tracking() -> dict[str, Any]:
     """Returns the section `tracking` as it is where nobody says anything else."""
     with (resources.files(CONFIG_MODULE) / "tracking" / "mlflow.yaml").open() as file:
         return plain(OmegaConf.load(file))
+
+
+def usual_storage() -> str:
+    """Returns where studies are kept where nobody says anything else; without a password."""
+    return address_of(STORAGE, "optuna.journal")
 
 
 def resume_command(run_id: str, tracking_uri: str) -> str:
@@ -57,7 +63,15 @@ def evaluate_command(run_id: str, tracking_uri: str) -> str:
 
 def report_command(study: str, storage: str) -> str:
     """Returns what one types to see what a study has found."""
-    return _command_at("armscan.report", f"study={study}", "storage", storage, USUAL_STORAGE)
+    return _command_at("armscan.report", f"study={study}", "storage", storage, usual_storage())
+
+
+def ui_command(*, tracking: str | None = None, storage: str | None = None) -> str:
+    """Returns what one types to look at runs and studies in the browser; what is None is where it usually is."""
+    usual = {"storage": usual_storage(), "tracking": usual_tracking()["uri"]}
+    given = {"storage": storage, "tracking": tracking}
+    words = [f"{key}={uri}" for key, uri in given.items() if uri not in (None, usual[key])]
+    return shlex.join(["python", "-m", "armscan.ui", *words])
 
 
 def _command(module: str, of_run: str, key_of_store: str, tracking_uri: str) -> str:

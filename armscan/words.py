@@ -11,6 +11,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from armscan.errors import InvalidValueError, is_interruption, listed
+from armscan.passwords import check_words
+from armscan.services import hand_over_local
 
 
 def read_words(words: Sequence[str], allowed: Sequence[str], texts: Collection[str]) -> dict[str, Any]:
@@ -61,6 +63,8 @@ def answered(command: Callable[[Sequence[str]], int], words: Sequence[str] | Non
         print(usage)
         return 0
     try:
+        check_words(words)
+        hand_over_local()
         return command(words)
     # Raised inside compiled code, an interrupt can come out as any other error.
     except (KeyboardInterrupt, Exception) as error:

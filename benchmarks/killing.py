@@ -16,6 +16,7 @@ from pathlib import Path
 
 from filelock import FileLock
 
+from armscan.passwords import hand_over_storage
 from armscan.sweeps.supervising import local_workers
 from armscan.sweeps.tally import RETRY_OF
 from benchmarks.studies import JOURNAL, NAME, SLEEPING, started, tally_in
@@ -65,7 +66,8 @@ def storage_of_kind(kind: str, folder: Path) -> Iterator[tuple[str, Callable[[],
             yield f"sqlite:///{folder}/optuna.db", partial(lock_file, folder / "optuna.db")
         case "postgresql":
             with postgres_server() as server:
-                yield server.make_database(), partial(server.restart, away_s=AWAY_S)
+                # Its password goes to the workers by the environment.
+                yield hand_over_storage(server.make_database()), partial(server.restart, away_s=AWAY_S)
         case _:
             sys.exit(f"storage is {kind!r}, but it must be journal, sqlite or postgresql")
 

@@ -71,7 +71,9 @@ def finished_run(name: str, overrides: Sequence[str], folder: Path) -> Run:
         print(f"{name}: python -m armscan.run {' '.join(overrides)}", flush=True)
         with (folder / f"{name}.log").open("w") as log:
             subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=True)
-        client, experiment_id = open_store(store, experiment=name, artifacts=f"{folder.absolute()}/mlartifacts")
+        client, experiment_id = open_store(
+            store, experiment=name, artifacts=f"{folder.absolute()}/mlartifacts", wait_s=60.0
+        )
         (newest,) = client.search_runs([experiment_id], order_by=["attributes.start_time DESC"], max_results=1)
         (run_folder / "run_id").write_text(newest.info.run_id)
     return Run(run_folder, store)

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,11 +29,11 @@ def programs() -> Path | None:
 
 
 @contextmanager
-def postgres_server(host: str = LOOPBACK) -> Iterator[PostgresServer]:
-    """A server as long as it lasts."""
+def postgres_server(host: str = LOOPBACK, **settings: str) -> Iterator[PostgresServer]:
+    """A server as long as it lasts, with these settings of PostgreSQL beside its own."""
     folder = Path(tempfile.mkdtemp(prefix="armscan-postgres-"))
     try:
-        server = PostgresServer(folder, host)
+        server = PostgresServer(folder, settings, host)
         server.start()
         try:
             yield server
@@ -48,10 +48,11 @@ class PostgresServer:
 
     Args:
         folder: of its data, empty.
+        settings: of PostgreSQL, beside those that a server of one's own needs.
         host: address that it listens on.
     """
 
-    def __init__(self, folder: Path, host: str = LOOPBACK) -> None:
+    def __init__(self, folder: Path, settings: Mapping[str, str] | None = None, host: str = LOOPBACK) -> None:
         found = programs()
         assert found is not None
         self._host = host
@@ -59,7 +60,7 @@ class PostgresServer:
         # It refuses to run as root.
         self._account = _account() if os.geteuid() == 0 else None
         self._process: subprocess.Popen[bytes] | None = None
-        self._numbers = itertools.count()
+        self._numbers, self._settings = itertools.count(), dict(settings or {})
         with socket.socket() as free:
             free.bind((host, 0))
             self.port = free.getsockname()[1]
@@ -77,7 +78,7 @@ class PostgresServer:
         """Starts it, and waits until it answers."""
         # Without fsync: it is only the server that is killed here, and never the machine.
         own = {"port": self.port, "listen_addresses": self._host, "unix_socket_directories": "", "fsync": "off"}
-        words = [word for key, value in own.items() for word in ("-c", f"{key}={value}")]
+        words = [word for key, value in (self._settings | own).items() for word in ("-c", f"{key}={value}")]
         self._process = self._started("postgres", "-D", self._data, *words)
         until_s = time.monotonic() + START_S
         while not self._answers():
@@ -108,12 +109,13 @@ class PostgresServer:
         self.execute(f"CREATE DATABASE {name}")
         return self.uri(name)
 
-    def execute(self, statement: str) -> None:
-        """Executes a statement in the database that is always there."""
+    def execute(self, statement: str) -> list[tuple[Any, ...]]:
+        """Executes a statement in the database that is always there; returns its rows."""
         import psycopg
 
         with psycopg.connect(self.uri("postgres"), autocommit=True) as connection:
-            connection.execute(statement)
+            cursor = connection.execute(statement)
+            return cursor.fetchall() if cursor.description else []
 
     def uri(self, database: str) -> str:
         """Returns the address of a database."""

@@ -1,14 +1,28 @@
-"""Processes that a test has started through others: found again by what only they have."""
+"""What runs on this machine, for tests of what must not be left running, and to end what they started by others."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 END_S = 10.0
+
+
+def processes_in(folder: Path) -> list[int]:
+    """The processes whose working folder this is."""
+    listing = subprocess.run(["ps", "-eo", "pid="], capture_output=True, text=True, check=True).stdout.split()
+    found = []
+    for pid in listing:
+        try:
+            if Path(f"/proc/{pid}/cwd").readlink() == folder:
+                found.append(int(pid))
+        except OSError:
+            continue
+    return found
 
 
 def with_variable(name: str, value: str) -> list[int]:

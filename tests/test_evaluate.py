@@ -55,7 +55,7 @@ def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json",
     with contextlib.chdir(folder):
         experiment = build(config)
     client, experiment_id = open_store(
-        f"sqlite:///{folder}/mlruns.db", experiment="armscan", artifacts=str(folder / "artifacts")
+        f"sqlite:///{folder}/mlruns.db", experiment="armscan", artifacts=str(folder / "artifacts"), wait_s=60.0
     )
     familiar = Familiar.of(experiment.maker.one(experiment.split.training))
     (folder / "config.yaml").write_text(yaml.safe_dump(OmegaConf.to_container(config)))
@@ -63,7 +63,7 @@ def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json",
     tags = {SUM_TAGS[name]: sum_of((folder / name).read_bytes()) for name in SUM_TAGS if name in kept}
     tags |= {"volumes.training": " ".join(experiment.split.training), "working_folder": str(folder)}
     tags |= {FAMILIAR_TAG: familiar.to_json()} if has_tag else {}
-    with TrackedRun.start(client, experiment_id, name="tiny", config={}, tags=tags) as run:
+    with TrackedRun.start(client, experiment_id, name="tiny", config={}, tags=tags, folder=folder) as run:
         if agent is None:
             facts = {"n_env_steps": 7, "run_id": run.run_id}
             save_checkpoint(folder / "best.pt", experiment.agent.weights(), facts)

@@ -225,7 +225,7 @@ def test_killed_job_of_a_multirun_is_resumed_by_its_own_id(tmp_path):
 def cut_off(tmp_path):
     """A run that was cut off before anything was learned; returns its client, id and folder."""
     client, experiment_id = open_store(
-        f"sqlite:///{tmp_path}/mlruns.db", experiment="armscan", artifacts=str(tmp_path / "mlartifacts")
+        f"sqlite:///{tmp_path}/mlruns.db", experiment="armscan", artifacts=str(tmp_path / "mlartifacts"), wait_s=60.0
     )
     folder = tmp_path / "outputs" / "run"
     folder.mkdir(parents=True)
@@ -237,7 +237,7 @@ def cut_off(tmp_path):
         "armscan.version": armscan.__version__,
         "config.sha256": "f3",
     }
-    return client, client.create_run(experiment_id, tags=tags).info.run_id, folder
+    return client, client.create_run(experiment_id, name="cut off", tags=tags).info.run_id, folder
 
 
 def refused(answer, *words):

@@ -51,7 +51,7 @@ def test_run_trains_evaluates_and_tracks(tmp_path):
     ended = armscan_run(*SMALL, "seed=3", cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
-    for word in ("400/400 steps", "return", "success", "left", "test volumes", "mlflow ui", "episode.gif"):
+    for word in ("400/400 steps", "return", "success", "left", "test volumes", "armscan.ui", "episode.gif"):
         assert word in ended.stdout
     client, (tracked,) = runs_in(tmp_path)
     assert f"run {tracked.info.run_id}: sac-cluster-y-phantom-seed3" in ended.stdout
@@ -104,7 +104,7 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     assert "Traceback" not in ended.stderr
     assert "delta is 7, but it must be a finite number above 0 and at most 1" in ended.stderr
     assert "again alone: python -m armscan.run obs=cluster env.delta=7" in ended.stderr
-    assert "mlflow ui --backend-store-uri sqlite:///mlruns.db" in ended.stdout
+    assert "all runs  python -m armscan.ui\n" in ended.stdout
     tracked = runs_in(tmp_path)[1]
     (parent,) = [each for each in tracked if each.info.run_name.startswith("multirun")]
     children = [each for each in tracked if each is not parent]

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from optuna.trial import Trial
 
 from armscan.errors import InvalidValueError
 from armscan.mistakes import CONFIG_MODULE, CONFIG_NAME
-from armscan.settings import SWEEPS, plain
+from armscan.settings import CLUSTER, SWEEPS, plain
+from armscan.sweeps.outcome import Notes
 from armscan.sweeps.tally import ENV_STEPS, RETRY_OF, SEEDS
 from armscan.sweeps.values import Value, overrides_of
 from armscan.tracking import TrackedRun
@@ -43,6 +45,8 @@ class Attempt:
         opened: takes the tracked run of a training while it goes on, and None when it has ended.
         show_picture: takes a file that the dashboard is to show.
         reported: steps that have been reported, also before the trial was handed back.
+        notes: of the trial.
+        together: see `Storage.together`.
     """
 
     trial: Trial
@@ -56,7 +60,13 @@ class Attempt:
     opened: Callable[[TrackedRun | None], None]
     show_picture: Callable[[Path], None]
     reported: set[int]
+    notes: Notes
+    together: Callable[[Callable[[], bool]], bool]
     env_steps: int = field(default=0, init=False)
+    _of_seeds: dict[str, Mapping[str, float]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._of_seeds = dict(self.trial.user_attrs.get(SEEDS, {}))
 
     @property
     def folder(self) -> Path:
@@ -83,13 +93,14 @@ class Attempt:
         return seeded, choices
 
     @property
-    def seeds_done(self) -> dict[int, dict[str, float]]:
+    def seeds_done(self) -> dict[int, Mapping[str, float]]:
         """The figures of the seeds that have been run to their end, also by an attempt before."""
-        return {int(seed): figures for seed, figures in self.trial.user_attrs.get(SEEDS, {}).items()}
+        return {int(seed): figures for seed, figures in self._of_seeds.items()}
 
     def keep_seed(self, seed: int, figures: Mapping[str, float]) -> None:
         """Notes the figures of a seed that has been run to its end."""
-        self.trial.set_user_attr(SEEDS, {str(each): one for each, one in (self.seeds_done | {seed: figures}).items()})
+        self._of_seeds = self._of_seeds | {str(seed): dict(figures)}
+        self.notes.add(partial(self.trial.set_user_attr, SEEDS, self._of_seeds))
 
     def report(self, figures: Mapping[str, float], *, seed: int, n_env_steps: int, grid: int, total: int) -> None:
         """Reports how a training is going.
@@ -115,9 +126,13 @@ class Attempt:
             return
         self.reported.add(step)
         values = [one[self.objective] for one in done] + [figures[self.objective]]
-        self.trial.report(sum(values) / len(values), step)
-        if self.trial.should_prune():
+        if self.notes.written_with(self.together, partial(self._is_to_be_pruned, step, sum(values) / len(values))):
             raise optuna.TrialPruned
+
+    def _is_to_be_pruned(self, step: int, value: float) -> bool:
+        # Not by the trial's own method, which reports nothing twice: the storage may have lost it with its connection.
+        self.trial.storage.set_trial_intermediate_value(self.trial._trial_id, step, value)
+        return self.trial.should_prune()
 
 
 def trial_folder(study_folder: Path, number: int) -> Path:
@@ -132,7 +147,9 @@ def composed(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
         config = compose(CONFIG_NAME, list(words), return_hydra_config=True)
     choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
     with open_dict(config):
-        for section in ("study", "hydra"):
+        # Where runs are tracked is the same whatever said so.
+        config.tracking = plain(config.tracking)
+        for section in ("study", "hydra", CLUSTER):
             config.pop(section, None)
     return config, choices
 

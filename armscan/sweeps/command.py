@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import sys
 from collections.abc import Callable, Sequence
 
 from armscan.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher
 from armscan.mistakes import quieten_libraries
-from armscan.settings import plain
+from armscan.passwords import check_written
+from armscan.settings import TRACKING_URI, plain
 from armscan.sweeps.attempt import composed
 from armscan.sweeps.checking import check_space
-from armscan.sweeps.command_line import CommandLine
-from armscan.sweeps.database import hand_over_password
+from armscan.sweeps.command_line import STORAGE, CommandLine
 from armscan.sweeps.launching import run_workers
 from armscan.sweeps.opening import open_for_work, read_settings
 from armscan.sweeps.planning import print_plan
 from armscan.sweeps.screen import print_result
-from armscan.sweeps.storage import without_password
 from armscan.sweeps.study import existing_study
 
 
@@ -40,10 +38,9 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     given = CommandLine.read(words)
     quieten_libraries()
     settings, task, config = read_settings(given.of_trials)
-    # Words are written into files, logs and the tracking store.
-    hand_over_password(settings.storage)
-    settings = dataclasses.replace(settings, storage=without_password(settings.storage))
-    given = given.with_storage(settings.storage)
+    for key, uri in ((STORAGE, settings.storage), (TRACKING_URI, config.tracking.uri)):
+        check_written(key, uri)
+    given = given.with_services({STORAGE: settings.storage, TRACKING_URI: config.tracking.uri})
     launcher = composed(given.launching)[1][LAUNCHER]
     if launcher in ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))

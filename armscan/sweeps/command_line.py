@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -12,7 +12,7 @@ from hydra.core.override_parser.types import Override, QuotedString
 
 from armscan.errors import InvalidValueError
 from armscan.launchers import LAUNCHER
-from armscan.settings import MULTIRUN, PLAN, RESUME, SWEEPS
+from armscan.settings import CLUSTER, MULTIRUN, PLAN, RESUME, SWEEPS
 from armscan.sweeps.describing import NOT_SEARCHED
 from armscan.sweeps.values import written
 
@@ -59,12 +59,20 @@ class CommandLine:
         _check_search_path(overrides)
         return cls(own, PLAN in options)
 
-    def with_storage(self, uri: str) -> Self:
-        """Returns the same for the storage at another address."""
-        if uri == fixed_by(self.words).get(STORAGE, uri):
-            return self
-        others = (word for word in self.words if word.lstrip("+").partition("=")[0] != STORAGE)
-        return replace(self, words=(*others, f"{STORAGE}={written(uri)}"))
+    def with_services(self, addresses: Mapping[str, str]) -> Self:
+        """Returns the same with these addresses instead of what has said them.
+
+        Args:
+            addresses: without passwords, by `study.storage` and `tracking.uri`; workers need not find them out.
+        """
+        said = {word: word.lstrip("+").partition("=")[0] for word in self.words}
+        if CLUSTER in said.values():
+            given = addresses
+        else:
+            fixed = fixed_by(self.words)
+            given = {key: uri for key, uri in addresses.items() if fixed.get(key, uri) != uri}
+        others = (word for word, key in said.items() if key not in (CLUSTER, *given))
+        return replace(self, words=(*others, *(f"{key}={written(uri)}" for key, uri in given.items())))
 
     @property
     def launching(self) -> list[str]:

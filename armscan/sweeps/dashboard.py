@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from pathlib import Path
 
 import optuna
-from mlflow import MlflowClient
 from optuna.artifacts import FileSystemArtifactStore, upload_artifact
 from optuna.trial import Trial
 
-from armscan.console import from_here
-from armscan.sweeps.storage import without_password
+from armscan.log import say
+from armscan.tracking import TrackingStore
 
 # Where `mlflow ui` answers, for stores that are no server themselves.
 USUAL_UI = "http://127.0.0.1:5000"
 
 
-def note_run(noted: optuna.Study | Trial, client: MlflowClient, experiment_id: str, run_id: str, folder: Path) -> None:
+def note_run(noted: optuna.Study | Trial, client: TrackingStore, experiment_id: str, run_id: str, folder: Path) -> None:
     """Leaves a note with the link to the tracked run, and the folder.
 
     Args:
@@ -31,8 +28,7 @@ def note_run(noted: optuna.Study | Trial, client: MlflowClient, experiment_id: s
     # Deferred: it takes a second, and only who works at a study needs it.
     from optuna_dashboard import save_note
 
-    uri = str(client.tracking_uri)
-    address = without_password(uri).rstrip("/") if uri.startswith("http") else USUAL_UI
+    address = client.uri.rstrip("/") if client.uri.startswith("http") else USUAL_UI
     link = f"[its run in MLflow]({address}/#/experiments/{experiment_id}/runs/{run_id})"
     save_note(noted, f"{link}, {run_id}\n\nits folder: `{folder.resolve()}`")
 
@@ -45,11 +41,9 @@ def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:
         picture: a file.
         artifacts: folder of the pictures of all studies.
     """
-    artifacts.mkdir(parents=True, exist_ok=True)
-    upload_artifact(study_or_trial=trial, file_path=str(picture), artifact_store=FileSystemArtifactStore(artifacts))
-
-
-def dashboard_command(storage: str, artifacts: str) -> str:
-    """Returns what one types to look at the studies of a storage."""
-    program = from_here(Path(sys.executable).with_name("optuna-dashboard"))
-    return shlex.join([str(program), storage, "--artifact-dir", artifacts])
+    try:
+        artifacts.mkdir(parents=True, exist_ok=True)
+        upload_artifact(study_or_trial=trial, file_path=str(picture), artifact_store=FileSystemArtifactStore(artifacts))
+    except OSError as error:
+        # No reason for a trial to fail: it is in its folder, too.
+        say(f"{picture} cannot be shown in Optuna's dashboard: {error}")

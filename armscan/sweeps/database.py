@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -12,9 +11,12 @@ from optuna.distributions import BaseDistribution
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.storages import BaseStorage, RDBStorage, get_storage
 from optuna.trial import TrialState
-from sqlalchemy import URL, Connection, create_engine, inspect, make_url, text
+from sqlalchemy import URL, Connection, create_engine, inspect, text
 
-from armscan.sweeps.patience import ConnectionLostError, Patience
+from armscan.errors import StorageAwayError
+from armscan.passwords import STORAGE_PASSWORD, database_url
+from armscan.patience import Patience
+from armscan.sweeps.away import ConnectionLostError, why_away
 
 T = TypeVar("T")
 # One of a PostgreSQL database's advisory locks.
@@ -29,18 +31,11 @@ TCP = {
     "keepalives_count": 3,
     "tcp_user_timeout": 25_000,
 }
-# Where the address has no password: the command hands it to its workers so, and not in words that are written down.
-PASSWORD_VARIABLE = "ARMSCAN_STORAGE_PASSWORD"
 
 
 def url_of(uri: str) -> URL:
     """Returns the address of a database with its driver and password."""
-    url = make_url(uri)
-    if url.drivername == "postgresql":
-        url = url.set(drivername="postgresql+psycopg")
-    if url.get_backend_name() == "postgresql" and url.password is None:
-        url = url.set(password=os.environ.get(PASSWORD_VARIABLE))
-    return url
+    return database_url(uri, STORAGE_PASSWORD)
 
 
 class DatabaseStorage:
@@ -95,9 +90,15 @@ class DatabaseStorage:
 
     def alone(self, decide: Callable[[], T]) -> T:
         """See `Storage.alone`; for a database that has a lock."""
-        return self._patience.through(partial(self._alone_once, decide))
+        return self._patience.through(partial(self._at_once, decide, is_alone=True))
 
-    def _alone_once(self, decide: Callable[[], T]) -> T:
+    def together(self, operate: Callable[[], T]) -> T:
+        """See `Storage.together`; for a database that has transactions of several statements."""
+        if getattr(self._here, "inside", None) is not None:
+            return operate()
+        return self._patience.through(partial(self._at_once, operate, is_alone=False))
+
+    def _at_once(self, decide: Callable[[], T], *, is_alone: bool) -> T:
         # One transaction on one connection holds the lock and all that is decided. So nothing is done without the lock:
         # who loses the connection loses both, and nothing is left half done. Only whether it was all done or nothing is
         # not known where the connection is lost while it is committed; whoever decides again looks first.
@@ -108,7 +109,8 @@ class DatabaseStorage:
         with self._rdb.engine.connect() as connection:
             try:
                 with connection.begin():
-                    _lock(connection)
+                    if is_alone:
+                        _lock(connection)
                     sessions.remove()
                     # What Optuna commits in this thread are savepoints of the transaction.
                     sessions(bind=connection, join_transaction_mode="create_savepoint")
@@ -135,15 +137,6 @@ class DatabaseStorage:
 BaseStorage.register(DatabaseStorage)
 
 
-def hand_over_password(uri: str) -> None:
-    """Keeps the password of an address, where it has one, for this process and those that it starts."""
-    if not uri.startswith("postgresql"):
-        return
-    url = make_url(uri)
-    if password := url.password or url.query.get("password"):
-        os.environ[PASSWORD_VARIABLE] = str(password)
-
-
 def open_database(url: URL, shown: str, *, is_patient: bool, is_made: bool = True) -> BaseStorage:
     """Opens a database.
 
@@ -153,7 +146,8 @@ def open_database(url: URL, shown: str, *, is_patient: bool, is_made: bool = Tru
         is_patient: whether to wait for it.
         is_made: whether the tables are made where there are none.
     """
-    opened = DatabaseStorage(url, Patience(shown), is_patient=is_patient, is_made=is_made)
+    patience = Patience("the storage", f"study.storage is {shown!r}", why_away, StorageAwayError)
+    opened = DatabaseStorage(url, patience, is_patient=is_patient, is_made=is_made)
     return cast(BaseStorage, opened)
 
 

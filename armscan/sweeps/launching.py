@@ -13,20 +13,21 @@ from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 
-from armscan.errors import ArmscanError, StorageAwayError, StudyError
+from armscan.errors import ArmscanError, AwayError, StorageAwayError, StudyError
 from armscan.launchers import LAUNCHER, ON_THIS_MACHINE, quieten_launcher
 from armscan.mistakes import mistake_in_one_line
+from armscan.patience import impatient
 from armscan.settings import TRACKING_URI
+from armscan.sweeps.clearing import close_orphans, close_runs_of
 from armscan.sweeps.command_line import STORAGE, USUAL_LAUNCHER, WORKER_KEY, CommandLine, fixed_by
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.opening import OpenStudy
-from armscan.sweeps.patience import impatient
 from armscan.sweeps.screen import Screen
-from armscan.sweeps.storage import without_password
-from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, WORKER_FILES, Process, keep_gpus, local_workers
+from armscan.sweeps.supervising import LAUNCHER_FILE, STOP_FILE, WORKER_FILES, Process, here, keep_gpus, local_workers
 from armscan.sweeps.values import written
 from armscan.sweeps.vigil import Vigil
-from armscan.sweeps.worker import close_runs_of
+from armscan.tracking import TrackedRun, sync
+from armscan.tracking.run import SHORT_WAIT_S
 
 # Workers that are asked to leave have so long, before their launcher is interrupted and those on this machine are
 # killed; a folder that is shared shows others only after a while that they are asked.
@@ -51,13 +52,14 @@ def run_workers(opened: OpenStudy, given: CommandLine, launcher: str, launch: La
         StudyError: if the launcher has failed, and nobody is at work.
     """
     started = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
-    folder = opened.folder.absolute() / "workers" / started
+    folder = here() / opened.folder / "workers" / started
     folder.mkdir(parents=True)
     Process.current().write(folder / LAUNCHER_FILE)
     words = _words(opened, given, launcher, folder)
-    opened.client.update_run(opened.run_id, status="RUNNING")
+    tracked = TrackedRun.joined(opened.client, opened.run_id, name=opened.settings.name, folder=folder)
+    tracked.set_status("RUNNING")
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
-    with _leaving(opened, folder, leave_s), Screen(opened, folder):
+    with _leaving(opened, folder, tracked, leave_s), Screen(opened, folder):
         if launcher not in ON_THIS_MACHINE:
             _launch_elsewhere(opened, folder, launcher, lambda: launch(words))
         elif launcher == USUAL_LAUNCHER:
@@ -84,9 +86,7 @@ def _words(opened: OpenStudy, given: CommandLine, launcher: str, folder: Path) -
 def _addresses(opened: OpenStudy, given: CommandLine) -> list[str]:
     """Returns the words that say where all is kept, where that stands in the environment, which others have not."""
     told, kept = fixed_by(given.words), {STORAGE: opened.settings.storage, TRACKING_URI: opened.config.tracking.uri}
-    # What has a password in it goes into no words.
-    untold = {key: uri for key, uri in kept.items() if key not in told and without_password(uri) == uri}
-    return [f"{key}={written(uri)}" for key, uri in untold.items()]
+    return [f"{key}={written(uri)}" for key, uri in kept.items() if key not in told]
 
 
 def _launch_elsewhere(opened: OpenStudy, folder: Path, launcher: str, launch: Callable[[], object]) -> None:
@@ -115,7 +115,7 @@ def _launch_elsewhere(opened: OpenStudy, folder: Path, launcher: str, launch: Ca
 
 
 @contextlib.contextmanager
-def _leaving(opened: OpenStudy, folder: Path, leave_s: float) -> Iterator[None]:
+def _leaving(opened: OpenStudy, folder: Path, tracked: TrackedRun, leave_s: float) -> Iterator[None]:
     """What the workers are launched in: on the way out none of them is left, and nothing that they ran is open."""
     status, is_asked = "FINISHED", threading.Event()
     patience = threading.Timer(leave_s, os.kill, (os.getpid(), signal.SIGINT))
@@ -149,11 +149,24 @@ def _leaving(opened: OpenStudy, folder: Path, leave_s: float) -> Iterator[None]:
             for phase in opened.begun():
                 for trial in phase.ledger.reclaim(Witness().is_dead):
                     close_runs_of(trial, phase)
-        opened.client.set_terminated(opened.run_id, "KILLED" if is_asked.is_set() else status)
+        _deliver(opened, tracked, "KILLED" if is_asked.is_set() else status)
         for each, handler in before.items():
             signal.signal(each, handler)
     if is_asked.is_set():
         raise KeyboardInterrupt
+
+
+def _deliver(opened: OpenStudy, tracked: TrackedRun, status: str) -> None:
+    """Ends the study's own run, and delivers what the runs of its trials have left because their store was away."""
+    is_there = tracked.end(status, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
+    left = []
+    if is_there:
+        left = [each.folder for each in sync(opened.folder, lambda _: opened.client) if each.left]
+        with contextlib.suppress(AwayError), impatient():
+            for phase in opened.begun():
+                close_orphans(phase)
+    if not is_there or left:
+        print(f"not all is tracked: python -m armscan.track sync {opened.folder} delivers the rest", file=sys.stderr)
 
 
 @contextlib.contextmanager

@@ -13,8 +13,9 @@ from typing import Any
 
 from optuna.trial import FrozenTrial, Trial
 
+from armscan.log import say
 from armscan.sweeps.ledger import Ledger
-from armscan.sweeps.log import say
+from armscan.sweeps.outcome import Notes, Outcome
 from armscan.sweeps.tally import HOLDER, LEASE
 
 BEAT_S, TICK_S = 10.0, 0.25
@@ -100,6 +101,8 @@ class Keeper:
         self._is_told_to_leave_soon = is_told_to_leave_soon
         self._trial: Trial | None = None
         self._close: Callable[[], None] | None = None
+        # Of the trial at hand.
+        self.notes = Notes()
         self._spent: str | None = None
         # Held while a trial changes hands, so that none is forgotten by who leaves in the middle of it.
         self._changing = threading.Lock()
@@ -119,14 +122,20 @@ class Keeper:
             for thread in self._threads:
                 thread.join()
 
-    def claim(self) -> Trial | None:
-        """Takes a trial, as `Ledger.claim` does, and holds it from then on."""
-        self._leave_where_told_to()
+    def claim(self, outcome: Outcome | None = None, conclude: Callable[[], None] | None = None) -> Trial | None:
+        """Takes a trial, as `Ledger.claim` does, and holds it from then on.
+
+        Args:
+            outcome: of the trial before, which is not held any more.
+            conclude: what is then to be done of that one, also where the process is told to leave before it is.
+        """
         with self._changing:
             # How far the trial before was is not said of this one.
             self._lease = {key: self._lease[key] for key in (*HOLDER, "beat")}
-            self._trial = self._ledger.claim(self._lease)
-            return self._trial
+            self._trial = self._ledger.claim(self._lease, outcome)
+            self._close, self.notes = conclude, Notes()
+        self._leave_where_told_to()
+        return self._trial
 
     def closing(self, close: Callable[[], None] | None) -> None:
         """Says how to close what the trial has open, where the process is told to leave."""
@@ -147,17 +156,10 @@ class Keeper:
         """Leaves the trial, if one is held, for another to go on with."""
         with self._changing:
             if self._trial is not None:
-                self._ledger.hand_back(self._trial, self._lease)
+                self._ledger.hand_back(self._trial, self._lease, self.notes)
                 say(f"trial {self._trial.number} is handed back")
             if self._close is not None:
                 self._close()
-            self._trial = self._close = None
-
-    @contextmanager
-    def ending(self) -> Iterator[None]:
-        """What a trial is ended in: afterwards it is not held any more."""
-        with self._changing:
-            yield
             self._trial = self._close = None
 
     def _leave_where_told_to(self) -> None:
@@ -189,9 +191,8 @@ class Keeper:
 
     def _give_sign(self) -> None:
         with self._changing:
-            if self._trial is not None:
-                self._lease = self._lease | {"beat": self._lease["beat"] + 1}
-                self._ledger.renew(self._trial, self._lease)
-        for trial in self._ledger.reclaim(self._witness.is_dead):
+            self._lease = self._lease | {"beat": self._lease["beat"] + 1}
+            tally = self._ledger.renew(self._trial, self._lease)
+        for trial in self._ledger.reclaim(self._witness.is_dead, tally):
             self._on_death(trial)
-        self._spent = self._ledger.spent(self._ledger.tally())
+        self._spent = self._ledger.spent(tally)

@@ -6,14 +6,16 @@ could take with it when it dies.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import optuna
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
+from armscan.sweeps.limits import Limits
+from armscan.sweeps.outcome import Notes, Outcome
 from armscan.sweeps.storage import Storage
 from armscan.sweeps.tally import (
     ATTEMPT,
@@ -29,27 +31,7 @@ from armscan.sweeps.tally import (
     env_steps_of,
 )
 
-# After this many failures, with no trial that got anywhere, the fault is in the configuration and not in a trial.
-FAILURES_AT_ONCE = 3
-
-
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """When a study has enough.
-
-    Args:
-        n_trials: that finish.
-        max_failures: trials that may fail for good.
-        max_retries: of a trial whose worker died.
-        hours: wall time in which trials run; None for no limit.
-        env_steps: of all trials; None for no limit.
-    """
-
-    n_trials: int
-    max_failures: int = 10
-    max_retries: int = 1
-    hours: float | None = None
-    env_steps: int | None = None
+T = TypeVar("T")
 
 
 class Ledger:
@@ -72,32 +54,59 @@ class Ledger:
         """Returns how the study stands."""
         return Tally.of(self.study.get_trials(deepcopy=False))
 
-    def claim(self, lease: Mapping[str, Any]) -> Trial | None:
-        """Takes a trial to run, one that waits before a new one.
+    def together(self, operate: Callable[[], T]) -> T:
+        """See `Storage.together`."""
+        return self._storage.together(operate)
+
+    def claim(self, lease: Mapping[str, Any], outcome: Outcome | None = None) -> Trial | None:
+        """Tells what came of a trial, and takes another to run, one that waits before a new one.
 
         Args:
             lease: who takes it.
+            outcome: of the trial before; None where there is none to be told. It says then whether it was told.
 
         Returns:
             The trial, or None where there is none to be had now: those that run may be enough, or the study is over.
         """
         asked: list[Trial] = []
+        n_times = 0
 
         def claimed() -> Trial | None:
+            nonlocal n_times
+            n_times += 1
+            if outcome is not None:
+                self._tell(outcome, is_repeated=n_times > 1)
             tally = self.tally()
             # Where the storage went away in the middle, one may have been taken before, and only the answer been lost.
             leases = {trial._trial_id: trial.user_attrs.get(LEASE) for trial in tally.running}
             for trial in asked:
                 if leases.get(trial._trial_id) == lease:
                     return trial
-            enough = len(tally.finished) + len(tally.running) >= self._limits.n_trials
-            if enough or self.end(tally) is not None or not (self._is_open or tally.waiting):
+            if not self.has_more(tally):
                 return None
             asked.append(self.study.ask())
             asked[-1].set_user_attr(LEASE, dict(lease))
             return asked[-1]
 
         return self._storage.alone(claimed)
+
+    def _tell(self, outcome: Outcome, *, is_repeated: bool) -> None:
+        trial = outcome.trial
+        now = self.study._storage.get_trial(trial._trial_id).state
+        if now != TrialState.RUNNING:
+            # Others end the trial of a worker only as failed; or it was this one, and the answer was lost.
+            outcome.is_told = is_repeated and now == outcome.state
+            return
+        for name, value in outcome.attributes.items():
+            trial.set_user_attr(name, value)
+        outcome.notes.write()
+        self.study.tell(trial, outcome.values, outcome.state)
+        outcome.is_told = True
+
+    def has_more(self, tally: Tally) -> bool:
+        """Whether there is a trial to be had now."""
+        enough = len(tally.finished) + len(tally.running) >= self._limits.n_trials
+        return not enough and self.end(tally) is None and (self._is_open or bool(tally.waiting))
 
     def end(self, tally: Tally) -> str | None:
         """Returns why no further trial is to be begun; None where some are."""
@@ -111,26 +120,13 @@ class Ledger:
         return self.spent(tally)
 
     def spent(self, tally: Tally) -> str | None:
-        """Returns why no trial is to be gone on with, for time or environment steps; None where there are some left."""
-        limits = self._limits
-        if limits.hours is not None and tally.busy_hours >= limits.hours:
-            return f"the {limits.hours:g} hours of study.hours are over"
-        if limits.env_steps is not None and tally.env_steps >= limits.env_steps:
-            return f"the {limits.env_steps} environment steps of study.env_steps are taken"
-        return None
+        """See `Limits.spent`."""
+        return self._limits.spent(tally)
 
     def broken(self, tally: Tally) -> str | None:
-        """Returns why so many trials have failed that the study ends; None where they are few enough."""
-        limits, failed = self._limits, tally.failed
-        if failed:
-            forgiven = self.study.user_attrs.get(FORGIVEN, ())
-            failed = tuple(trial for trial in failed if trial.number not in forgiven)
-        if len(failed) > limits.max_failures:
-            return f"{len(failed)} trials have failed, and at most {limits.max_failures} may: {_reason(failed[-1])}"
-        got_nowhere = not tally.finished and not any(trial.intermediate_values for trial in tally.all)
-        if len(failed) >= FAILURES_AT_ONCE and got_nowhere:
-            return f"the first {len(failed)} trials failed before they reported anything: {_reason(failed[0])}"
-        return None
+        """See `Limits.broken`; failures that were forgiven do not count."""
+        forgiven = self.study.user_attrs.get(FORGIVEN, ()) if tally.failed else ()
+        return self._limits.broken(tally, forgiven)
 
     def forgive(self) -> int:
         """Lets failures count no more, where there were too many: somebody starts the study again all the same.
@@ -144,8 +140,14 @@ class Ledger:
         self.study.set_user_attr(FORGIVEN, [trial.number for trial in tally.failed])
         return len(tally.failed)
 
-    def hand_back(self, trial: Trial, lease: Mapping[str, Any]) -> None:
-        """Leaves a trial of one's own for another to go on with; the lease says how far it is."""
+    def hand_back(self, trial: Trial, lease: Mapping[str, Any], notes: Notes | None = None) -> None:
+        """Leaves a trial of one's own for another to go on with.
+
+        Args:
+            trial: that is left.
+            lease: says how far it is.
+            notes: of the trial, not written yet.
+        """
         storage = self.study._storage
         # Nobody holds it: whoever takes it and dies before its own lease is there is not to be taken for this worker.
         left = {**lease, "started": ""}
@@ -156,27 +158,39 @@ class Ledger:
             is_own = all(holder.get(key) == lease[key] for key in HOLDER if key in lease)
             # Not where somebody took this worker for dead, nor, where only the answer was lost, took it up already.
             if now.state == TrialState.RUNNING and is_own:
+                if notes is not None:
+                    notes.write()
                 storage.set_trial_user_attr(trial._trial_id, LEASE, left)
                 storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
 
         self._storage.alone(handed_back)
 
-    def renew(self, trial: Trial, lease: Mapping[str, Any]) -> None:
-        """Says that the worker of a trial of one's own is alive, and how far it is."""
-        try:
-            self.study._storage.set_trial_user_attr(trial._trial_id, LEASE, dict(lease))
-        except UpdateFinishedTrialError:
-            return
+    def renew(self, trial: Trial | None, lease: Mapping[str, Any]) -> Tally:
+        """Says that the worker of a trial of one's own is alive, and how far it is.
 
-    def fail(self, trial: Trial, reason: str) -> None:
-        """Ends a trial of one's own that raised."""
-        self._storage.alone(lambda: self._fail(trial._trial_id, {FAILURE: reason}))
+        Args:
+            trial: None where the worker has none at hand.
+            lease: of the trial.
 
-    def reclaim(self, is_dead: Callable[[FrozenTrial], bool]) -> list[FrozenTrial]:
+        Returns:
+            How the study stands.
+        """
+
+        def renewed() -> Tally:
+            # Where somebody took the worker for dead, the trial is not its own any more.
+            with contextlib.suppress(UpdateFinishedTrialError):
+                if trial is not None:
+                    self.study._storage.set_trial_user_attr(trial._trial_id, LEASE, dict(lease))
+            return self.tally()
+
+        return self.together(renewed)
+
+    def reclaim(self, is_dead: Callable[[FrozenTrial], bool], seen: Tally | None = None) -> list[FrozenTrial]:
         """Fails the trials of workers that have died, and lets each be taken up again where it may be.
 
         Args:
             is_dead: whether the worker of a running trial is.
+            seen: how the study stood a moment ago; it is asked for where it is None.
 
         Returns:
             The trials that were failed.
@@ -187,7 +201,7 @@ class Ledger:
             return LEASE not in trial.user_attrs or is_dead(trial)
 
         # First without keeping others out: hardly ever is one lost.
-        if not any(map(is_lost, self.tally().running)):
+        if not any(map(is_lost, (seen or self.tally()).running)):
             return []
         reclaimed: dict[int, FrozenTrial] = {}
 
@@ -221,7 +235,3 @@ class Ledger:
             return storage.set_trial_state_values(trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
             return False
-
-
-def _reason(trial: FrozenTrial) -> str:
-    return f"trial {trial.number}: {trial.user_attrs.get(FAILURE, 'no reason is known')}"

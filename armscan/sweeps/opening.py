@@ -9,23 +9,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import optuna
-from mlflow import MlflowClient
 from omegaconf import DictConfig
 
 from armscan.errors import InvalidValueError, StudyError, listed
+from armscan.patience import PATIENCE_S
 from armscan.settings import plain
 from armscan.sweeps.attempt import composed, study_section
 from armscan.sweeps.command_line import fixed_by
 from armscan.sweeps.dashboard import note_run
 from armscan.sweeps.judging import make_judging_study, seed_of_judged
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.parts import make_pruner, make_sampler, make_task
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.settings import StudySettings
 from armscan.sweeps.storage import Storage, open_storage
 from armscan.sweeps.study import STUDY_RUN, make_study, open_study
 from armscan.sweeps.tasks import Task
-from armscan.tracking import open_store, source_tags
+from armscan.tracking import TrackingStore, open_store, source_tags
 
 NO_END = 10**9
 
@@ -48,7 +49,7 @@ class OpenStudy:
     task: Task
     config: DictConfig
     storage: Storage
-    client: MlflowClient
+    client: TrackingStore
     experiment_id: str
     run_id: str
 
@@ -175,7 +176,8 @@ def open_for_work(
         StudyError: if the storage cannot be used, or the study that exists is another.
         TrackingError: if the tracking store cannot be used.
     """
-    client, experiment_id = open_store(**plain(config.tracking))
+    patience_s = PATIENCE_S if is_patient else None
+    client, experiment_id = open_store(**plain(config.tracking), patience_s=patience_s)
     for name in ("folder", "artifacts"):
         make_folder(f"study.{name}", getattr(settings, name))
     storage = open_storage(settings.storage, is_patient=is_patient)
@@ -184,7 +186,7 @@ def open_for_work(
     @functools.cache
     def run_made() -> str:
         tags = {**source_tags(), "study": settings.name, "study.storage": storage.uri, "overrides": " ".join(words)}
-        return str(client.create_run(experiment_id, run_name=f"study {settings.name}", tags=tags).info.run_id)
+        return str(client.create_run(experiment_id, name=f"study {settings.name}", tags=tags).info.run_id)
 
     def tracked() -> str:
         if STUDY_RUN not in study.user_attrs:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mlflow import MlflowClient
 from optuna.trial import Trial
 
 from armscan.sweeps.ledger import Ledger
 from armscan.sweeps.space import Space
+from armscan.tracking import TrackingStore
 
 if TYPE_CHECKING:
     from armscan.sweeps.attempt import Attempt
@@ -51,6 +51,6 @@ class Phase:
     folder: Path
     artifacts: Path
     storage_uri: str
-    client: MlflowClient
+    client: TrackingStore
     experiment_id: str
     run_id: str

@@ -17,14 +17,12 @@ from rich.text import Text
 
 from armscan.console import print_where_to_look
 from armscan.errors import StorageAwayError
+from armscan.patience import impatient
 from armscan.settings import report_command
-from armscan.sweeps.dashboard import dashboard_command
 from armscan.sweeps.judging import best_trials
 from armscan.sweeps.ledger import Ledger
 from armscan.sweeps.opening import OpenStudy
-from armscan.sweeps.patience import impatient
 from armscan.sweeps.settings import StudySettings
-from armscan.sweeps.storage import without_password
 from armscan.sweeps.tally import ENV_STEPS, FAILURE, JUDGED, JUDGED_SEED, LEASE, RETRIED, Tally
 from armscan.sweeps.values import overrides_of
 from armscan.sweeps.verdict import shown_of, verdicts
@@ -165,10 +163,8 @@ def print_result(opened: OpenStudy) -> int:
         )
     Console().print(table)
     is_judged = _print_verdicts(opened)
-    print_where_to_look(opened.folder, opened.config.tracking.uri)
-    storage = without_password(settings.storage)
-    print(f"studies   {dashboard_command(storage, settings.artifacts)}")
-    print(f"report    {report_command(settings.name, storage)}")
+    print_where_to_look(opened.folder, opened.config.tracking.uri, storage=settings.storage)
+    print(f"report    {report_command(settings.name, settings.storage)}")
     return 0 if is_judged else 1
 
 

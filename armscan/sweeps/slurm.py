@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any, Self
 
-from armscan.sweeps.log import say
+from armscan.log import say
 
 # Said before a job's time is over or it is preempted, as submitit asks for; and when it is cancelled, or queued again.
 SOON, NOW = signal.SIGUSR2, signal.SIGTERM

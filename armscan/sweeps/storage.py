@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from optuna.storages import BaseStorage, JournalStorage
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.errors import StudyError
+from armscan.passwords import masked, without_password
 from armscan.sweeps.database import DatabaseStorage, open_database, tables_in, url_of
 from armscan.sweeps.journal import open_journal, read_journal
 
@@ -56,6 +56,20 @@ class Storage:
                 return decide()
         assert isinstance(self.optuna, DatabaseStorage)
         return self.optuna.alone(decide)
+
+    def together(self, operate: Callable[[], T]) -> T:
+        """Asks for several things at once, where there is a way to go for each: one there and back for all of them.
+
+        Args:
+            operate: asks; see `alone`.
+
+        Returns:
+            What it returns.
+        """
+        if self.lock_file is not None:
+            return operate()
+        assert isinstance(self.optuna, DatabaseStorage)
+        return self.optuna.together(operate)
 
 
 def open_storage(uri: str, *, where: str = "study.storage", is_patient: bool = False) -> Storage:
@@ -176,13 +190,5 @@ def _refused_in_one_line(uri: str, where: str) -> Iterator[None]:
             f"{where} is {shown!r}, but {error.name} is not installed: pip install 'armscan[postgres]'"
         ) from error
     except (SQLAlchemyError, StorageInternalError, OSError, ImportError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split()).replace(uri, shown)[:MAX_REASON_CHARS]
+        reason = masked(" ".join(str(error).split()).replace(uri, shown))[:MAX_REASON_CHARS]
         raise StudyError(f"{where} is {shown!r}, but this storage cannot be used: {reason}") from error
-
-
-def without_password(uri: str) -> str:
-    """Returns an address as it may be shown."""
-    scheme, separator, rest = uri.partition("://")
-    account, at, host = rest.rpartition("@")
-    shown = f"{scheme}{separator}{account.partition(':')[0]}{at}{host}"
-    return re.sub(r"([?&])password=[^&]*&?", r"\1", shown).rstrip("?&")

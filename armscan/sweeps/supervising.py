@@ -20,7 +20,7 @@ from typing import BinaryIO, Self
 
 from omegaconf import DictConfig
 
-from armscan.errors import StorageAwayError, StudyError
+from armscan.errors import AwayError, StudyError
 from armscan.files import write_whole
 from armscan.sweeps.command_line import words_of_trials
 from armscan.sweeps.lease import process_start
@@ -66,7 +66,7 @@ class Process:
     @classmethod
     def current(cls) -> Self:
         """This process."""
-        return cls(socket.gethostname(), os.getpid(), process_start(os.getpid()), str(Path.cwd()))
+        return cls(socket.gethostname(), os.getpid(), process_start(os.getpid()), str(here()))
 
     @classmethod
     def read(cls, file: Path) -> Self:
@@ -82,6 +82,15 @@ class Process:
         """Whether it has ended, as far as can be seen from here: not from another machine."""
         is_here = self.host == socket.gethostname() and self.started != ""
         return is_here and process_start(self.pid) != self.started
+
+
+def here() -> Path:
+    """Returns the directory of this process as its user calls it.
+
+    That is a name which other machines know; what a link or a mount of this machine leads to may not be.
+    """
+    called = Path(os.environ.get("PWD", ""))
+    return called if called.is_absolute() and called.is_dir() and called.samefile(".") else Path.cwd()
 
 
 def local_workers(folder: Path) -> list[Process]:
@@ -209,7 +218,7 @@ def worker_main() -> None:
         is_alone = os.getppid() != parent_pid or launcher.is_gone
         return is_asked.is_set() or is_alone or (folder / STOP_FILE).exists()
 
-    from armscan.sweeps.log import say
+    from armscan.log import say
     from armscan.sweeps.working import work
 
     try:
@@ -220,6 +229,6 @@ def worker_main() -> None:
             is_told_to_leave_soon=is_asked_soon.is_set,
             leave=lambda: os._exit(LEFT),
         )
-    except StorageAwayError as error:
+    except AwayError as error:
         say(str(error))
         raise SystemExit(AWAY) from error

@@ -19,12 +19,13 @@ from armscan.experiment import FILM_SEED, judged, learned, place_tags, start_tra
 from armscan.files import LAST_CHECKPOINT, held, write_whole
 from armscan.invocation import Invocation
 from armscan.multirun import Job
+from armscan.patience import PATIENCE_S
 from armscan.settings import plain
 from armscan.stage import Stage
 from armscan.sweeps.attempt import Attempt
 from armscan.sweeps.tally import ENV_STEPS
 from armscan.sweeps.tasks import VolumesInMemory
-from armscan.tracking import TrackedRun, draw_learning_curve, open_store
+from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
 from armscan.tracking.run import CURVE_FILE, EVALUATION_FILE
 from armscan.training import TEST, EpochReport, Evaluation, TrainingResult, film_episode, take_up
 
@@ -190,12 +191,12 @@ def _begun(
             # Whatever has happened to it, the trial can be begun again, with an agent that has learned nothing.
             stage = Stage.built(config)
         else:
-            client, _ = open_store(**plain(config.tracking))
+            client, _ = open_store(**plain(config.tracking), patience_s=PATIENCE_S)
             tags = volume_tags(stage.experiment.split) | place_tags(folder)
             tags["mlflow.parentRunId"] = attempt.run_id
-            return stage, TrackedRun.go_on(client, run_id, config=plain(config), tags=tags), earlier
+            return stage, TrackedRun.go_on(client, run_id, folder=folder, config=plain(config), tags=tags), earlier
     job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
-    tracked = start_tracking(config, Invocation(folder, attempt.overrides, choices, job), stage)
+    tracked = start_tracking(config, Invocation(folder, attempt.overrides, choices, job), stage, patience_s=PATIENCE_S)
     tracked.set_tags({"study": attempt.trial.study.study_name, "trial": str(attempt.trial.number)})
     write_whole(begun, lambda file: file.write(json.dumps({"run_id": tracked.run_id}).encode()))
     return stage, tracked, []
@@ -209,5 +210,6 @@ def _take_over(attempt: Attempt, folder: Path) -> None:
     for file in before.iterdir():
         if file.is_file() and not file.name.startswith(".") and file.name != RUN_FILE:
             shutil.copyfile(file, folder / file.name)
+    take_over(json.loads((before / RUN_FILE).read_text())["run_id"], before, folder)
     # Last: from then on this folder counts.
     shutil.copyfile(before / RUN_FILE, folder / RUN_FILE)

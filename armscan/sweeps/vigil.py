@@ -10,9 +10,10 @@ from collections import defaultdict
 from collections.abc import Iterator
 
 from armscan.errors import StorageAwayError
+from armscan.patience import impatient
+from armscan.sweeps.judging import lacking
 from armscan.sweeps.lease import Witness
 from armscan.sweeps.opening import OpenStudy
-from armscan.sweeps.patience import impatient
 
 LOOK_S = 5.0
 # A launcher that waits for longer after the end of a study waits for a worker that nobody will hear of any more.
@@ -35,14 +36,15 @@ class Vigil:
 
     def is_over(self) -> bool:
         """Whether nobody is at work, and nothing is left to be done."""
-        phases = self._opened.begun()
-        tallies = [phase.ledger.tally() for phase in phases]
-        ends = [phase.ledger.end(tally) for phase, tally in zip(phases, tallies, strict=True)]
-        if None in ends or any(tally.running for tally in tallies):
-            return False
-        is_broken = phases[0].ledger.broken(tallies[0]) is not None
-        is_to_be_judged = self._opened.settings.judging.best and tallies[0].finished and not is_broken
-        return len(phases) > 1 or not is_to_be_judged
+        searching, *judging = self._opened.begun()
+        for phase in (searching, *judging):
+            tally = phase.ledger.tally()
+            if tally.running or phase.ledger.end(tally) is None:
+                return False
+        if searching.ledger.broken(searching.ledger.tally()):
+            return True
+        judged = judging[0].ledger.study if judging else None
+        return not lacking(self._opened.settings, searching.ledger.study, judged)
 
     def is_alive(self) -> bool:
         """Whether the worker of any trial is."""

@@ -4,31 +4,32 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
 from optuna.exceptions import UpdateFinishedTrialError
-from optuna.trial import FrozenTrial, Trial, TrialState
+from optuna.trial import Trial, TrialState
 
-from armscan.checks import check_float
-from armscan.errors import InvalidValueError, StorageAwayError, listed
+from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.files import CONFIG_FILE, SUM_TAGS
+from armscan.log import say
 from armscan.mistakes import mistake_in_one_line
 from armscan.settings import plain
 from armscan.sweeps.attempt import CONFIG_SUM, FOLDER, RUN, Attempt, composed, sum_of_config, trial_folder
 from armscan.sweeps.dashboard import note_run, show_picture
+from armscan.sweeps.figures import checked_figures
 from armscan.sweeps.lease import Keeper, LimitReachedError
-from armscan.sweeps.log import say
+from armscan.sweeps.outcome import Once, Outcome
 from armscan.sweeps.parts import make_sampler
 from armscan.sweeps.phases import Phase
-from armscan.sweeps.tally import ENV_STEPS, FIGURES, RETRY_OF
+from armscan.sweeps.tally import ENV_STEPS, FAILURE, FIGURES, RETRY_OF
 from armscan.sweeps.values import overrides_of
 from armscan.tracking import TrackedRun
+from armscan.tracking.run import SHORT_WAIT_S
 
 WAIT_S = 1.0
 MAX_REASON_CHARS = 2000
@@ -49,32 +50,54 @@ class Worker:
 
     def work(self) -> str:
         """Runs trials until no further one is to be begun, and those that others run have ended; returns why."""
+        outcome: Outcome | None = None
+        conclude: Once | None = None
+        while True:
+            # One way to the storage for the trial before and the next: with many workers it is these that add up.
+            trial = self._keeper.claim(outcome, conclude)
+            if conclude is not None:
+                conclude()
+                self._keeper.closing(None)
+            outcome, conclude = None, None
+            if trial is not None:
+                outcome = self._run(trial)
+                conclude = Once(partial(self._conclude, outcome, self._tracked)) if outcome else None
+                self._tracked = None
+            elif reason := self._waited():
+                return reason
+
+    def _waited(self) -> str | None:
+        """Waits until there is a trial to be had; returns why there will be none any more."""
         ledger = self._phase.ledger
         while True:
-            trial = self._keeper.claim()
-            if trial is not None:
-                self._run(trial)
-                continue
             tally = ledger.tally()
             reason = ledger.end(tally)
             # A trial that somebody runs may yet have to be taken up again.
             if reason is not None and not tally.running:
                 return reason
+            if ledger.has_more(tally):
+                return None
             time.sleep(WAIT_S)
 
-    def _run(self, trial: Trial) -> None:
+    def _run(self, trial: Trial) -> Outcome | None:
+        """Runs a trial; returns what came of it, None where that is for others to say."""
         say(f"{self._phase.name}: {_beginning(trial)}")
+        notes = self._keeper.notes
         try:
             figures = checked_figures(self._figures(trial), self._phase.objectives)
         except optuna.TrialPruned:
-            self._tell(trial, TrialState.PRUNED)
+            return Outcome(trial, TrialState.PRUNED, notes)
         except UpdateFinishedTrialError:
             # Somebody has taken this worker for dead: the trial is theirs.
-            self._let_go(trial)
+            self._let_go(trial, self._tracked)
+            self._keeper.closing(None)
         except LimitReachedError as limit:
             say(f"trial {trial.number} is handed back: {limit}")
             self._keeper.hand_back()
-            self._tracked = None
+        except TrackingAwayError:
+            # For whoever finds the tracking store back.
+            self._keeper.hand_back()
+            raise
         except StorageAwayError:
             raise
         # Whatever else a trial raises is the trial's, and not the study's; this process is told to leave otherwise.
@@ -82,17 +105,19 @@ class Worker:
             line = mistake_in_one_line(error)
             if line is None:
                 traceback.print_exc()
-            self._fail(trial, line or repr(error))
+            reason = (line or repr(error))[:MAX_REASON_CHARS]
+            return Outcome(trial, TrialState.FAIL, notes, attributes={FAILURE: reason})
         else:
-            trial.set_user_attr(FIGURES, figures)
-            self._tell(trial, TrialState.COMPLETE, [figures[name] for name in self._phase.objectives])
+            values = [figures[name] for name in self._phase.objectives]
+            return Outcome(trial, TrialState.COMPLETE, notes, values, {FIGURES: figures})
+        return None
 
     def _figures(self, trial: Trial) -> dict[str, float]:
-        phase = self._phase
+        phase, notes = self._phase, self._keeper.notes
         # By the number of the trial: workers side by side draw other points, and one alone the same ones again.
         seed = np.random.SeedSequence((phase.seed, trial.number)).generate_state(1)[0]
         trial.study.sampler = make_sampler(phase.sampler, int(seed))
-        chosen = phase.space.suggest(trial)
+        chosen = self._suggested(trial)
         config, choices = composed([*self._words, *overrides_of(chosen)])
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)
@@ -102,7 +127,7 @@ class Worker:
         self._opened(None)
         for name, value in ((FOLDER, str(folder)), (CONFIG_SUM, config_sum)):
             if trial.user_attrs.get(name) != value:
-                trial.set_user_attr(name, value)
+                notes.add(partial(trial.set_user_attr, name, value))
         attempt = Attempt(
             trial=trial,
             chosen=chosen,
@@ -113,13 +138,24 @@ class Worker:
             objective=phase.reported,
             tell_progress=self._keeper.tell_progress,
             opened=self._opened,
-            show_picture=partial(show_picture, trial, artifacts=phase.artifacts),
+            show_picture=lambda picture: notes.add(partial(show_picture, trial, picture, phase.artifacts)),
             reported=_steps_of(trial) if is_gone_on_with else set(),
+            notes=notes,
+            together=phase.ledger.together,
         )
         try:
             return phase.run(attempt)
         finally:
-            trial.set_user_attr(ENV_STEPS, attempt.env_steps)
+            notes.add(partial(trial.set_user_attr, ENV_STEPS, attempt.env_steps))
+
+    def _suggested(self, trial: Trial) -> dict[str, Any]:
+        """Returns what a trial tries, drawn and written at once."""
+
+        def suggested() -> dict[str, Any]:
+            # Anew each time: what a trial has noted as written may have been lost with the connection.
+            return self._phase.space.suggest(Trial(trial.study, trial._trial_id))
+
+        return self._phase.ledger.together(suggested)
 
     def _begun(self, trial: Trial, chosen: dict[str, Any], folder: Path, config_sum: str) -> TrackedRun:
         """Opens the tracked run of a trial, anew or where it was handed back."""
@@ -135,7 +171,7 @@ class Worker:
         if RETRY_OF in attributes:
             tags["trial.retry_of"] = str(attributes[RETRY_OF])
         if RUN in attributes:
-            tracked = TrackedRun.go_on(phase.client, attributes[RUN], config={}, tags=tags)
+            tracked = TrackedRun.go_on(phase.client, attributes[RUN], folder=folder, config={}, tags=tags)
         else:
             tracked = TrackedRun.start(
                 phase.client,
@@ -143,84 +179,40 @@ class Worker:
                 name=f"{phase.name}-{trial.number:04d}",
                 config=chosen,
                 tags=tags,
+                folder=folder,
                 parent_id=phase.run_id,
             )
             # Before the trial knows its run: who goes on with it makes no note any more.
-            note_run(trial, phase.client, phase.experiment_id, tracked.run_id, folder)
-            trial.set_user_attr(RUN, tracked.run_id)
+            noted = partial(note_run, trial, phase.client, phase.experiment_id, tracked.run_id, folder)
+            for write in (noted, partial(trial.set_user_attr, RUN, tracked.run_id)):
+                self._keeper.notes.add(write)
         return tracked
 
     def _opened(self, training: TrackedRun | None) -> None:
         open_runs = [run for run in (training, self._tracked) if run is not None]
         self._keeper.closing(partial(_close, open_runs))
 
-    def _tell(self, trial: Trial, state: TrialState, values: Sequence[float] | None = None) -> None:
-        with self._keeper.ending():
-            try:
-                trial.study.tell(trial, values, state)
-            # Its own error, and that of a trial which is not running any more.
-            except (UpdateFinishedTrialError, ValueError):
-                self._let_go(trial)
-                return
-        named = dict(zip(self._phase.objectives, values or (), strict=False))
-        shown = ", ".join(f"{name} {value:.4g}" for name, value in named.items())
-        say(f"trial {trial.number} {state.name.lower()} {shown}".rstrip())
-        if self._tracked is not None:
-            self._tracked.log_figures(trial.user_attrs.get(FIGURES, {}), n_env_steps=0)
-            if state == TrialState.PRUNED:
-                self._phase.client.set_tag(self._tracked.run_id, "pruned", "true")
-            self._tracked.end("FINISHED")
-        self._tracked = None
+    def _conclude(self, outcome: Outcome, tracked: TrackedRun | None) -> None:
+        """Says what came of a trial, once the storage knows it."""
+        trial, state = outcome.trial, outcome.state
+        if not outcome.is_told:
+            self._let_go(trial, tracked)
+            return
+        figures = outcome.attributes.get(FIGURES, {})
+        shown = ", ".join(f"{name} {figures[name]:.4g}" for name in self._phase.objectives if name in figures)
+        reason = outcome.attributes.get(FAILURE)
+        say(f"trial {trial.number} " + (f"failed: {reason}" if reason else f"{state.name.lower()} {shown}".rstrip()))
+        if tracked is None:
+            return
+        tracked.log_figures(figures, n_env_steps=0)
+        if state == TrialState.PRUNED:
+            tracked.set_tags({"pruned": "true"})
+        tracked.end("FAILED" if reason else "FINISHED", reason=reason)
 
-    def _fail(self, trial: Trial, reason: str) -> None:
-        say(f"trial {trial.number} failed: {reason}")
-        with self._keeper.ending():
-            self._phase.ledger.fail(trial, reason[:MAX_REASON_CHARS])
-        if self._tracked is not None:
-            self._tracked.end("FAILED", reason=reason)
-        self._tracked = None
-
-    def _let_go(self, trial: Trial) -> None:
+    def _let_go(self, trial: Trial, tracked: TrackedRun | None) -> None:
         say(f"trial {trial.number} was taken over by another worker")
-        if self._tracked is not None:
-            self._tracked.end("FAILED", reason="taken over by another worker")
-        self._tracked = None
-
-
-def checked_figures(figures: Any, objectives: Sequence[str]) -> dict[str, float]:
-    """Returns what a task has returned.
-
-    Args:
-        figures: by name; those that are no objectives may be NaN.
-        objectives: the names of those that must be there, and finite.
-
-    Raises:
-        InvalidValueError: if it is anything else.
-    """
-    if not isinstance(figures, Mapping):
-        raise InvalidValueError(f"the task has returned {figures!r}, but it must be figures by their names")
-    if missing := [name for name in objectives if name not in figures]:
-        raise InvalidValueError(f"the task has not returned {missing[0]}, but only {listed(list(figures))}")
-    for name, figure in figures.items():
-        if name in objectives:
-            check_float(f"what the task has returned as {name}", figure)
-        elif not isinstance(figure, Real):
-            raise InvalidValueError(f"what the task has returned as {name} is {figure!r}, but it must be a number")
-    return {str(name): float(figure) for name, figure in figures.items()}
-
-
-def close_runs_of(trial: FrozenTrial, phase: Phase) -> None:
-    """Closes what a dead worker has left open in the tracking store."""
-    run_id = trial.user_attrs.get(RUN)
-    if run_id is None:
-        return
-    client, reason = phase.client, "its worker died"
-    children = client.search_runs(
-        [phase.experiment_id], f"tags.mlflow.parentRunId = '{run_id}' AND attributes.status = 'RUNNING'"
-    )
-    for each in (*(child.info.run_id for child in children), run_id):
-        client.set_tag(each, "failure", reason)
-        client.set_terminated(each, "FAILED")
+        if tracked is not None:
+            tracked.end("FAILED", reason="taken over by another worker")
 
 
 def _steps_of(trial: Trial) -> set[int]:
@@ -237,4 +229,4 @@ def _beginning(trial: Trial) -> str:
 
 def _close(runs: Sequence[TrackedRun]) -> None:
     for run in runs:
-        run.end("KILLED", reason="handed back")
+        run.end("KILLED", reason="handed back", wait_s=SHORT_WAIT_S)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
+from armscan.log import say
 from armscan.mistakes import quieten_libraries
+from armscan.sweeps.clearing import close_runs_of
 from armscan.sweeps.lease import Keeper
-from armscan.sweeps.log import say
 from armscan.sweeps.opening import open_for_work, read_settings
 from armscan.sweeps.phases import Phase
-from armscan.sweeps.worker import Worker, close_runs_of
+from armscan.sweeps.worker import Worker
 
 
 def work(
@@ -31,7 +32,7 @@ def work(
         leave: likewise.
 
     Raises:
-        StorageAwayError: if the storage is away for longer than a worker waits.
+        AwayError: if the storage or the tracking store is away for longer than a worker waits.
     """
     quieten_libraries()
     opened = open_for_work(*read_settings(words), words, is_patient=True)

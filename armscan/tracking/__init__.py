@@ -1,16 +1,21 @@
 """MLflow: the store, its runs, and the pictures that go there."""
 
+from armscan.tracking.client import TrackingStore
 from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, find_run, found_run, jobs_of
 from armscan.tracking.pictures import draw_learning_curve
 from armscan.tracking.run import TrackedRun, flattened
 from armscan.tracking.source import source_tags
+from armscan.tracking.spool import take_over
 from armscan.tracking.store import open_existing_store, open_store
+from armscan.tracking.sync import abandon, sync
 
 __all__ = [
     "EVALUATED_TAG",
     "FAMILIAR_TAG",
     "FoundRun",
     "TrackedRun",
+    "TrackingStore",
+    "abandon",
     "draw_learning_curve",
     "find_run",
     "flattened",
@@ -19,4 +24,6 @@ __all__ = [
     "open_existing_store",
     "open_store",
     "source_tags",
+    "sync",
+    "take_over",
 ]

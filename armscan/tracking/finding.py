@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from mlflow import MlflowClient
 from mlflow.entities import Run
 
 from armscan.errors import TrackingError, listed
 from armscan.files import BEST_CHECKPOINT, CONFIG_FILE, SUM_TAGS, VOLUMES_FILE, sum_of
+from armscan.tracking.client import TrackingStore
 from armscan.tracking.store import open_existing_store, usable_store
 from armscan.training import Fingerprints
 
@@ -42,7 +42,7 @@ class FoundRun:
         files: its artifacts, by their paths.
     """
 
-    client: MlflowClient = field(repr=False)
+    client: TrackingStore = field(repr=False)
     uri: str
     experiment_id: str
     run_id: str
@@ -118,7 +118,7 @@ def found_run(uri: str, run_id: str) -> FoundRun:
         return _found(client, uri, run)
 
 
-def find_run(client: MlflowClient, run_id: str) -> Run:
+def find_run(client: TrackingStore, run_id: str) -> Run:
     """Returns the run of an id.
 
     Args:
@@ -139,20 +139,21 @@ def find_run(client: MlflowClient, run_id: str) -> Run:
         max_results=N_SHOWN + 1,
     )
     if not found:
-        raise TrackingError(f"the run is {run_id!r}, but no run of {client.tracking_uri} has an id that begins so")
+        raise TrackingError(f"the run is {run_id!r}, but no run of {client.uri} has an id that begins so")
     if len(found) > 1:
         ids = [run.info.run_id for run in found[:N_SHOWN]] + (["others"] if len(found) > N_SHOWN else [])
         raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the id")
-    return found[0]
+    run: Run = found[0]
+    return run
 
 
-def jobs_of(client: MlflowClient, run: Run) -> list[Run]:
+def jobs_of(client: TrackingStore, run: Run) -> list[Run]:
     """Returns the runs of a multirun's jobs, by its parent run; none where the run is another."""
     children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
     return [child for child in children if EVALUATED_TAG not in child.data.tags]
 
 
-def _found(client: MlflowClient, uri: str, run: Run) -> FoundRun:
+def _found(client: TrackingStore, uri: str, run: Run) -> FoundRun:
     return FoundRun(
         client=client,
         uri=uri,

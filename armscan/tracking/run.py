@@ -3,102 +3,127 @@
 from __future__ import annotations
 
 import json
+import os
+import shlex
 import time
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from mlflow import MlflowClient
-from mlflow.entities import Metric, Param
+from mlflow.entities import Run
 
 from armscan.errors import is_interruption
+from armscan.log import say
+from armscan.tracking.client import TrackingStore
+from armscan.tracking.courier import Courier
 from armscan.tracking.pictures import draw_learning_curve
 from armscan.tracking.source import source_tags
+from armscan.tracking.spool import Address, Spool, file_of
 from armscan.training import EpochReport, Evaluation, TrainingResult
 
 EVALUATION_FILE, CURVE_FILE = "evaluation.json", "learning_curve.png"
-PARAMS_A_BATCH = 100
 MAX_PARAM_CHARS = 6000
+# Why a run ended before its end.
+FAILURE_TAG = "failure"
+# For a store that is away, where somebody waits for this process to end.
+SHORT_WAIT_S = 2.0
 
 
 class TrackedRun:
     """A run in MLflow, and the training callback that fills it.
 
+    What it is told is written into a file of its folder, and delivered from there in the background: whoever trains
+    waits for no store, and what a store that is away has not got, `python -m armscan.track sync FOLDER` delivers later.
+
     Args:
-        client: of an open store.
-        run_id: of the run.
+        store: that it is in.
+        spool: of the run.
         name: what the UI calls the run.
         logged: the names and steps of the figures that are there already, which are not logged again.
     """
 
     def __init__(
-        self, client: MlflowClient, run_id: str, *, name: str, logged: Collection[tuple[str, int]] = ()
+        self, store: TrackingStore, spool: Spool, *, name: str, logged: Collection[tuple[str, int]] = ()
     ) -> None:
-        self._client = client
+        self._store, self._spool = store, spool
+        self._courier = Courier(spool, store)
         self._logged = frozenset(logged)
-        self.run_id = run_id
+        self._is_closed, self._is_delivered, self._is_resumed = False, False, False
+        self.run_id = spool.address.run_id
         self.name = name
 
     @classmethod
     def start(
         cls,
-        client: MlflowClient,
+        store: TrackingStore,
         experiment_id: str,
         *,
         name: str,
         config: Mapping[str, Any],
         tags: Mapping[str, str],
+        folder: Path,
         parent_id: str | None = None,
     ) -> Self:
         """Makes a new run.
 
         Args:
-            client: of an open store.
+            store: that it is made in.
             experiment_id: of the run.
             name: what the UI calls the run.
             config: the resolved configuration; its leaves become parameters.
             tags: further tags.
+            folder: of the run.
             parent_id: the run that this one is a child of, None for none.
         """
         parent = {"mlflow.parentRunId": parent_id} if parent_id else {}
-        run = client.create_run(experiment_id, run_name=name, tags={**source_tags(), **tags, **parent})
-        tracked = cls(client, run.info.run_id, name=name)
+        run = store.create_run(experiment_id, name=name, tags={**source_tags(), **tags, **parent})
+        tracked = cls.joined(store, run.info.run_id, name=name, folder=folder)
         tracked.log_config(config)
         return tracked
 
     @classmethod
-    def go_on(cls, client: MlflowClient, run_id: str, *, config: Mapping[str, Any], tags: Mapping[str, str]) -> Self:
+    def joined(cls, store: TrackingStore, run_id: str, *, name: str, folder: Path) -> Self:
+        """Returns a run that is there, to add to it."""
+        return cls(store, Spool.begin(folder, Address(run_id, store.uri)), name=name)
+
+    @classmethod
+    def go_on(
+        cls, store: TrackingStore, run_id: str, *, folder: Path, config: Mapping[str, Any], tags: Mapping[str, str]
+    ) -> Self:
         """Opens a run again that was interrupted, as if nothing had happened to it.
 
         Args:
-            client: of the run's store.
+            store: that it is in.
             run_id: of the run.
+            folder: of the run.
             config: as it was started with; parameters that were not logged any more are.
             tags: to set anew.
         """
-        run = client.get_run(run_id)
-        if "failure" in run.data.tags:
-            client.delete_tag(run_id, "failure")
+        run = store.get_run(run_id)
         code = {f"resumed.{key}": value for key, value in source_tags().items() if key.startswith("git.")}
         resumed = {"resumed": str(int(run.data.tags.get("resumed", "0")) + 1)}
-        client.update_run(run_id, status="RUNNING")
-        logged = {(name, point.step) for name in run.data.metrics for point in client.get_metric_history(run_id, name)}
-        tracked = cls(client, run_id, name=run.info.run_name or run_id, logged=logged)
+        is_spooled = file_of(folder, run_id).exists()
+        spool = Spool.begin(folder, Address(run_id, store.uri))
+        logged = _logged_in(spool) if is_spooled else _logged_of(store, run)
+        tracked = cls(store, spool, name=run.info.run_name or run_id, logged=logged)
+        tracked._is_resumed = True
+        tracked.set_status("RUNNING")
+        tracked._add(untagged=FAILURE_TAG)
         tracked.set_tags(dict(tags) | code | resumed)
         tracked.log_config(config)
         return tracked
 
     def set_tags(self, tags: Mapping[str, str]) -> None:
         """Sets tags."""
-        for key, value in tags.items():
-            self._client.set_tag(self.run_id, key, value)
+        if tags:
+            self._add(tags=dict(tags))
 
     def log_config(self, config: Mapping[str, Any]) -> None:
         """Logs a configuration's leaves as parameters; those that are there already stay as they are."""
-        params = [Param(key, str(value)[:MAX_PARAM_CHARS]) for key, value in flattened(config).items()]
-        for first in range(0, len(params), PARAMS_A_BATCH):
-            self._client.log_batch(self.run_id, params=params[first : first + PARAMS_A_BATCH])
+        params = {key: str(value)[:MAX_PARAM_CHARS] for key, value in flattened(config).items()}
+        if params:
+            self._add(params=params)
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
         """Makes up for what was not logged any more when the run was killed."""
@@ -115,21 +140,21 @@ class TrackedRun:
         """The run goes on: evaluation and artifacts come after the training."""
 
     def log_figures(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
-        """Logs figures at an environment step, in one request; none twice."""
-        now_ms = time.time_ns() // 1_000_000
-        metrics = [
-            Metric(name, value, now_ms, n_env_steps)
+        """Logs figures at an environment step; none twice."""
+        now_ms = _now_ms()
+        points = [
+            (name, float(value), now_ms, n_env_steps)
             for name, value in figures.items()
             # MLflow has no place for a mean over no episodes, which is NaN.
             if value == value and (name, n_env_steps) not in self._logged
         ]
-        if metrics:
-            self._client.log_batch(self.run_id, metrics=metrics)
+        if points:
+            self._add(metrics=points)
 
     def log_files(self, *files: Path) -> None:
-        """Keeps files as artifacts."""
+        """Keeps files as artifacts; they stay as they are until the run has ended."""
         for file in files:
-            self._client.log_artifact(self.run_id, str(file))
+            self._add(file=os.path.relpath(file, self._spool.folder))
 
     def keep_results(self, result: TrainingResult | None, evaluations: Mapping[str, Evaluation], folder: Path) -> None:
         """Logs the final evaluations, and keeps what the run has made in its folder.
@@ -161,15 +186,59 @@ class TrackedRun:
         if error is None:
             self.end("FINISHED")
         elif is_interruption(error):
-            self.end("KILLED", reason="interrupted")
+            self.end("KILLED", reason="interrupted", wait_s=SHORT_WAIT_S)
         else:
             self.end("FAILED", reason=repr(error))
 
-    def end(self, status: str, *, reason: str | None = None) -> None:
-        """Closes the run as FINISHED, FAILED (with the reason) or KILLED."""
+    def set_status(self, status: str) -> None:
+        """Says how the run stands, such as RUNNING."""
+        self._add(status=(status, _now_ms()))
+
+    def end(self, status: str, *, reason: str | None = None, wait_s: float | None = None) -> bool:
+        """Closes the run as FINISHED, FAILED (with the reason) or KILLED, and waits until the store has all of it.
+
+        Args:
+            status: of the run.
+            reason: of its failure.
+            wait_s: how long a store is waited for that is away; as long as the configuration says where it is None.
+
+        Returns:
+            Whether the store has all of it; the rest is in the folder of the run.
+        """
+        if self._is_closed:
+            return self._is_delivered
+        self._is_closed = True
         if reason is not None:
-            self._client.set_tag(self.run_id, "failure", reason[:MAX_PARAM_CHARS])
-        self._client.set_terminated(self.run_id, status)
+            self._add(tags={FAILURE_TAG: reason[:MAX_PARAM_CHARS]})
+        elif self._is_resumed:
+            # Who took the one before for dead may have said so since.
+            self._add(untagged=FAILURE_TAG)
+        self.set_status(status)
+        failure = self._courier.finish(self._store.wait_s if wait_s is None else wait_s)
+        self._spool.close()
+        self._is_delivered = failure is None
+        if failure is not None:
+            again = f"python -m armscan.track sync {shlex.quote(str(self._spool.folder))}"
+            say(f"run {self.run_id}: {self._store.uri} has not got all of it ({failure}): {again} delivers the rest")
+        return self._is_delivered
+
+    def _add(self, **entry: Any) -> None:
+        self._spool.add(**entry)
+        self._courier.wake()
+
+
+def _now_ms() -> int:
+    return time.time_ns() // 1_000_000
+
+
+def _logged_in(spool: Spool) -> set[tuple[str, int]]:
+    return {(name, step) for entry in spool.entries() for name, _, _, step in entry.get("metrics", ())}
+
+
+def _logged_of(store: TrackingStore, run: Run) -> set[tuple[str, int]]:
+    """Returns what the store has of a run whose folder has no spool: an older version has made it."""
+    run_id = run.info.run_id
+    return {(name, point.step) for name in run.data.metrics for point in store.get_metric_history(run_id, name)}
 
 
 def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

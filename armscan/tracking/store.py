@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from filelock import FileLock
@@ -14,50 +15,98 @@ from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 from sqlalchemy.exc import SQLAlchemyError
 
+from armscan.checks import check_float
 from armscan.errors import TrackingError
+from armscan.passwords import (
+    SERVER_PASSWORD,
+    TRACKING_PASSWORD,
+    database_url,
+    hand_over_tracking,
+    password_of,
+    without_password,
+)
+from armscan.tracking.client import TrackingStore, reason_in
 
 SQLITE_PREFIX = "sqlite:///"
 EXAMPLES = {"uri": "sqlite:///mlruns.db", "experiment": "armscan", "artifacts": "mlartifacts"}
 LOCK_TIMEOUT_S = 120
+# Where there is no configuration that says it.
+USUAL_WAIT_S = 120.0
 # A server that is away should be said to be away within seconds, not after minutes of retries.
-HTTP_DEFAULTS = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2", "MLFLOW_HTTP_REQUEST_TIMEOUT": "20"}
+DEFAULTS = {
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
+    # Nobody has asked for it, and on a cluster it goes nowhere.
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    # Between the lines of a worker's log nobody looks for addresses.
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+}
 
 
-def open_store(uri: str, *, experiment: str, artifacts: str) -> tuple[MlflowClient, str]:
+def open_store(
+    uri: str, *, experiment: str, artifacts: str, wait_s: float, patience_s: float | None = None
+) -> tuple[TrackingStore, str]:
     """Opens a tracking store and makes the experiment where it does not exist yet.
 
     Args:
         uri: of the store, such as `sqlite:///mlruns.db` or the address of an MLflow server.
         experiment: the experiment's name.
         artifacts: folder of its artifacts where the store is a database; a server has its own place for them.
+        wait_s: how long a run waits for it at its end.
+        patience_s: how long it is waited for otherwise, already while it is opened; None for not at all.
 
     Returns:
-        A client of the store, and the experiment's id.
+        The store, and the experiment's id.
 
     Raises:
         TrackingError: if the store cannot be reached or used.
     """
     _check_texts(uri=uri, experiment=experiment, artifacts=artifacts)
-    with usable_store(uri):
-        return _open_locked(uri, experiment, artifacts)
+    check_float("tracking.wait_s", wait_s, at_least=0.0)
+    shown = hand_over_tracking(uri)
+    with usable_store(shown):
+        if not shown.startswith(SQLITE_PREFIX):
+            store = _store(shown, wait_s, patience_s)
+            return store, _experiment_in(store, experiment, None if shown.startswith("http") else artifacts)
+        # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
+        database = Path(shown.removeprefix(SQLITE_PREFIX)).absolute()
+        database.parent.mkdir(parents=True, exist_ok=True)
+        # MLflow would try for minutes to open what cannot be opened, and the lock for ever to be made.
+        database.open("ab").close()
+        with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
+            store = _store(f"{SQLITE_PREFIX}{database}", wait_s, patience_s)
+            return store, _experiment_in(store, experiment, artifacts)
 
 
-def open_existing_store(uri: str) -> MlflowClient:
+def open_existing_store(uri: str) -> TrackingStore:
     """Opens a tracking store to look for a run in it, and makes nothing.
 
     Raises:
         TrackingError: if there is none, or it cannot be used.
     """
     _check_texts(uri=uri)
+    uri = hand_over_tracking(uri)
     if uri.startswith(SQLITE_PREFIX):
         database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
         if not database.is_file():
             raise TrackingError(f"tracking.uri is {uri!r}, but there is no {database}; give the one that the run is in")
         uri = f"{SQLITE_PREFIX}{database}"
     with usable_store(uri):
-        client = MlflowClient(tracking_uri=uri)
-        client.search_experiments(max_results=1)
-        return client
+        store = _store(uri, USUAL_WAIT_S, None)
+        store.search_experiments(max_results=1)
+        return store
+
+
+def _store(uri: str, wait_s: float, patience_s: float | None) -> TrackingStore:
+    connect = partial(MlflowClient, tracking_uri=_address(uri))
+    return TrackingStore(connect, uri, patience_s=patience_s, wait_s=wait_s)
+
+
+def _address(uri: str) -> str:
+    """Returns the address of a store with its driver and password."""
+    if not uri.startswith("postgresql"):
+        return uri
+    return database_url(uri, TRACKING_PASSWORD).render_as_string(hide_password=False)
 
 
 def _check_texts(**values: object) -> None:
@@ -69,41 +118,39 @@ def _check_texts(**values: object) -> None:
 @contextmanager
 def usable_store(uri: str) -> Iterator[None]:
     """What a store is used in: it answers in time and quietly, and what goes wrong is a `TrackingError` of one line."""
-    for name, value in HTTP_DEFAULTS.items():
+    for name, value in DEFAULTS.items():
         os.environ.setdefault(name, value)
+    if SERVER_PASSWORD not in os.environ and (password := password_of(SERVER_PASSWORD)):
+        os.environ[SERVER_PASSWORD] = password
     # The making of a new database is told table by table.
     for library in ("alembic", "mlflow"):
         logging.getLogger(library).setLevel(logging.WARNING)
+    # What they tell of a store that is away is raised as well.
+    for library in ("mlflow.store.db.utils", "urllib3.connectionpool"):
+        logging.getLogger(library).setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
             # SQLAlchemy tells MLflow's users of MLflow's own deprecated calls.
             warnings.simplefilter("ignore")
             yield
     except (MlflowException, SQLAlchemyError, OSError, ModuleNotFoundError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise TrackingError(f"tracking.uri is {uri!r}, but this store cannot be used: {reason}") from error
+        raise TrackingError(
+            f"tracking.uri is {without_password(uri)!r}, but this store cannot be used: {reason_in(error)}"
+        ) from error
 
 
-def _open_locked(uri: str, experiment: str, artifacts: str) -> tuple[MlflowClient, str]:
-    if not uri.startswith(SQLITE_PREFIX):
-        return _open(uri, experiment, None if uri.startswith("http") else artifacts)
-    # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
-    database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
-    database.parent.mkdir(parents=True, exist_ok=True)
-    # MLflow would try for minutes to open what cannot be opened, and the lock for ever to be made.
-    database.open("ab").close()
-    with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
-        return _open(f"{SQLITE_PREFIX}{database}", experiment, artifacts)
-
-
-def _open(uri: str, experiment: str, artifacts: str | None) -> tuple[MlflowClient, str]:
-    client = MlflowClient(tracking_uri=uri)
-    found = client.get_experiment_by_name(experiment)
-    if found is not None:
-        if found.lifecycle_stage != "active":
-            raise TrackingError(
-                f"tracking.experiment is {experiment!r}, but it was deleted; restore it, or name another"
-            )
-        return client, found.experiment_id
+def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> str:
+    """Returns the id of an experiment, which is made where there is none."""
     location = Path(artifacts).absolute().as_uri() if artifacts else None
-    return client, client.create_experiment(experiment, artifact_location=location)
+    found = store.get_experiment_by_name(name)
+    if found is None:
+        try:
+            return str(store.create_experiment(name, artifact_location=location))
+        except MlflowException as error:
+            # Somebody else may just have made it, or it was this one, and only the answer was lost.
+            if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                raise
+            found = store.get_experiment_by_name(name)
+    if found.lifecycle_stage != "active":
+        raise TrackingError(f"tracking.experiment is {name!r}, but it was deleted; restore it, or name another")
+    return str(found.experiment_id)

@@ -18,8 +18,8 @@ from mlflow import MlflowClient
 from mlflow.entities import Run
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.sweeps.database import PASSWORD_VARIABLE
-from armscan.sweeps.storage import open_storage, without_password
+from armscan.passwords import STORAGE_PASSWORD, without_password
+from armscan.sweeps.storage import open_storage
 from armscan.sweeps.tally import LEASE, RETRY_OF
 from tests.postgres import PASSWORD
 
@@ -55,7 +55,7 @@ class StartedStudy:
     ) -> None:
         self.folder, self._storage = folder, open_storage(storage).optuna
         self._client, self._experiment = MlflowClient(tracking), folder.name
-        own = {"PYTHONPATH": str(REPOSITORY), "MLFLOW_TRACKING_URI": tracking, PASSWORD_VARIABLE: PASSWORD}
+        own = {"PYTHONPATH": str(REPOSITORY), "MLFLOW_TRACKING_URI": tracking, STORAGE_PASSWORD: PASSWORD}
         kept = [f"study.storage={without_password(storage)}", f"tracking.experiment={self._experiment}"]
         self.printed = folder / "printed"
         with self.printed.open("ab") as printed:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from armscan.sweeps.database import PASSWORD_VARIABLE
+from armscan.passwords import STORAGE_PASSWORD
 from tests.cluster.studies import REPOSITORY, TRAINING, WAITING
 from tests.mlflow_server import mlflow_server
 from tests.postgres import PASSWORD, postgres_server, programs
@@ -15,7 +15,7 @@ def cluster():
     if (reason := why_not_here()) is not None:
         pytest.skip(reason)
     with (
-        ray_cluster({"PYTHONPATH": str(REPOSITORY), PASSWORD_VARIABLE: PASSWORD}) as started,
+        ray_cluster({"PYTHONPATH": str(REPOSITORY), STORAGE_PASSWORD: PASSWORD}) as started,
         started.head.entered(),
     ):
         yield started

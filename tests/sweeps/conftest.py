@@ -2,9 +2,13 @@
 
 import optuna
 import pytest
+from optuna.trial import TrialState
 
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
+from armscan.sweeps.outcome import Notes, Outcome
 from armscan.sweeps.storage import open_storage
+from armscan.sweeps.tally import FAILURE
 
 
 @pytest.fixture(params=["journal", "sqlite", "postgresql"])
@@ -29,3 +33,10 @@ def make_ledger(storage_uri):
         return Ledger(study, storage, Limits(**{"n_trials": 5} | limits), is_open=is_open)
 
     return make
+
+
+def fail(ledger, trial, reason):
+    """Ends a trial as failed, as its worker does with its next claim."""
+    outcome = Outcome(trial, TrialState.FAIL, Notes(), attributes={FAILURE: reason})
+    ledger._storage.alone(lambda: ledger._tell(outcome, is_repeated=False))
+    assert outcome.is_told

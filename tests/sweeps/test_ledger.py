@@ -12,6 +12,7 @@ from optuna.trial import TrialState
 
 from armscan.sweeps.lease import Witness, process_start
 from armscan.sweeps.tally import ATTEMPT, FAILURE, LEASE, RETRIED, RETRY_OF, Tally
+from tests.sweeps.conftest import fail
 
 
 def states(ledger):
@@ -47,9 +48,9 @@ def test_trial_that_is_handed_back_is_the_next_to_be_run_with_the_same_values(ma
 def test_failed_trial_is_replaced_until_too_many_have_failed(make_ledger):
     ledger = make_ledger(n_trials=2, max_failures=1)
     finish(ledger, ledger.claim({}))
-    ledger.fail(ledger.claim({}), "no luck")
+    fail(ledger, ledger.claim({}), "no luck")
     assert ledger.end(ledger.tally()) is None
-    ledger.fail(ledger.claim({}), "none again")
+    fail(ledger, ledger.claim({}), "none again")
     reason = "2 trials have failed, and at most 1 may: trial 2: none again"
     assert ledger.end(ledger.tally()) == ledger.broken(ledger.tally()) == reason
     assert ledger.claim({}) is None
@@ -59,7 +60,7 @@ def test_study_whose_first_trials_all_fail_at_once_ends(make_ledger):
     ledger = make_ledger(n_trials=100, max_failures=50)
     for _ in range(3):
         assert ledger.broken(ledger.tally()) is None
-        ledger.fail(ledger.claim({}), "agent.lr is -1")
+        fail(ledger, ledger.claim({}), "agent.lr is -1")
     assert ledger.broken(ledger.tally()).endswith("before they reported anything: trial 0: agent.lr is -1")
 
 

@@ -13,10 +13,13 @@ import pytest
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import SQLAlchemyError
 
+from armscan import patience
 from armscan.errors import StorageAwayError
-from armscan.sweeps import lease, patience, screen
+from armscan.sweeps import lease, screen
+from armscan.sweeps.away import is_away
 from armscan.sweeps.lease import Keeper, Witness, process_start
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.storage import open_storage
 from armscan.sweeps.tally import LEASE, RETRY_OF
 
@@ -273,14 +276,14 @@ def test_screen_says_once_that_the_storage_is_away_and_shows_what_is_new_when_it
     assert capsys.readouterr().out.splitlines() == ["it is away", "trial 3 done", "trial 3 done"]
 
 
-@pytest.mark.parametrize(("statement", "is_away"), [("SELECT * FROM nowhere", False), ("DELETE FROM a", True)])
-def test_only_what_passes_is_waited_for(tmp_path, statement, is_away):
+@pytest.mark.parametrize(("statement", "is_waited_for"), [("SELECT * FROM nowhere", False), ("DELETE FROM a", True)])
+def test_only_what_passes_is_waited_for(tmp_path, statement, is_waited_for):
     file = tmp_path / "a.db"
     locked = sqlite3.connect(file, isolation_level=None)
     locked.execute("CREATE TABLE a (b)")
-    locked.execute("BEGIN EXCLUSIVE" if is_away else "BEGIN")
+    locked.execute("BEGIN EXCLUSIVE" if is_waited_for else "BEGIN")
     engine = create_engine(f"sqlite:///{file}", connect_args={"timeout": 0})
     with pytest.raises(SQLAlchemyError) as raised, engine.begin() as connection:
         connection.execute(text(statement))
     locked.close()
-    assert patience.is_away(raised.value) is is_away
+    assert is_away(raised.value) is is_waited_for

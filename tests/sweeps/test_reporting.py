@@ -7,8 +7,10 @@ import pytest
 from PIL import Image
 
 from armscan import report
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.storage import open_storage
+from tests.sweeps.conftest import fail
 
 
 @pytest.fixture
@@ -37,7 +39,7 @@ def searched(folder, objectives, n_trials=6):
         if len(objectives) == 1:
             trial.report(lr, 100)
         if number == 1:
-            Ledger(study, storage, Limits(n_trials=1)).fail(trial, "it <b>broke</b>")
+            fail(Ledger(study, storage, Limits(n_trials=1)), trial, "it <b>broke</b>")
         elif number == 2 and len(objectives) == 1:
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
         else:

@@ -11,7 +11,8 @@ import optuna
 import pytest
 
 from armscan.errors import StudyError
-from armscan.sweeps.storage import existing_storage, open_storage, without_password
+from armscan.passwords import without_password
+from armscan.sweeps.storage import existing_storage, open_storage
 
 
 def test_storage_keeps_a_study_for_whoever_opens_it_next(storage_uri):

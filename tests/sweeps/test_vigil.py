@@ -4,10 +4,16 @@ import threading
 import time
 from types import SimpleNamespace
 
+import optuna
 import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps import vigil as module
+from armscan.sweeps.judging import lacking
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
+from armscan.sweeps.storage import open_storage
+from armscan.sweeps.tally import JUDGED, JUDGED_SEED
 from armscan.sweeps.vigil import Vigil
 
 ELSEWHERE = {"worker": "0", "host": "elsewhere", "pid": 1, "started": "1"}
@@ -28,9 +34,10 @@ def watch(make_ledger, monkeypatch):
     def watch(best=0):
         ledger = make_ledger(n_trials=2)
         phases = [SimpleNamespace(name="a", ledger=ledger)]
-        settings = SimpleNamespace(judging=SimpleNamespace(best=best))
+        settings = SimpleNamespace(judging=SimpleNamespace(best=best, seeds=1), seeds=(0,))
         first, second = ledger.claim(ELSEWHERE), ledger.claim(ELSEWHERE)
         ledger.study.tell(first, 1.0)
+        watch.phases, watch.settings = phases, settings
         return Vigil(SimpleNamespace(begun=lambda: phases, settings=settings)), ledger, second
 
     return watch
@@ -43,10 +50,22 @@ def test_study_is_over_when_enough_trials_have_finished_and_none_is_running(watc
     assert vigil.is_over()
 
 
-def test_study_that_is_to_be_judged_is_not_over_when_it_has_searched(watch):
+def test_study_that_is_to_be_judged_is_over_when_its_best_has_been(watch, storage_uri):
     vigil, ledger, running = watch(best=1)
     ledger.study.tell(running, 1.0)
     assert not vigil.is_over()
+    storage = open_storage(storage_uri)
+    made = optuna.create_study(study_name="a-judged", storage=storage.optuna)
+    watch.phases.append(
+        SimpleNamespace(name="a-judged", ledger=Ledger(made, storage, Limits(n_trials=9), is_open=False))
+    )
+    # As it is where others were judged before.
+    assert not vigil.is_over()
+    ((best, seed),) = lacking(watch.settings, ledger.study, made)
+    made.enqueue_trial({}, user_attrs={JUDGED: best.number, JUDGED_SEED: seed})
+    assert not vigil.is_over()
+    made.tell(made.ask(), 1.0)
+    assert vigil.is_over()
 
 
 def test_launcher_that_waits_for_nobody_is_interrupted_when_the_study_is_over(watch):

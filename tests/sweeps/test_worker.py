@@ -9,7 +9,8 @@ import pytest
 
 from armscan.sweeps.judging import best_trials
 from armscan.sweeps.lease import Keeper
-from armscan.sweeps.ledger import Ledger, Limits
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
 from armscan.sweeps.phases import Phase
 from armscan.sweeps.space import Space
 from armscan.sweeps.storage import open_storage
@@ -34,7 +35,9 @@ def work(tmp_path):
         folder = tmp_path / folder
         storage = open_storage(str(folder / "optuna.journal"))
         study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
-        client, experiment_id = open_store(f"sqlite:///{folder}/a.db", experiment="a", artifacts=str(folder / "b"))
+        client, experiment_id = open_store(
+            f"sqlite:///{folder}/a.db", experiment="a", artifacts=str(folder / "b"), wait_s=60.0
+        )
         phase = Phase(
             name="a",
             ledger=Ledger(study, storage, Limits(**{"n_trials": 5} | limits)),
@@ -50,7 +53,7 @@ def work(tmp_path):
             storage_uri=storage.uri,
             client=client,
             experiment_id=experiment_id,
-            run_id=client.create_run(experiment_id).info.run_id,
+            run_id=client.create_run(experiment_id, name="study", tags={}).info.run_id,
         )
         keeper = Keeper(
             phase.ledger, "0", is_told_to_leave=lambda: False, leave=lambda: os._exit(1), on_death=lambda _: None

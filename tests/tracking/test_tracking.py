@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -34,7 +35,17 @@ REPORTS = [
 
 @pytest.fixture
 def store(tmp_path):
-    return open_store(f"sqlite:///{tmp_path}/runs.db", experiment="test", artifacts=str(tmp_path / "artifacts"))
+    uri, artifacts = f"sqlite:///{tmp_path}/runs.db", str(tmp_path / "artifacts")
+    return open_store(uri, experiment="test", artifacts=artifacts, wait_s=60.0)
+
+
+def eventually(look, is_there):
+    """Returns what is seen as soon as it is what it must become."""
+    until_s = time.monotonic() + 30
+    while not is_there(seen := look()):
+        assert time.monotonic() < until_s, seen
+        time.sleep(0.05)
+    return seen
 
 
 def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
@@ -43,7 +54,9 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "best.pt").write_text("weights")
-    with TrackedRun.start(client, experiment_id, name="n", config=config, tags={"overrides": "seed=3"}) as tracked:
+    with TrackedRun.start(
+        client, experiment_id, name="n", config=config, tags={"overrides": "seed=3"}, folder=folder
+    ) as tracked:
         tracked.on_start(300, ())
         for report in REPORTS:
             tracked.on_epoch(report)
@@ -67,11 +80,11 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
 
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), "KILLED"), (ValueError("no"), "FAILED")])
-def test_tracked_run_says_how_it_ended(store, error, status):
+def test_tracked_run_says_how_it_ended(store, tmp_path, error, status):
     client, experiment_id = store
 
     def fail():
-        with TrackedRun.start(client, experiment_id, name="n", config={}, tags={}) as tracked:
+        with TrackedRun.start(client, experiment_id, name="n", config={}, tags={}, folder=tmp_path) as tracked:
             ids.append(tracked.run_id)
             raise error
 
@@ -83,39 +96,44 @@ def test_tracked_run_says_how_it_ended(store, error, status):
     assert run.data.tags["failure"]
 
 
-def test_runs_are_children_of_their_parent(store):
+def test_runs_are_children_of_their_parent(store, tmp_path):
     client, experiment_id = store
-    with TrackedRun.start(client, experiment_id, name="parent", config={}, tags={}) as parent:
+    with TrackedRun.start(client, experiment_id, name="parent", config={}, tags={}, folder=tmp_path) as parent:
         pass
-    with TrackedRun.start(client, experiment_id, name="child", config={}, tags={}, parent_id=parent.run_id):
+    with TrackedRun.start(
+        client, experiment_id, name="child", config={}, tags={}, folder=tmp_path, parent_id=parent.run_id
+    ):
         pass
     (child,) = client.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{parent.run_id}'")
     assert child.info.run_name == "child"
 
 
-def test_run_that_goes_on_logs_what_is_missing_and_nothing_twice(store):
+def test_run_that_goes_on_logs_what_is_missing_and_nothing_twice(store, tmp_path):
     client, experiment_id = store
-    first = TrackedRun.start(client, experiment_id, name="n", config={"seed": 3}, tags={"folder": "here"})
+    first = TrackedRun.start(
+        client, experiment_id, name="n", config={"seed": 3}, tags={"folder": "here"}, folder=tmp_path
+    )
     first.on_epoch(REPORTS[0])
     first.end("KILLED", reason="interrupted")
-    second = TrackedRun.go_on(client, first.run_id, config={"seed": 3, "more": 4}, tags={"folder": "there"})
-    run = client.get_run(first.run_id)
+    config = {"seed": 3, "more": 4}
+    second = TrackedRun.go_on(client, first.run_id, folder=tmp_path, config=config, tags={"folder": "there"})
+    run = eventually(lambda: client.get_run(first.run_id), lambda run: "more" in run.data.params)
     assert run.info.status == "RUNNING"
     assert "failure" not in run.data.tags
     assert (run.data.tags["resumed"], run.data.tags["folder"]) == ("1", "there")
     assert run.data.params == {"seed": "3", "more": "4"}
     second.on_start(300, REPORTS[:2])
     second.on_epoch(REPORTS[2])
+    second.end("FINISHED")
     for name, values in {"validation/mean_steps": [9.0, 4.0, 3.0], "wall_s": [1.0, 2.0, 3.0]}.items():
         history = client.get_metric_history(first.run_id, name)
         assert [(point.step, point.value) for point in history] == list(zip([100, 200, 300], values, strict=True))
-    second.end("FINISHED")
     assert client.get_run(first.run_id).info.status == "FINISHED"
 
 
 def test_find_run_takes_the_beginning_of_an_id_and_names_what_is_wrong(store):
     client, experiment_id = store
-    ids = [client.create_run(experiment_id).info.run_id for _ in range(17)]
+    ids = [client.create_run(experiment_id, name="n", tags={}).info.run_id for _ in range(17)]
     assert {find_run(client, run_id).info.run_id for run_id in ids} == set(ids)
     firsts = [run_id[0] for run_id in ids]
     twice = next(first for first in firsts if firsts.count(first) > 1)
@@ -139,7 +157,7 @@ def test_open_existing_store_makes_nothing(tmp_path):
 def test_many_processes_may_open_a_fresh_store_at_once(tmp_path):
     script = (
         "import sys; from armscan.tracking import open_store\n"
-        "print(open_store(sys.argv[1], experiment='test', artifacts='artifacts')[1])"
+        "print(open_store(sys.argv[1], experiment='test', artifacts='artifacts', wait_s=1.0)[1])"
     )
     command = [sys.executable, "-c", script, f"sqlite:///{tmp_path}/fresh.db"]
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE, cwd=tmp_path) for _ in range(4)]
@@ -151,19 +169,19 @@ def test_many_processes_may_open_a_fresh_store_at_once(tmp_path):
 @pytest.mark.parametrize("uri", ["./mlruns", "nonsense://x", "sqlite:////proc/no/runs.db", "sqlite:///", "", None, 3])
 def test_open_store_names_a_store_that_cannot_be_used(uri):
     with pytest.raises(TrackingError, match=r"tracking\.uri is"):
-        open_store(uri, experiment="test", artifacts="artifacts")
+        open_store(uri, experiment="test", artifacts="artifacts", wait_s=1.0)
 
 
 def test_open_store_names_a_folder_in_the_place_of_the_store(tmp_path):
     (tmp_path / "runs.db").mkdir()
     with pytest.raises(TrackingError, match="Is a directory"):
-        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="test", artifacts="artifacts")
+        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="test", artifacts="artifacts", wait_s=1.0)
 
 
 def test_open_store_names_a_damaged_store(tmp_path):
     (tmp_path / "runs.db").write_bytes(b"no database at all" * 100)
     with pytest.raises(TrackingError, match="not a database"):
-        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="test", artifacts="artifacts")
+        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="test", artifacts="artifacts", wait_s=1.0)
 
 
 def test_flattened_gives_dotted_keys_and_keeps_lists():

@@ -1,4 +1,4 @@
-"""What a worker says of itself, in its log."""
+"""What a process says of itself while it works: in the log of a worker, or on the screen."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ from datetime import datetime
 
 
 def say(text: str) -> None:
-    """Writes a line into the worker's log."""
+    """Prints a line with the time; what a worker prints is its log."""
     print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)

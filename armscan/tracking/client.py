@@ -1,0 +1,92 @@
+"""An MLflow store that can be away for a while."""
+
+from __future__ import annotations
+
+import re
+import uuid
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, TypeVar
+
+from mlflow import MlflowClient
+from mlflow.entities import Run
+from mlflow.exceptions import MlflowException
+from requests import RequestException
+from sqlalchemy.exc import DBAPIError, OperationalError
+
+from armscan.errors import TrackingAwayError
+from armscan.passwords import masked
+from armscan.patience import Patience
+
+T = TypeVar("T")
+# What MLflow says of a store that it cannot reach, of one that fails, and of what is not there.
+AWAY, NOT_THERE = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "REQUEST_LIMIT_EXCEEDED"), "RESOURCE_DOES_NOT_EXIST"
+MAX_REASON_CHARS = 300
+# A tag of each run: by which one is found again whose making was not answered.
+MADE_TAG = "made"
+
+
+class TrackingStore:
+    """An open store, asked as one asks `MlflowClient`, but where it is away, it is waited for.
+
+    Args:
+        connect: opens the store.
+        uri: of the store, as it may be shown.
+        patience_s: how long it is waited for; None for not at all.
+        wait_s: how long a run waits for it at its end.
+    """
+
+    def __init__(
+        self, connect: Callable[[], MlflowClient], uri: str, *, patience_s: float | None, wait_s: float
+    ) -> None:
+        self.uri, self.wait_s = uri, wait_s
+        self._patience = None
+        if patience_s is not None:
+            named = f"tracking.uri is {uri!r}"
+            self._patience = Patience("the tracking store", named, why_away, TrackingAwayError, patience_s=patience_s)
+        # Which waits for nothing.
+        self.mlflow = self._asked(connect)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return partial(self._asked, getattr(self.mlflow, name))
+
+    def create_run(self, experiment_id: str, *, name: str, tags: Mapping[str, str]) -> Run:
+        """Makes a run, and only one, also where the store goes away before it has answered."""
+        made, n_asked = uuid.uuid4().hex, 0
+
+        def create() -> Run:
+            nonlocal n_asked
+            n_asked += 1
+            if n_asked > 1 and (found := self.mlflow.search_runs([experiment_id], f"tags.{MADE_TAG} = '{made}'")):
+                return found[0]
+            return self.mlflow.create_run(experiment_id, run_name=name, tags={**tags, MADE_TAG: made})
+
+        return self._asked(create)
+
+    def _asked(self, operate: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+        asked = partial(operate, *args, **kwargs)
+        return asked() if self._patience is None else self._patience.through(asked)
+
+
+def why_away(error: BaseException) -> str | None:
+    """Returns why a store cannot be reached or written to for now; None where an error says anything else."""
+    match error:
+        case MlflowException(error_code=code):
+            is_away = code in AWAY
+        case RequestException(response=response) if response is not None:
+            is_away = response.status_code >= 500
+        case DBAPIError():
+            is_away = error.connection_invalidated or isinstance(error, OperationalError)
+        case _:
+            is_away = isinstance(error, OSError)
+    return reason_in(error) if is_away else None
+
+
+def reason_in(error: BaseException) -> str:
+    """Returns what an error says, short and without a password."""
+    text = masked(" ".join(str(error).split()))
+    if told := re.search(r"\[Errno -?\d+\] ([\w ]+)", text):
+        return told[1].strip()
+    return text[:MAX_REASON_CHARS]

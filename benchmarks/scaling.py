@@ -1,0 +1,219 @@
+"""What one more worker costs PostgreSQL and MLflow: `python -m benchmarks.scaling [tracking=true] [workers=1,2,4]`.
+
+Workers take trials that do nothing but report ten times, one after another. They are threads of a few processes, and no
+configuration is composed, because that is not what the services are asked for; all else is what a study does. Without
+`tracking=true` runs are tracked nowhere, and what is measured is the storage alone.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+import tempfile
+import threading
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import optuna
+from omegaconf import DictConfig, OmegaConf
+
+from armscan.patience import Patience
+from armscan.sweeps import worker as worker_module
+from armscan.sweeps.attempt import Attempt
+from armscan.sweeps.lease import Keeper
+from armscan.sweeps.ledger import Ledger
+from armscan.sweeps.limits import Limits
+from armscan.sweeps.phases import Phase
+from armscan.sweeps.space import Space
+from armscan.sweeps.storage import open_storage
+from armscan.sweeps.worker import Worker
+from armscan.tracking import open_store
+from armscan.words import read_words
+from tests.mlflow_server import mlflow_server
+from tests.postgres import PostgresServer, postgres_server
+
+WORKERS = (1, 2, 4, 8, 16, 32)
+N_REPORTS, STEPS_A_REPORT = 10, 100
+MAX_PROCESSES, TRIALS_A_WORKER, FEWEST_TRIALS = 4, 6, 30
+SPACE = {"agent.lr": {"low": 1e-4, "high": 1e-2, "log": True}, "agent.batch_size": {"choices": [64, 128, 256]}}
+SAMPLER = {"_target_": "optuna.samplers.RandomSampler"}
+SETTINGS = {"shared_preload_libraries": "pg_stat_statements", "max_connections": "400"}
+# What armscan and MLflow ask, without what transactions and the measuring itself consist of.
+CALLS = """
+SELECT datname, sum(calls), sum(calls) FILTER (WHERE query ILIKE 'commit%'), sum(total_exec_time) / 1000
+FROM pg_stat_statements JOIN pg_database ON pg_database.oid = dbid GROUP BY datname
+"""
+
+
+class Asked(NamedTuple):
+    """What a database was asked.
+
+    Args:
+        statements: in all.
+        commits: of transactions.
+        busy_s: what the database took for the statements.
+    """
+
+    statements: int
+    commits: int
+    busy_s: float
+
+
+class NoStore:
+    """A tracking store that takes everything and keeps nothing."""
+
+    uri, wait_s = "nowhere", 5.0
+
+    def __init__(self) -> None:
+        self.mlflow = self
+
+    def create_run(self, *_: Any, **__: Any) -> Any:
+        """Returns a run that is nowhere."""
+        return SimpleNamespace(info=SimpleNamespace(run_id=uuid.uuid4().hex))
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *_, **__: None
+
+
+def reporting(attempt: Attempt) -> dict[str, float]:
+    """A trial that reports, and does nothing else."""
+    total = N_REPORTS * STEPS_A_REPORT
+    for part in range(1, N_REPORTS + 1):
+        at = {"n_env_steps": part * STEPS_A_REPORT, "grid": STEPS_A_REPORT, "total": total}
+        attempt.report({"mean_steps": 1.0 / part}, seed=0, **at)
+    return {"mean_steps": 1.0}
+
+
+def composed(words: object) -> tuple[DictConfig, dict[str, str]]:
+    """Returns a configuration without composing one."""
+    return OmegaConf.create({"seed": 0}), {}
+
+
+def phase_of(storage_uri: str, tracking_uri: str | None, folder: Path, n_trials: int) -> Phase:
+    """Opens a study of trials that report, as a worker does."""
+    storage = open_storage(storage_uri)
+    study = optuna.create_study(study_name="scaling", storage=storage.optuna, load_if_exists=True)
+    store: Any = NoStore()
+    experiment_id = "0"
+    if tracking_uri is not None:
+        store, experiment_id = open_store(tracking_uri, experiment="scaling", artifacts="-", wait_s=60.0)
+    return Phase(
+        name="scaling",
+        ledger=Ledger(study, storage, Limits(n_trials=n_trials)),
+        space=Space.read(SPACE),
+        objectives=("mean_steps",),
+        reported="mean_steps",
+        run=reporting,
+        seeds_of=lambda _: (0,),
+        sampler=SAMPLER,
+        seed=0,
+        folder=folder,
+        artifacts=folder / "artifacts",
+        storage_uri=storage.uri,
+        client=store,
+        experiment_id=experiment_id,
+        run_id="study",
+    )
+
+
+@contextmanager
+def round_trips_counted() -> Iterator[dict[int, int]]:
+    """Counts how often each thread goes to a storage, by its id."""
+    counts: dict[int, int] = {}
+    through = Patience.through
+
+    def counted(patience: Patience, operate: Any) -> Any:
+        here = threading.get_ident()
+        counts[here] = counts.get(here, 0) + 1
+        return through(patience, operate)
+
+    Patience.through = counted  # type: ignore[method-assign]
+    try:
+        yield counts
+    finally:
+        Patience.through = through  # type: ignore[method-assign]
+
+
+def work(phase: Phase, name: str) -> None:
+    """Works at a study as a worker's process does."""
+    keeper = Keeper(phase.ledger, name, is_told_to_leave=lambda: False, leave=lambda: None, on_death=lambda _: None)
+    with keeper.at_work():
+        Worker(phase, [], keeper).work()
+
+
+def work_in_threads(n_threads: int, number: int, barrier: Any, opened: partial[Phase]) -> None:
+    """Runs some of the workers in this process, once those of all processes are there."""
+    worker_module.composed = composed
+    worker_module.say = lambda text: None
+    phases = [opened() for _ in range(n_threads)]
+    threads = [threading.Thread(target=work, args=(phase, f"{number}-{i}")) for i, phase in enumerate(phases)]
+    barrier.wait()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+def asked(server: PostgresServer, uri: str) -> Asked:
+    """Returns what a database was asked since its counts were reset."""
+    of_database = {name: rest for name, *rest in server.execute(CALLS)}
+    statements, commits, busy_s = of_database.get(uri.rpartition("/")[2], (0, 0, 0.0))
+    return Asked(int(statements), int(commits or 0), float(busy_s))
+
+
+def measured(server: PostgresServer, n_workers: int, tracking_uri: str | None, folder: Path) -> tuple[float, int, str]:
+    """Runs a study; returns its seconds, its trials, and the address of its database."""
+    n_trials = max(FEWEST_TRIALS, TRIALS_A_WORKER * n_workers)
+    uri = server.make_database()
+    opened = partial(phase_of, uri, tracking_uri, folder, n_trials)
+    opened()
+    n_processes = min(MAX_PROCESSES, n_workers)
+    shares = [n_workers // n_processes + (i < n_workers % n_processes) for i in range(n_processes)]
+    context = multiprocessing.get_context("spawn")
+    barrier = context.Barrier(n_processes + 1)
+    processes = [context.Process(target=work_in_threads, args=(n, i, barrier, opened)) for i, n in enumerate(shares)]
+    for process in processes:
+        process.start()
+    barrier.wait()
+    server.execute("SELECT pg_stat_statements_reset()")
+    began_s = time.monotonic()
+    for process in processes:
+        process.join()
+    took_s = time.monotonic() - began_s
+    return took_s, n_trials, uri
+
+
+def row(took_s: float, n_trials: int, of_storage: Asked, of_mlflow: Asked | None) -> str:
+    """Returns the figures of a study."""
+    figures = [f"{60 * n_trials / took_s:.0f}", f"{of_storage.commits / n_trials:.1f}"]
+    for each in (of_storage, of_mlflow):
+        figures += [f"{each.statements / n_trials:.0f}", f"{each.busy_s / took_s:.1%}"] if each else ["-", "-"]
+    return " | ".join(figures)
+
+
+def main() -> None:
+    """Prints a row for each number of workers."""
+    values: Mapping[str, Any] = read_words(sys.argv[1:], ("tracking", "workers"), ("workers",))
+    numbers = [int(each) for each in values["workers"].split(",")] if "workers" in values else WORKERS
+    with tempfile.TemporaryDirectory() as name, postgres_server(**SETTINGS) as server:
+        server.execute("CREATE EXTENSION pg_stat_statements")
+        backend = server.make_database()
+        tracking = mlflow_server(Path(name), backend) if values.get("tracking") else nullcontext()
+        print("| workers | trials/min | transactions | statements | busy | MLflow: statements | busy |")
+        print("| --- | --- | --- | --- | --- | --- | --- |")
+        with tracking as mlflow:
+            for n_workers in numbers:
+                tracking_uri = mlflow.uri if mlflow else None
+                took_s, n_trials, uri = measured(server, n_workers, tracking_uri, Path(name) / str(n_workers))
+                of_mlflow = asked(server, backend) if mlflow else None
+                print(f"| {n_workers} | {row(took_s, n_trials, asked(server, uri), of_mlflow)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

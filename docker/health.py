@@ -1,0 +1,12 @@
+"""Whether a worker is at work in this container: the exit code is 0 where one is."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from pathlib import Path
+
+from armscan.sweeps.supervising import local_workers
+
+starts = Path("studies").glob(f"*/workers/*_{socket.gethostname()}_*")
+sys.exit(0 if any(local_workers(folder) for folder in starts) else 1)

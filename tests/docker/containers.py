@@ -1,0 +1,162 @@
+"""The services of the compose file on this machine, without an engine: what would be containers are processes."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from tests.docker.files import REPOSITORY, read_compose, read_image
+
+START_S, STOP_S, SECRETS = 120.0, 20.0, "/run/secrets"
+# What the commands call beside Python's own programs; git, for one, is not in the image.
+IN_THE_IMAGE = ("sh", "cat")
+
+
+class Containers:
+    """The services, each with the words and the environment that the files give it.
+
+    Only what is an engine's is put in its place: names of services are 127.0.0.1, their ports are free ones, and
+    volumes, secrets and the image's own folders are folders here.
+
+    Args:
+        folder: for all of it, empty.
+        postgres_port: where PostgreSQL answers.
+        programs: the folder of PostgreSQL's programs.
+        password: of the database.
+        **given: the compose file's variables.
+    """
+
+    def __init__(self, folder: Path, postgres_port: int, programs: Path, password: str, **given: str) -> None:
+        self.services: dict[str, dict[str, Any]] = read_compose(**given)["services"]
+        self.folder, self._image, self._programs = folder, read_image(), programs
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.ports = {name: _free_port() for name, each in self.services.items() if "ports" in each}
+        self.ports["postgres"] = postgres_port
+        self.secret = folder / "secrets" / "database_password"
+        for each in ("secrets", "programs", "home"):
+            (folder / each).mkdir()
+        self.secret.write_text(f"{password}\n")
+        for each in IN_THE_IMAGE:
+            (folder / "programs" / each).symlink_to(str(shutil.which(each)))
+        self._replaced = self._replacements()
+        self._pattern = re.compile("|".join(f"(?P<_{place}>{pattern})" for place, pattern in enumerate(self._replaced)))
+
+    def _replacements(self) -> dict[str, str]:
+        """What stands in the files, as patterns, and what it is here."""
+        replaced = {r"\b0\.0\.0\.0\b": "127.0.0.1", rf"{SECRETS}\b": str(self.secret.parent)}
+        replaced |= {re.escape(path): str(here) for path, here in self._image.copied.items()}
+        for name, service in self.services.items():
+            for port in service.get("ports", []):
+                inside = port.rpartition(":")[2]
+                replaced[rf"(?<=[@/]){name}:{inside}\b"] = f"127.0.0.1:{self.ports[name]}"
+                replaced[rf"\b{inside}\b"] = str(self.ports[name])
+            for volume in service.get("volumes", []):
+                source, target = volume.split(":")[:2]
+                if not source.startswith("."):
+                    (self.folder / source).mkdir(exist_ok=True)
+                    replaced[rf"(?<![\w/.]){target}\b"] = str(self.folder / source)
+        return replaced
+
+    def here(self, text: str) -> str:
+        """Returns a text of the files as it has to be on this machine."""
+        return self._pattern.sub(lambda found: list(self._replaced.values())[int(str(found.lastgroup)[1:])], text)
+
+    def environment(self, name: str) -> dict[str, str]:
+        """The variables that a service's processes have, and no others."""
+        path = [Path(sys.executable).parent, self.folder / "programs"]
+        own = {"HOME": str(self.folder / "home"), "LANG": "C.UTF-8", "PYTHONPATH": str(REPOSITORY)}
+        given = self._image.environment | self.services[name].get("environment", {})
+        if name == "postgres":
+            path = [self._programs]
+        own["PATH"] = ":".join(map(str, path))
+        return {key: self.here(value) for key, value in given.items() if key != "PATH"} | own
+
+    def is_healthy(self, name: str) -> bool:
+        """Whether a service's health check says so."""
+        test = self.services[name].get("healthcheck", {}).get("test", ["CMD", *self._image.healthcheck])
+        assert test[0] == "CMD"
+        with self._log_of(name).open("ab") as log:
+            return subprocess.run(self._words(test[1:]), **self._surroundings(name, log), check=False).returncode == 0
+
+    def start(self, name: str) -> subprocess.Popen[bytes]:
+        """Starts a service."""
+        words = self._words([*self._image.entrypoint, *shlex.split(self.services[name]["command"])])
+        with self._log_of(name).open("ab") as log:
+            # In a session of its own: a Ctrl-C is meant for who started it.
+            self._processes[name] = subprocess.Popen(words, **self._surroundings(name, log), start_new_session=True)
+        return self._processes[name]
+
+    def wait_until_healthy(self, name: str) -> None:
+        """Waits until the health check of a service says that it is there."""
+        until_s = time.monotonic() + START_S
+        while not self.is_healthy(name):
+            process = self._processes.get(name)
+            assert process is None or process.poll() is None, self.log(name)
+            assert time.monotonic() < until_s, self.log(name)
+            time.sleep(0.5)
+
+    def stop(self, name: str) -> int:
+        """Stops a service as an engine does, which waits for as long as the file says; returns its exit code."""
+        process = self._processes.pop(name)
+        process.send_signal(signal.SIGTERM)
+        grace = self.services[name].get("stop_grace_period", "10s")
+        try:
+            return process.wait(float(grace.removesuffix("s")))
+        finally:
+            _end(process)
+
+    def stop_all(self) -> None:
+        """Ends whatever is still there."""
+        for process in self._processes.values():
+            process.send_signal(signal.SIGTERM)
+        for process in self._processes.values():
+            try:
+                process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                pass
+            finally:
+                _end(process)
+
+    def log(self, name: str) -> str:
+        """What a service has printed."""
+        return self._log_of(name).read_text()
+
+    def _log_of(self, name: str) -> Path:
+        return self.folder / f"{name}.log"
+
+    def _words(self, words: Sequence[str]) -> list[str]:
+        return [self.here(word) for word in words]
+
+    def _surroundings(self, name: str, log: BinaryIO) -> dict[str, Any]:
+        folder = self.here(self._image.words["WORKDIR"])
+        return {
+            "env": self.environment(name),
+            "cwd": folder,
+            "stdin": subprocess.DEVNULL,
+            "stdout": log,
+            "stderr": log,
+        }
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Ends what is left of the group of a process."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])

@@ -1,0 +1,167 @@
+"""Every service's command, as the compose file has it, run on this machine beside its health check."""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from contextlib import suppress
+from pathlib import Path
+
+import psycopg
+import pytest
+from mlflow import MlflowClient
+
+from armscan.sweeps.supervising import LEFT
+from tests.docker.containers import Containers
+from tests.docker.files import FOLDER
+from tests.postgres import PASSWORD, postgres_server, programs
+
+# Trials that only wait, between one and five seconds, and of which only one key is searched.
+TRIALS = (
+    "study.task._target_=benchmarks.sleeping.Sleeping study/pruner=none study.n_trials=2 study.judging.best=0 "
+    "agent.gamma=0.5 agent.updates_per_env_step=0.1 agent.batch_size=64 'study.space.agent.lr={low: 0.001, high: 0.01}'"
+)
+# A worker's database connections, beside which others have a place: see POSTGRES_CONNECTIONS.
+MOST_CONNECTIONS = 6
+
+
+@pytest.fixture
+def postgres_there():
+    """A server of this test's own."""
+    if programs() is None:
+        pytest.skip("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
+    with postgres_server() as server:
+        yield server
+
+
+@pytest.fixture
+def containers(postgres_there, tmp_path):
+    """The services on this machine; of them PostgreSQL is there, as its image leaves it at its first start."""
+    services = Containers(tmp_path, postgres_there.port, programs(), PASSWORD, ARMSCAN_WORDS=TRIALS)
+    postgres_there.execute(f"CREATE DATABASE {services.services['postgres']['environment']['POSTGRES_DB']}")
+    postgres_there.execute((FOLDER / "databases.sql").read_text())
+    try:
+        yield services
+    finally:
+        services.stop_all()
+
+
+def asked(url, **headers):
+    """Returns the status and the body of an answer."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as answer:
+            return answer.status, answer.read()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read()
+
+
+def command_lines(marked):
+    """Returns the words of all processes that have this in their environment."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if marked.encode() in (process / "environ").read_bytes():
+                found.append((process / "cmdline").read_bytes())
+    return found
+
+
+def selected(server, query):
+    """Returns the first column of what the studies' database answers."""
+    with psycopg.connect(server.uri("armscan")) as connection:
+        return [row[0] for row in connection.execute(query)]
+
+
+def states(server):
+    """Returns how the trials stand."""
+    return selected(server, "SELECT state::text FROM trials ORDER BY number")
+
+
+def n_connections(server):
+    """Returns how many clients the studies' database has, this one left out."""
+    (n_all,) = selected(server, "SELECT count(*) FROM pg_stat_activity WHERE datname = 'armscan'")
+    return n_all - 1
+
+
+def wait_for(come_true, within_s=60.0):
+    until_s = time.monotonic() + within_s
+    while not come_true():
+        assert time.monotonic() < until_s
+        time.sleep(0.1)
+
+
+def test_postgres_understands_its_words_and_says_when_it_is_away(containers, postgres_there):
+    words = shlex.split(containers.services["postgres"]["command"])
+    (data,) = selected(postgres_there, "SHOW data_directory")
+    # What it would have with these words, said without a start.
+    asking = [programs() / words[0], "-C", "max_connections", *words[1:], "-D", data]
+    said = subprocess.run(asking, capture_output=True, text=True, check=True)
+    assert int(said.stdout) >= 300
+    assert containers.is_healthy("postgres")
+    postgres_there.stop()
+    assert not containers.is_healthy("postgres")
+
+
+def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_there):
+    for name in ("mlflow", "dashboard"):
+        assert not containers.is_healthy(name)
+        containers.start(name)
+    for name in ("mlflow", "dashboard"):
+        containers.wait_until_healthy(name)
+    mlflow, dashboard = (f"http://127.0.0.1:{containers.ports[name]}" for name in ("mlflow", "dashboard"))
+    # As workers call it, as a browser does, and as a page of somebody else's would.
+    port = containers.ports["mlflow"]
+    for host, status in ((f"mlflow:{port}", 200), (f"localhost:{port}", 200), (f"elsewhere:{port}", 403)):
+        assert asked(f"{mlflow}/ajax-api/2.0/mlflow/experiments/search?max_results=1", Host=host)[0] == status, host
+
+    n_before = n_connections(postgres_there)
+    assert not containers.is_healthy("worker")
+    containers.start("worker")
+    containers.wait_until_healthy("worker")
+    # Until the trial knows its tracked run, with which it is gone on.
+    wait_for(lambda: "mlflow_run" in selected(postgres_there, "SELECT key FROM trial_user_attributes"))
+    assert states(postgres_there) == ["RUNNING"]
+    assert n_connections(postgres_there) - n_before <= MOST_CONNECTIONS
+    words = command_lines(f"ARMSCAN_STORAGE_PASSWORD_FILE={containers.secret}")
+    assert len(words) >= 5
+    assert [each for each in words if PASSWORD.encode() in each] == []
+    assert containers.stop("worker") == LEFT, containers.log("worker")
+    assert states(postgres_there) == ["WAITING"]
+    assert not containers.is_healthy("worker")
+
+    assert containers.start("worker").wait(300) == 0, containers.log("worker")
+    assert states(postgres_there) == ["COMPLETE"] * 2
+    shown = json.loads(asked(f"{dashboard}/api/studies")[1])
+    assert [study["study_name"] for study in shown["study_summaries"]] == ["sac_y"]
+    client = MlflowClient(mlflow)
+    (experiment,) = (each for each in client.search_experiments() if each.name == "armscan")
+    runs = client.search_runs([experiment.experiment_id])
+    assert [run.info.status for run in runs] == ["FINISHED"] * 3
+    client.log_text(runs[0].info.run_id, "kept", "note.txt")
+    assert [file.read_text() for file in containers.folder.glob("artifacts/**/note.txt")] == ["kept"]
+    assert {each.name for each in containers.folder.glob("work/*")} >= {"studies", "optuna.artifacts"}
+    assert PASSWORD not in "".join(containers.log(name) for name in ("mlflow", "dashboard", "worker"))
+
+
+def test_entry_refuses_a_password_that_cannot_be_read(tmp_path):
+    ended = subprocess.run(
+        [FOLDER / "entry.sh", "true"],
+        env={"PATH": os.environ["PATH"], "ARMSCAN_STORAGE_PASSWORD_FILE": str(tmp_path / "not-there")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode != 0
+    assert "not-there" in ended.stderr
+
+
+@pytest.mark.parametrize("variable", ["ARMSCAN_STORAGE_PASSWORD", "ARMSCAN_STORAGE_PASSWORD_FILE"])
+def test_entry_hands_the_password_to_every_client_of_the_database(variable, tmp_path):
+    (tmp_path / "password").write_text("a b'$c\n")
+    value = str(tmp_path / "password") if variable.endswith("FILE") else "a b'$c"
+    words = [FOLDER / "entry.sh", sys.executable, "-c", "import os; print(os.environ['PGPASSWORD'])"]
+    ended = subprocess.run(words, env={"PATH": os.environ["PATH"], variable: value}, capture_output=True, check=True)
+    assert ended.stdout == b"a b'$c\n"

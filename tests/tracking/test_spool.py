@@ -1,0 +1,124 @@
+"""What is to be tracked of a run, in a file of its folder."""
+
+import json
+import multiprocessing
+import time
+
+import pytest
+
+from armscan.errors import FolderInUseError, TrackingError
+from armscan.tracking.spool import Address, Spool, file_of, spool_files, take_over
+
+ADDRESS = Address("a" * 32, "sqlite:///runs.db")
+
+
+@pytest.fixture
+def spool(tmp_path):
+    spool = Spool.begin(tmp_path, ADDRESS)
+    yield spool
+    spool.close()
+
+
+def kinds(entries):
+    return [next(iter(entry)) for entry in entries]
+
+
+def test_spool_keeps_entries_in_their_order_and_what_is_delivered_of_each_lane(spool, tmp_path):
+    spool.add(tags={"a": "b"})
+    spool.add(file="best.pt")
+    spool.add(metrics=[("x", 1.0, 5, 100)])
+    figures, end = spool.next_entries("figures", 10)
+    assert kinds(figures) == ["address", "tags", "metrics"]
+    assert figures[2]["metrics"] == [["x", 1.0, 5, 100]]
+    assert spool.next_entries("files", 10)[0] == [{"file": "best.pt"}]
+    spool.mark("figures", end)
+    spool.close()
+    again = Spool.begin(tmp_path, ADDRESS)
+    assert again.next_entries("figures", 10)[0] == []
+    assert not again.is_delivered
+    again.mark("files", again.next_entries("files", 10)[1])
+    assert again.is_delivered
+    again.add(status=("FINISHED", 7))
+    assert (again.is_delivered, again.status) == (False, "FINISHED")
+    again.close()
+
+
+def test_spool_gives_no_more_entries_than_asked_for(spool):
+    for step in range(5):
+        spool.add(metrics=[("x", 1.0, 5, step)])
+    first, end = spool.next_entries("figures", 3)
+    spool.mark("figures", end)
+    rest, _ = spool.next_entries("figures", 10)
+    assert (len(first), len(rest)) == (3, 3)
+
+
+def test_spool_cuts_off_a_line_whose_writer_died(spool, tmp_path):
+    spool.add(tags={"a": "b"})
+    spool.close()
+    with spool.file.open("ab") as file:
+        file.write(b'{"metrics": [["x", 1.')
+    again = Spool.begin(tmp_path, ADDRESS)
+    again.add(status=("FINISHED", 7))
+    assert kinds(again.entries()) == ["address", "tags", "status"]
+    again.close()
+
+
+@pytest.mark.parametrize("damage", [b"nonsense\n", b"[1]\n", b'{"\xff": 1}\n'])
+def test_spool_names_a_damaged_line(spool, damage):
+    with spool.file.open("ab") as file:
+        file.write(damage)
+    with pytest.raises(TrackingError, match=f"{spool.file}: a line of it is damaged"):
+        list(spool.entries())
+
+
+@pytest.mark.parametrize("contents", [b"", b'{"tags": {}}\n', b'{"address": {"run": 1}}\n', b'{"address": 3}\n'])
+def test_spool_names_a_file_that_does_not_say_what_it_is_of(tmp_path, contents):
+    file = file_of(tmp_path, "b" * 32)
+    file.parent.mkdir()
+    file.write_bytes(contents)
+    with pytest.raises(TrackingError, match="does not begin with the run that it is of"):
+        Spool(file)
+    # Nobody holds what could not be opened.
+    file.write_bytes(json.dumps({"address": {"run_id": "b", "uri": "c"}}).encode() + b"\n")
+    Spool(file, timeout_s=0.0).close()
+
+
+def test_spool_delivers_all_again_where_nobody_knows_what_was_delivered(spool, tmp_path):
+    spool.mark("figures", spool.next_entries("figures", 10)[1])
+    spool.file.with_suffix(".delivered.json").write_text("{")
+    spool.close()
+    again = Spool.begin(tmp_path, ADDRESS)
+    assert kinds(again.next_entries("figures", 10)[0]) == ["address"]
+    again.close()
+
+
+def hold(folder, is_held):
+    held = Spool.begin(folder, ADDRESS)
+    is_held.set()
+    time.sleep(60)
+    held.close()
+
+
+def test_spool_is_held_by_one_process_until_that_dies(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    is_held = context.Event()
+    process = context.Process(target=hold, args=(tmp_path, is_held))
+    process.start()
+    assert is_held.wait(60)
+    with pytest.raises(FolderInUseError, match="another process tracks this run"):
+        Spool(file_of(tmp_path, ADDRESS.run_id), timeout_s=0.0)
+    process.kill()
+    process.join()
+    Spool(file_of(tmp_path, ADDRESS.run_id), timeout_s=5.0).close()
+
+
+def test_spool_is_taken_over_with_what_is_delivered_of_it(spool, tmp_path):
+    spool.add(tags={"a": "b"})
+    spool.mark("figures", spool.next_entries("figures", 1)[1])
+    spool.close()
+    take_over(ADDRESS.run_id, tmp_path, tmp_path / "retry")
+    assert spool_files(tmp_path) == [file_of(tmp_path / "retry", ADDRESS.run_id)]
+    again = Spool.begin(tmp_path / "retry", ADDRESS)
+    assert kinds(again.next_entries("figures", 10)[0]) == ["tags"]
+    again.close()
+    take_over("c" * 32, tmp_path, tmp_path / "retry")
