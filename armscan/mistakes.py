@@ -75,6 +75,8 @@ def quieten_libraries() -> None:
         ".*is an experimental feature.*",
         ".*Deprecat.*",
         ".*is not divisible by the number of test environments.*",
+        # Our values of a launcher are checked against the launcher's own, as they should be.
+        r"\s*'hydra/launcher/.*' is validated against ConfigStore schema",
     ):
         warnings.filterwarnings("ignore", message=message)
     for category in (DeprecationWarning, FutureWarning, PendingDeprecationWarning):

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from armscan.errors import FolderInUseError, InvalidValueError, TrackingError
 from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, SPOOLS, write_whole
+from armscan.launchers import LAUNCHER, check_launcher
 from armscan.mistakes import mistake_in_one_line
 from armscan.passwords import check_written
 from armscan.settings import TRACKING_URI, plain, resume_command
@@ -99,6 +100,7 @@ class Multirun(Callback):
         if config.get("study") is not None:
             # It has a run of its own, which outlives many starts of workers.
             return
+        check_launcher(config.hydra.runtime.choices[LAUNCHER])
         folder = Path(config.hydra.sweep.dir)
         if not isinstance(config.tracking, DictConfig):
             raise InvalidValueError(f"tracking is {config.tracking!r}, but it must be a section, such as its default")

@@ -8,6 +8,9 @@ import os
 # side never claim more threads than there are cores.
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
+# Ray reads it when it is imported, which other libraries do where it is installed: it would abort a study that is told
+# to end with a trace.
+os.environ.setdefault("RAY_DISABLE_FAILURE_SIGNAL_HANDLER", "1")
 
 import signal
 import sys

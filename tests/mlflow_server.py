@@ -14,13 +14,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-START_S, STOP_S = 120.0, 10.0
+LOOPBACK, START_S, STOP_S = "127.0.0.1", 120.0, 10.0
 
 
 @contextmanager
-def mlflow_server(folder: Path, backend: str) -> Iterator[MlflowServer]:
+def mlflow_server(folder: Path, backend: str, host: str = LOOPBACK) -> Iterator[MlflowServer]:
     """A server as long as it lasts."""
-    server = MlflowServer(folder, backend)
+    server = MlflowServer(folder, backend, host)
     server.start()
     try:
         yield server
@@ -37,7 +37,7 @@ class MlflowServer:
         host: that it listens on.
     """
 
-    def __init__(self, folder: Path, backend: str, host: str = "127.0.0.1") -> None:
+    def __init__(self, folder: Path, backend: str, host: str = LOOPBACK) -> None:
         self._folder, self._host = folder, host
         self.artifacts, self.log = folder / "artifacts", folder / "mlflow_server.log"
         # The driver that armscan installs. In the environment: a process's words can be read by everybody.

@@ -18,7 +18,7 @@ from typing import Any
 
 USER, PASSWORD = "armscan", "not-to-be-shown"
 DEBIAN, PROGRAMS = Path("/usr/lib/postgresql"), ("initdb", "postgres")
-START_S = 60.0
+LOOPBACK, START_S = "127.0.0.1", 60.0
 
 
 def programs() -> Path | None:
@@ -29,11 +29,11 @@ def programs() -> Path | None:
 
 
 @contextmanager
-def postgres_server(**settings: str) -> Iterator[PostgresServer]:
+def postgres_server(host: str = LOOPBACK, **settings: str) -> Iterator[PostgresServer]:
     """A server as long as it lasts, with these settings of PostgreSQL beside its own."""
     folder = Path(tempfile.mkdtemp(prefix="armscan-postgres-"))
     try:
-        server = PostgresServer(folder, settings)
+        server = PostgresServer(folder, settings, host)
         server.start()
         try:
             yield server
@@ -49,18 +49,20 @@ class PostgresServer:
     Args:
         folder: of its data, empty.
         settings: of PostgreSQL, beside those that a server of one's own needs.
+        host: address that it listens on.
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, str] | None = None) -> None:
+    def __init__(self, folder: Path, settings: Mapping[str, str] | None = None, host: str = LOOPBACK) -> None:
         found = programs()
         assert found is not None
+        self._host = host
         self._programs, self._data, self._log = found, folder / "data", folder / "log"
         # It refuses to run as root.
         self._account = _account() if os.geteuid() == 0 else None
         self._process: subprocess.Popen[bytes] | None = None
         self._numbers, self._settings = itertools.count(), dict(settings or {})
         with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
+            free.bind((host, 0))
             self.port = free.getsockname()[1]
         password = folder / "password"
         password.write_text(PASSWORD)
@@ -69,11 +71,13 @@ class PostgresServer:
                 shutil.chown(path, self._account)
         words = ("-D", self._data, "-U", USER, f"--pwfile={password}", "--auth=scram-sha-256", "--encoding=UTF8")
         assert self._started("initdb", *words, "--no-sync").wait() == 0, self._log.read_text()
+        with (self._data / "pg_hba.conf").open("a") as allowed:
+            allowed.write("host all all samenet scram-sha-256\n")
 
     def start(self) -> None:
         """Starts it, and waits until it answers."""
         # Without fsync: it is only the server that is killed here, and never the machine.
-        own = {"port": self.port, "listen_addresses": "127.0.0.1", "unix_socket_directories": "", "fsync": "off"}
+        own = {"port": self.port, "listen_addresses": self._host, "unix_socket_directories": "", "fsync": "off"}
         words = [word for key, value in (self._settings | own).items() for word in ("-c", f"{key}={value}")]
         self._process = self._started("postgres", "-D", self._data, *words)
         until_s = time.monotonic() + START_S
@@ -115,7 +119,7 @@ class PostgresServer:
 
     def uri(self, database: str) -> str:
         """Returns the address of a database."""
-        return f"postgresql://{USER}:{PASSWORD}@127.0.0.1:{self.port}/{database}"
+        return f"postgresql://{USER}:{PASSWORD}@{self._host}:{self.port}/{database}"
 
     def _answers(self) -> bool:
         import psycopg

@@ -1,9 +1,15 @@
-"""What runs on this machine, for tests of what must not be left running."""
+"""What runs on this machine, for tests of what must not be left running, and to end what they started by others."""
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
+import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
+
+END_S = 10.0
 
 
 def processes_in(folder: Path) -> list[int]:
@@ -17,3 +23,40 @@ def processes_in(folder: Path) -> list[int]:
         except OSError:
             continue
     return found
+
+
+def with_variable(name: str, value: str) -> list[int]:
+    """Returns the ids of the processes that were started with a variable in their environment."""
+    wanted, found = f"{name}={value}".encode(), []
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit() and int(folder.name) != os.getpid():
+            try:
+                variables = (folder / "environ").read_bytes().split(b"\0")
+            # It has ended, or is somebody else's.
+            except OSError:
+                continue
+            if wanted in variables:
+                found.append(int(folder.name))
+    return found
+
+
+def kill(pids: Iterable[int], how: signal.Signals = signal.SIGKILL) -> None:
+    """Sends a signal to those that are still there."""
+    for pid in pids:
+        try:
+            os.kill(pid, how)
+        except ProcessLookupError:
+            continue
+
+
+def end_all(found: Callable[[], list[int]]) -> None:
+    """Kills processes until none is found any more.
+
+    Args:
+        found: returns their ids.
+    """
+    until_s = time.monotonic() + END_S
+    while pids := found():
+        assert time.monotonic() < until_s, f"processes {pids} do not end"
+        kill(pids)
+        time.sleep(0.1)

@@ -11,12 +11,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, QuotedString
 
 from armscan.errors import InvalidValueError
+from armscan.launchers import LAUNCHER
 from armscan.settings import CLUSTER, MULTIRUN, PLAN, RESUME, SWEEPS
 from armscan.sweeps.describing import NOT_SEARCHED
 from armscan.sweeps.values import written
 
 STUDY = "study"
-LAUNCHER, USUAL_LAUNCHER = "hydra/launcher", "submitit_local"
+USUAL_LAUNCHER = "submitit_local"
 WORKER_KEY, SPACE, STORAGE, SEARCH_PATH = "study.worker", "study.space", "study.storage", "hydra.searchpath"
 
 

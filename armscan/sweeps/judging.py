@@ -42,16 +42,29 @@ def make_judging_study(storage: Storage, settings: StudySettings, searched: optu
 
     def made() -> optuna.Study:
         study = optuna.create_study(study_name=settings.judged_name, storage=storage.optuna, load_if_exists=True)
-        there = {
-            (trial.user_attrs[JUDGED], trial.user_attrs[JUDGED_SEED]) for trial in study.get_trials(deepcopy=False)
-        }
-        for trial in best_trials(searched, settings.judging.best):
-            for seed in judging_seeds(settings):
-                if (trial.number, seed) not in there:
-                    study.enqueue_trial(trial.params, user_attrs={JUDGED: trial.number, JUDGED_SEED: seed})
+        for trial, seed in lacking(settings, searched, study):
+            study.enqueue_trial(trial.params, user_attrs={JUDGED: trial.number, JUDGED_SEED: seed})
         return study
 
     return storage.alone(made)
+
+
+def lacking(
+    settings: StudySettings, searched: optuna.Study, judging: optuna.Study | None
+) -> list[tuple[FrozenTrial, int]]:
+    """Returns which trials have no training yet that judges them, and with which seeds.
+
+    Args:
+        settings: of the study.
+        searched: the study.
+        judging: that of the trainings that judge, None where it has not been made.
+    """
+    trials = judging.get_trials(deepcopy=False) if judging is not None else []
+    there = {(trial.user_attrs[JUDGED], trial.user_attrs[JUDGED_SEED]) for trial in trials}
+    wanted = [
+        (trial, seed) for trial in best_trials(searched, settings.judging.best) for seed in judging_seeds(settings)
+    ]
+    return [(trial, seed) for trial, seed in wanted if (trial.number, seed) not in there]
 
 
 def seed_of_judged(trial: Trial) -> tuple[int, ...]:

@@ -72,8 +72,10 @@ class Keeper:
         ledger: of the study.
         worker: what this worker is called.
         is_told_to_leave: asked several times a second.
-        leave: called, in another thread than the worker's, to end the process; what is at hand is handed back then.
+        leave: called, mostly in another thread than the worker's, to end the process; what is at hand is handed back
+            then.
         on_death: told of each trial whose worker had died.
+        is_told_to_leave_soon: asked when a trial is claimed, and when it tells its progress: it loses nothing then.
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class Keeper:
         is_told_to_leave: Callable[[], bool],
         leave: Callable[[], None],
         on_death: Callable[[FrozenTrial], None],
+        is_told_to_leave_soon: Callable[[], bool] = lambda: False,
     ) -> None:
         pid = os.getpid()
         self._lease: dict[str, Any] = {
@@ -95,6 +98,7 @@ class Keeper:
         }
         self._ledger, self._witness = ledger, Witness()
         self._is_told_to_leave, self._leave, self._on_death = is_told_to_leave, leave, on_death
+        self._is_told_to_leave_soon = is_told_to_leave_soon
         self._trial: Trial | None = None
         self._close: Callable[[], None] | None = None
         # Of the trial at hand.
@@ -130,7 +134,8 @@ class Keeper:
             self._lease = {key: self._lease[key] for key in (*HOLDER, "beat")}
             self._trial = self._ledger.claim(self._lease, outcome)
             self._close, self.notes = conclude, Notes()
-            return self._trial
+        self._leave_where_told_to()
+        return self._trial
 
     def closing(self, close: Callable[[], None] | None) -> None:
         """Says how to close what the trial has open, where the process is told to leave."""
@@ -143,6 +148,7 @@ class Keeper:
             LimitReachedError: if no trial is to be gone on with.
         """
         self._lease = self._lease | figures
+        self._leave_where_told_to()
         if self._spent is not None:
             raise LimitReachedError(self._spent)
 
@@ -155,6 +161,11 @@ class Keeper:
             if self._close is not None:
                 self._close()
             self._trial = self._close = None
+
+    def _leave_where_told_to(self) -> None:
+        if self._is_told_to_leave_soon():
+            self.hand_back()
+            self._leave()
 
     def _watch(self) -> None:
         while not self._stopped.wait(TICK_S):

@@ -16,16 +16,17 @@ import threading
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO, Self
 
 from omegaconf import DictConfig
 
-from armscan.errors import AwayError
+from armscan.errors import AwayError, StudyError
 from armscan.files import write_whole
 from armscan.sweeps.command_line import words_of_trials
 from armscan.sweeps.lease import process_start
+from armscan.sweeps.slurm import SOON, Notice
 
-LAUNCHER_FILE, STOP_FILE = "launcher.json", "stop"
+LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
 # The exit codes of a worker that was told to leave, of one whose storage was away for too long, and of all that have
 # ended by themselves and are not started again.
 LEFT, AWAY = 130, 75
@@ -35,6 +36,8 @@ GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"
 MAX_RESTARTS = 100
 # One that was not killed, but has crashed, will crash again.
 MAX_ERRORS = 5
+# A worker that is told to leave soon has so long for its epoch.
+SOON_S = 60.0
 WORKER_PROGRAM = """
 try:
     from armscan.sweeps.supervising import worker_main
@@ -52,16 +55,18 @@ class Process:
         host: that it runs on.
         pid: its process.
         started: see `process_start`.
+        directory: that it works in.
     """
 
     host: str
     pid: int
     started: str
+    directory: str
 
     @classmethod
     def current(cls) -> Self:
         """This process."""
-        return cls(socket.gethostname(), os.getpid(), process_start(os.getpid()))
+        return cls(socket.gethostname(), os.getpid(), process_start(os.getpid()), str(here()))
 
     @classmethod
     def read(cls, file: Path) -> Self:
@@ -79,9 +84,18 @@ class Process:
         return is_here and process_start(self.pid) != self.started
 
 
+def here() -> Path:
+    """Returns the directory of this process as its user calls it.
+
+    That is a name which other machines know; what a link or a mount of this machine leads to may not be.
+    """
+    called = Path(os.environ.get("PWD", ""))
+    return called if called.is_absolute() and called.is_dir() and called.samefile(".") else Path.cwd()
+
+
 def local_workers(folder: Path) -> list[Process]:
     """Returns the workers of a start that are at work on this machine."""
-    workers = [Process.read(file) for file in folder.glob("worker-*.json")]
+    workers = [Process.read(file) for file in folder.glob(WORKER_FILES)]
     here = socket.gethostname()
     return [each for each in workers if each.host == here and process_start(each.pid) == each.started]
 
@@ -104,32 +118,64 @@ def supervise(words: Sequence[str], number: int, folder: Path) -> None:
         words: of the study.
         number: of the worker.
         folder: of the workers of one start; each writes its log there.
+
+    Raises:
+        StudyError: if this machine does not see what the one of the launcher does.
+        SystemExit: see `Notice.follow`.
     """
-    launcher = Process.read(folder / LAUNCHER_FILE)
+    launcher = _launcher_of(folder)
     if os.getpid() != launcher.pid:
         # A Ctrl-C reaches all processes of a terminal, but it is the launcher that asks the workers to leave.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with (folder / f"worker-{number}.log").open("ab") as log:
-        n_errors = 0
+    handed_over = pickle.dumps((list(words), number, str(folder)))
+    n_errors = 0
+    with Notice.taken() as notice, (folder / f"worker-{number}.log").open("ab") as log:
         for _ in range(MAX_RESTARTS):
             if launcher.is_gone or (folder / STOP_FILE).exists():
                 return
-            handed_over = pickle.dumps((list(words), number, str(folder)))
-            ended = subprocess.run(
-                [sys.executable, "-c", WORKER_PROGRAM],
-                input=handed_over,
-                env=_environment(),
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-                check=False,
-            )
-            if ended.returncode in ENDS:
+            code = _worked(handed_over, launcher.directory, log, notice)
+            if notice.is_given and code not in (0, AWAY):
+                notice.follow()
                 return
-            if ended.returncode > 0:
-                n_errors += 1
+            if code in ENDS:
+                return
+            n_errors += code > 0
             if n_errors == MAX_ERRORS:
                 return
+
+
+def _launcher_of(folder: Path) -> Process:
+    """Returns the process that launched this start, where this machine sees what that one does."""
+    file = folder / LAUNCHER_FILE
+    if not file.exists():
+        raise _not_seen(folder)
+    launcher = Process.read(file)
+    if not Path(launcher.directory).is_dir():
+        raise _not_seen(Path(launcher.directory))
+    return launcher
+
+
+def _not_seen(folder: Path) -> StudyError:
+    return StudyError(
+        f"{folder} of the machine that the study was started on is not seen by {socket.gethostname()}: all machines "
+        "with workers must share it"
+    )
+
+
+def _worked(handed_over: bytes, directory: str, log: BinaryIO, notice: Notice) -> int:
+    """Runs the process of a worker to its end; returns its exit code."""
+    with subprocess.Popen(
+        [sys.executable, "-c", WORKER_PROGRAM],
+        stdin=subprocess.PIPE,
+        cwd=directory,
+        env=_environment(),
+        stdout=log,
+        stderr=log,
+        start_new_session=True,
+    ) as worker:
+        notice.pass_on_to(worker)
+        worker.communicate(handed_over)
+        return worker.returncode
 
 
 def keep_gpus() -> None:
@@ -152,9 +198,19 @@ def worker_main() -> None:
     words, number, folder_name = pickle.load(sys.stdin.buffer)
     folder, parent_pid = Path(folder_name), os.getppid()
     Process.current().write(folder / f"worker-{number}.json")
-    launcher, is_asked = Process.read(folder / LAUNCHER_FILE), threading.Event()
+    launcher, is_asked, is_asked_soon = Process.read(folder / LAUNCHER_FILE), threading.Event(), threading.Event()
+    late = threading.Timer(SOON_S, is_asked.set)
+    late.daemon = True
+
+    def ask_soon(*_: object) -> None:
+        # It may be told by Slurm, and again by the process above.
+        if not is_asked_soon.is_set():
+            is_asked_soon.set()
+            late.start()
+
     for asking in (signal.SIGINT, signal.SIGTERM):
         signal.signal(asking, lambda *_: is_asked.set())
+    signal.signal(SOON, ask_soon)
     # Whatever the launcher has kept from its processes.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
@@ -166,7 +222,13 @@ def worker_main() -> None:
     from armscan.sweeps.working import work
 
     try:
-        work(words, f"{folder.name}/{number}", is_told_to_leave, leave=lambda: os._exit(LEFT))
+        work(
+            words,
+            f"{folder.name}/{number}",
+            is_told_to_leave,
+            is_told_to_leave_soon=is_asked_soon.is_set,
+            leave=lambda: os._exit(LEFT),
+        )
     except AwayError as error:
         say(str(error))
         raise SystemExit(AWAY) from error

@@ -14,13 +14,21 @@ from armscan.sweeps.phases import Phase
 from armscan.sweeps.worker import Worker
 
 
-def work(words: Sequence[str], name: str, is_told_to_leave: Callable[[], bool], *, leave: Callable[[], None]) -> None:
+def work(
+    words: Sequence[str],
+    name: str,
+    is_told_to_leave: Callable[[], bool],
+    *,
+    is_told_to_leave_soon: Callable[[], bool],
+    leave: Callable[[], None],
+) -> None:
     """Works at a study until it is over.
 
     Args:
         words: of the study.
         name: of the worker.
         is_told_to_leave: see `Keeper`.
+        is_told_to_leave_soon: likewise.
         leave: likewise.
 
     Raises:
@@ -34,6 +42,7 @@ def work(words: Sequence[str], name: str, is_told_to_leave: Callable[[], bool], 
             phase.ledger,
             name,
             is_told_to_leave=is_told_to_leave,
+            is_told_to_leave_soon=is_told_to_leave_soon,
             leave=leave,
             on_death=partial(close_runs_of, phase=phase),
         )

@@ -1,0 +1,20 @@
+"""A study in PostgreSQL on an MLflow server, wherever its workers are."""
+
+import pytest
+
+from tests.cluster.studies import StartedStudy
+
+
+@pytest.fixture
+def start(tmp_path, postgres, tracking_server):
+    """Starts a study in an empty folder; it is ended with the test."""
+    started = []
+
+    def start(*words, environment):
+        study = StartedStudy(tmp_path, words, postgres.make_database(), tracking_server.uri, environment)
+        started.append(study)
+        return study
+
+    yield start
+    for study in started:
+        study.kill()

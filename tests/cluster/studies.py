@@ -1,0 +1,180 @@
+"""Studies as a person starts them, in PostgreSQL and on an MLflow server, and what must hold of them at the end."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import optuna
+from mlflow import MlflowClient
+from mlflow.entities import Run
+from optuna.trial import FrozenTrial, TrialState
+
+from armscan.passwords import STORAGE_PASSWORD, without_password
+from armscan.sweeps.storage import open_storage
+from armscan.sweeps.tally import LEASE, RETRY_OF
+from tests.postgres import PASSWORD
+
+REPOSITORY = Path(__file__).parents[2]
+FEW_VOLUMES = ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
+# Trials that only wait, each one to five seconds.
+WAITING = [
+    *("sweeps=sac_y", "study.task._target_=benchmarks.sleeping.Sleeping", "study/pruner=none", "study.max_retries=3"),
+    *("+study.space={training.env_steps:{low:100,high:200},agent.lr:{low:1.0e-4,high:1.0e-2}}", *FEW_VOLUMES),
+]
+# Trials that train, in epochs of a second or less.
+TRAINING = [
+    *("sweeps=sac_y", "study/pruner=none", "study.max_retries=3", "training.epoch_env_steps=200", *FEW_VOLUMES),
+    *("training.validation_episodes=2", "evaluation.episodes=3", "env.max_steps=8", "agent.random_env_steps=100"),
+    *("agent.batch_size=32", "network.vector.hidden_sizes=[16]"),
+]
+WAIT_S, END_S = 120.0, 180.0
+
+
+class StartedStudy:
+    """A study that is at work.
+
+    Args:
+        folder: empty, that it is started in.
+        words: of its command line, without where it is kept.
+        storage: address of an empty database, with its password.
+        tracking: address of the tracking server.
+        environment: what the command has beside that of this process.
+    """
+
+    def __init__(
+        self, folder: Path, words: Sequence[str], storage: str, tracking: str, environment: Mapping[str, str]
+    ) -> None:
+        self.folder, self._storage = folder, open_storage(storage).optuna
+        self._client, self._experiment = MlflowClient(tracking), folder.name
+        own = {"PYTHONPATH": str(REPOSITORY), "MLFLOW_TRACKING_URI": tracking, STORAGE_PASSWORD: PASSWORD}
+        kept = [f"study.storage={without_password(storage)}", f"tracking.experiment={self._experiment}"]
+        self.printed = folder / "printed"
+        with self.printed.open("ab") as printed:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "armscan.run", "-m", *words, *kept],
+                cwd=folder,
+                env=os.environ | own | environment,
+                stdout=printed,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    @property
+    def workers_folder(self) -> Path:
+        """Where its workers write."""
+        (folder,) = (self.folder / "studies" / "sac_y" / "workers").iterdir()
+        return folder
+
+    def trials(self, name: str = "sac_y") -> list[FrozenTrial]:
+        """Returns its trials, none where it has not been made yet."""
+        if name not in optuna.get_all_study_names(self._storage):
+            return []
+        return optuna.load_study(study_name=name, storage=self._storage).trials
+
+    def holder(self, number: int) -> dict[str, Any]:
+        """Waits until a worker is in the middle of a trial; returns its lease, with the number of the trial."""
+
+        def leases() -> list[dict[str, Any]]:
+            running = [trial for trial in self.trials() if trial.state == TrialState.RUNNING]
+            held = [
+                trial.user_attrs.get(LEASE, {}) | {"trial": trial.number}
+                for trial in running
+                if len(trial.intermediate_values) > 1
+            ]
+            return [lease for lease in held if str(lease.get("worker", "")).endswith(f"/{number}")]
+
+        self.wait(lambda: bool(leases()))
+        found = leases()
+        return found[0] if found else self.holder(number)
+
+    def kill_worker(self, number: int) -> int:
+        """Kills a worker in the middle of a trial; returns the number of the trial."""
+        lease = self.holder(number)
+        os.kill(lease["pid"], signal.SIGKILL)
+        return lease["trial"]
+
+    def wait(self, is_there: Callable[[], bool]) -> None:
+        """Waits for a moment while it is at work."""
+        until_s = time.monotonic() + WAIT_S
+        while not is_there():
+            assert self.process.poll() is None, self.told()
+            assert time.monotonic() < until_s, self.told()
+            time.sleep(0.1)
+
+    def end(self) -> int:
+        """Waits for its end; returns the exit code."""
+        try:
+            return self.process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(self.told()) from None
+
+    def kill(self) -> None:
+        """Kills the command, if it is still there; its workers leave then."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+    def told(self) -> str:
+        """Returns what the command and its workers have said."""
+        logs = sorted(self.folder.glob("studies/*/workers/*/worker-*.log"))
+        logs += sorted(self.folder.glob("studies/*/workers/*/.submitit/*/*.*[rt]"))
+        return "\n".join(f"--- {file.name}\n{file.read_text(errors='replace')}" for file in [self.printed, *logs])
+
+    def runs(self) -> list[Run]:
+        """Returns its runs of the tracking server."""
+        experiment = self._client.get_experiment_by_name(self._experiment)
+        return list(self._client.search_runs([experiment.experiment_id], max_results=1000))
+
+    def check_complete(self, n_trials: int) -> None:
+        """Checks that exactly so many trials have finished, and that each of them is tracked once and whole."""
+        trials, runs = self.trials(), self.runs()
+        finished = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+        assert len(finished) == n_trials, self.told()
+        assert {trial.state for trial in trials} <= {TrialState.COMPLETE, TrialState.FAIL}
+        retried = Counter(trial.user_attrs.get(RETRY_OF) for trial in trials)
+        assert all(retried[trial.number] == 1 for trial in trials if trial.state == TrialState.FAIL)
+        assert Counter(run.info.status for run in runs).keys() <= {"FINISHED", "FAILED"}
+        (of_study,) = [run for run in runs if run.info.run_name == "study sac_y"]
+        children = [run for run in runs if run.data.tags.get("mlflow.parentRunId") == of_study.info.run_id]
+        children = [run for run in children if run.data.tags["study"] == "sac_y"]
+        assert len(children) == len(trials)
+        for trial in trials:
+            (run,) = [run for run in children if run.data.tags["trial"] == str(trial.number)]
+            assert run.info.run_id == trial.user_attrs["mlflow_run"]
+            assert (run.info.status == "FINISHED") == (trial.state == TrialState.COMPLETE)
+            if trial.state == TrialState.COMPLETE:
+                assert run.data.metrics["mean_steps"] == trial.value
+                assert float(run.data.params["agent.lr"]) == trial.params["agent.lr"]
+
+    def check_secret(self) -> None:
+        """Checks that the password of the storage is in no file, and in no words of a process."""
+        words = [file for file in Path("/proc").glob("[0-9]*/cmdline") if PASSWORD.encode() in _contents(file)]
+        assert words == []
+        files = [file for file in self.folder.rglob("*") if file.is_file()]
+        assert [file for file in files if PASSWORD.encode() in file.read_bytes()] == []
+
+    def worker(self, number: int) -> dict[str, Any]:
+        """Returns what a worker has left word of."""
+        return json.loads((self.workers_folder / f"worker-{number}.json").read_text())
+
+
+def parent_of(pid: int) -> int:
+    """Returns the process that has started another."""
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def _contents(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    # A process that has ended.
+    except OSError:
+        return b""

@@ -1,0 +1,68 @@
+"""Studies whose workers are tasks of a real Ray cluster of two machines, one of which dies."""
+
+import pytest
+
+from armscan.passwords import STORAGE_PASSWORD
+from tests.cluster.studies import REPOSITORY, TRAINING, WAITING
+from tests.mlflow_server import mlflow_server
+from tests.postgres import PASSWORD, postgres_server, programs
+from tests.ray_cluster import ray_cluster, why_not_here
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """It is entered, too: all that follows is on its first machine."""
+    if (reason := why_not_here()) is not None:
+        pytest.skip(reason)
+    with (
+        ray_cluster({"PYTHONPATH": str(REPOSITORY), STORAGE_PASSWORD: PASSWORD}) as started,
+        started.head.entered(),
+    ):
+        yield started
+
+
+@pytest.fixture(scope="module")
+def postgres(cluster):
+    if programs() is None:
+        pytest.skip("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
+    with postgres_server(cluster.head.address) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def tracking_server(cluster, postgres, tmp_path_factory):
+    with mlflow_server(tmp_path_factory.mktemp("mlflow"), postgres.make_database(), cluster.head.address) as server:
+        yield server
+
+
+def test_study_that_is_told_to_end_hands_its_trials_back(cluster, start):
+    words = ["study.workers=2", "study.n_trials=50", "study.judging.best=0"]
+    study = start(*WAITING, "hydra/launcher=ray", *words, environment=cluster.environment)
+    study.holder(0)
+    study.holder(1)
+    # Ray takes this signal for itself.
+    study.process.terminate()
+    assert study.end() == 130, study.told()
+    printed = study.printed.read_text()
+    assert printed.endswith("interrupted; the same command goes on with the study\n")
+    assert "SIGTERM" not in printed
+    assert {trial.state.name for trial in study.trials()} <= {"COMPLETE", "WAITING"}
+    assert {run.info.status for run in study.runs()} <= {"FINISHED", "KILLED"}
+
+
+def test_study_outlives_a_killed_worker_and_a_machine_that_is_gone(cluster, start):
+    words = ["study.workers=2", "study.n_trials=4", "study.judging.best=0", "training.env_steps=2000"]
+    study = start(*TRAINING, "hydra/launcher=ray", *words, environment=cluster.environment)
+    numbers = {study.holder(number)["host"]: number for number in (0, 1)}
+    assert numbers.keys() == {cluster.head.name, cluster.other.name}
+    killed = study.kill_worker(numbers[cluster.head.name])
+    study.wait(lambda: any(trial.user_attrs.get("retry_of") == killed for trial in study.trials()))
+    study.holder(numbers[cluster.other.name])
+    cluster.other.crash()
+    assert study.end() == 0, study.told()
+    study.check_complete(4)
+    study.check_secret()
+    lost = [trial.user_attrs["failure"] for trial in study.trials() if trial.state.name == "FAIL"]
+    assert sorted(reason.rpartition(" on ")[2] for reason in lost) == sorted(numbers)
+    # Ray has begun the other worker again where there is a machine.
+    assert study.worker(numbers[cluster.other.name])["host"] == cluster.head.name

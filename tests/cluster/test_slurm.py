@@ -1,0 +1,95 @@
+"""Studies whose workers are jobs of a real Slurm: killed, told of their end, and queued again."""
+
+import os
+import signal
+
+import pytest
+
+from tests.cluster.studies import TRAINING, WAITING, parent_of
+from tests.slurm import missing_program, slurm
+
+SLURM = ["hydra/launcher=submitit_slurm", "hydra.launcher.mem_gb=null", "study.workers=2"]
+
+ACCOUNTING = r"""#!/bin/sh
+echo "JobID|State|NodeList"
+scontrol show job --oneliner | sed -nE \
+    's/.*ArrayJobId=([0-9]+) ArrayTaskId=([0-9]+) .*JobState=([A-Z]+) .*/\1_\2|\3|node/p'
+"""
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    if (missing := missing_program()) is not None:
+        pytest.skip(f"Slurm's {missing} is not installed: apt-get install slurmctld slurmd slurm-client munge")
+    with slurm() as started:
+        yield started
+
+
+def job_of(cluster, number):
+    """The job of a worker."""
+    (job,) = [job for job in cluster.jobs() if job.endswith(f"_{number}")]
+    return job
+
+
+def test_study_outlives_a_killed_worker_and_a_killed_job_that_slurm_says_nothing_of(cluster, start):
+    study = start(*WAITING, *SLURM, "study.n_trials=4", "study.judging.best=0", environment=cluster.environment)
+    study.kill_worker(0)
+    # That of submitit, above the worker: without it, there is no result that the launcher could wait for.
+    above = parent_of(study.holder(1)["pid"])
+    os.kill(above, signal.SIGKILL)
+    assert study.end() == 0, study.told()
+    study.check_complete(4)
+    study.check_secret()
+    (lost,) = [trial.user_attrs["failure"] for trial in study.trials() if trial.state.name == "FAIL"]
+    assert "its worker died" in lost
+    # The other worker was still there to see that it was alone.
+    assert "is handed back" in (study.workers_folder / "worker-1.log").read_text()
+
+
+@pytest.mark.slow
+def test_study_goes_on_when_the_launcher_gives_up_for_one_job_that_was_killed(cluster, start, tmp_path_factory):
+    # Accounting needs a database of Slurm's own; what it would say of the jobs is said in its place.
+    programs = tmp_path_factory.mktemp("bin")
+    accounting = programs / "sacct"
+    accounting.write_text(ACCOUNTING)
+    accounting.chmod(0o755)
+    environment = cluster.environment | {"PATH": f"{programs}:{os.environ['PATH']}"}
+    study = start(*WAITING, *SLURM, "study.n_trials=20", "study.judging.best=0", environment=environment)
+    os.kill(parent_of(study.holder(0)["pid"]), signal.SIGKILL)
+    assert study.end() == 0, study.told()
+    study.check_complete(20)
+    printed = study.printed.read_text()
+    assert "hydra/launcher is 'submitit_slurm', which has failed: Job " in printed
+    assert "waiting for workers that are still there" in printed
+
+
+def test_jobs_that_are_to_end_hand_their_trials_back_and_go_on_with_them_when_they_are_queued_again(cluster, start):
+    words = ["study.n_trials=2", "study.judging.best=0", "training.env_steps=4000"]
+    study = start(*TRAINING, *SLURM, *words, environment=cluster.environment)
+    study.holder(0)
+    study.holder(1)
+    # As before the end of its time, and as by an administrator.
+    cluster.told("scancel", "--signal=USR2", job_of(cluster, 0))
+    cluster.told("scontrol", "requeue", job_of(cluster, 1))
+    assert study.end() == 0, study.told()
+    study.check_complete(2)
+    assert len(study.trials()) == 2
+    for number in (0, 1):
+        log = (study.workers_folder / f"worker-{number}.log").read_text()
+        assert "is handed back" in log
+        assert "is gone on with" in log
+
+
+def test_a_cancelled_job_ends_its_worker_alone_and_an_interrupt_ends_all(cluster, start):
+    words = ["study.n_trials=50", "study.judging.best=0"]
+    study = start(*WAITING, *SLURM, *words, environment=cluster.environment)
+    study.holder(0)
+    cluster.told("scancel", job_of(cluster, 0))
+    study.wait(lambda: "is handed back" in (study.workers_folder / "worker-0.log").read_text())
+    study.wait(lambda: len(cluster.jobs()) == 1)
+    study.holder(1)
+    os.kill(study.process.pid, signal.SIGINT)
+    assert study.end() == 130, study.told()
+    assert study.printed.read_text().endswith("interrupted; the same command goes on with the study\n")
+    assert {trial.state.name for trial in study.trials()} <= {"COMPLETE", "WAITING"}
+    assert {run.info.status for run in study.runs()} == {"FINISHED", "KILLED"}
