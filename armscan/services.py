@@ -74,6 +74,5 @@ def hand_over_local() -> None:
             HAND_OVER[name](address)
 
 
-def register_resolver() -> None:
-    """Lets configurations name services."""
-    OmegaConf.register_new_resolver(RESOLVER, address_of, replace=True)
+# Whoever resolves a configuration, in whichever process, has imported this.
+OmegaConf.register_new_resolver(RESOLVER, address_of, replace=True)

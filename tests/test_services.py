@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from armscan import passwords
 from armscan.errors import InvalidValueError
 from armscan.passwords import check_words, masked, password_in, password_of, without_password
-from armscan.services import LOCAL_FILE, address_of, hand_over_local, register_resolver
+from armscan.services import LOCAL_FILE, address_of, hand_over_local
 from armscan.settings import usual_storage, usual_tracking
 
 VARIABLES = ("ARMSCAN_STORAGE", "MLFLOW_TRACKING_URI", "MLFLOW_TRACKING_USERNAME")
@@ -118,7 +118,6 @@ def test_masked_text_has_no_password(monkeypatch):
 
 
 def test_configuration_resolves_to_addresses_without_passwords(monkeypatch):
-    register_resolver()
     monkeypatch.setenv("ARMSCAN_STORAGE", "postgresql://me:secret@host/db")
     config = OmegaConf.create({"storage": "${armscan.service:storage}"})
     assert OmegaConf.to_yaml(config, resolve=True) == "storage: postgresql://me@host/db\n"

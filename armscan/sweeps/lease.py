@@ -21,8 +21,12 @@ from armscan.sweeps.tally import HOLDER, LEASE
 BEAT_S, TICK_S = 10.0, 0.25
 # Missed beats before a worker counts as dead: a busy storage may hold up some.
 DEAD_AFTER_S = 40.0
-# Of the time between two looks at a lease: in a longer one the storage was away for all, and nobody could renew any.
-MOST_UNSEEN_S = 15.0
+# So many workers look after the others at each beat, and more of them take turns: a look costs the storage something
+# for each trial that runs.
+LOOKING_AT_ONCE = 64
+# Of the time between two looks at a lease, in times of what it should be: in a longer one the storage was away for all,
+# and nobody could renew any.
+MOST_UNSEEN = 1.5
 # Where the storage is away, what is at hand cannot be handed back: it is reclaimed, as its process is gone.
 HAND_BACK_S = 5.0
 
@@ -48,6 +52,8 @@ class Witness:
     """Tells the dead from the living, by its own clock: clocks of machines differ."""
 
     def __init__(self) -> None:
+        # Between two looks.
+        self.pause_s = BEAT_S
         # By trial: its last sign, when it was last looked at, and for how long it has been the same by then.
         self._seen: dict[int, tuple[Any, float, float]] = {}
         self._host = socket.gethostname()
@@ -60,7 +66,7 @@ class Witness:
         sign = lease.get("worker"), lease.get("beat")
         now_s = time.monotonic()
         before, looked_s, silent_s = self._seen.get(trial.number, (None, now_s, 0.0))
-        silent_s = silent_s + min(now_s - looked_s, MOST_UNSEEN_S) if before == sign else 0.0
+        silent_s = silent_s + min(now_s - looked_s, MOST_UNSEEN * self.pause_s) if before == sign else 0.0
         self._seen[trial.number] = sign, now_s, silent_s
         return silent_s > DEAD_AFTER_S
 
@@ -104,6 +110,8 @@ class Keeper:
         # Of the trial at hand.
         self.notes = Notes()
         self._spent: str | None = None
+        # When to look next.
+        self._look_s = 0.0
         # Held while a trial changes hands, so that none is forgotten by who leaves in the middle of it.
         self._changing = threading.Lock()
         self._stopped = threading.Event()
@@ -192,7 +200,13 @@ class Keeper:
     def _give_sign(self) -> None:
         with self._changing:
             self._lease = self._lease | {"beat": self._lease["beat"] + 1}
-            tally = self._ledger.renew(self._trial, self._lease)
+            is_looking = time.monotonic() >= self._look_s
+            tally = self._ledger.renew(self._trial, self._lease, is_looking=is_looking)
+        if tally is None:
+            return
+        self._witness.pause_s = BEAT_S * max(1.0, len(tally.running) / LOOKING_AT_ONCE)
+        # A beat is never quite as long as it should be.
+        self._look_s = time.monotonic() + self._witness.pause_s - BEAT_S / 2
         for trial in self._ledger.reclaim(self._witness.is_dead, tally):
             self._on_death(trial)
         self._spent = self._ledger.spent(tally)

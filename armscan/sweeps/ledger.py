@@ -165,23 +165,24 @@ class Ledger:
 
         self._storage.alone(handed_back)
 
-    def renew(self, trial: Trial | None, lease: Mapping[str, Any]) -> Tally:
+    def renew(self, trial: Trial | None, lease: Mapping[str, Any], *, is_looking: bool = True) -> Tally | None:
         """Says that the worker of a trial of one's own is alive, and how far it is.
 
         Args:
             trial: None where the worker has none at hand.
             lease: of the trial.
+            is_looking: whether to look how the study stands.
 
         Returns:
-            How the study stands.
+            How it stands; None where nobody looks.
         """
 
-        def renewed() -> Tally:
+        def renewed() -> Tally | None:
             # Where somebody took the worker for dead, the trial is not its own any more.
             with contextlib.suppress(UpdateFinishedTrialError):
                 if trial is not None:
                     self.study._storage.set_trial_user_attr(trial._trial_id, LEASE, dict(lease))
-            return self.tally()
+            return self.tally() if is_looking else None
 
         return self.together(renewed)
 

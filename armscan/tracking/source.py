@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 
 
-def source_tags() -> dict[str, str]:
-    """Returns the git commit of the code and whether its tree was dirty; 'unknown' where the code is under no git."""
+@functools.cache
+def source_tags() -> Mapping[str, str]:
+    """Returns the git commit of the code and whether its tree was dirty; 'unknown' where the code is under no git.
+
+    Once for a process, whose code stays what it was when it was loaded.
+    """
     folder = Path(__file__).parent
     commit = _git("rev-parse", "HEAD", folder=folder)
     if commit is None:

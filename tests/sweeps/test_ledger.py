@@ -10,7 +10,8 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.lease import Witness, process_start
+from armscan.sweeps import lease as lease_module
+from armscan.sweeps.lease import Keeper, Witness, process_start
 from armscan.sweeps.tally import ATTEMPT, FAILURE, LEASE, RETRIED, RETRY_OF, Tally
 from tests.sweeps.conftest import fail
 
@@ -242,6 +243,26 @@ def test_witness_takes_a_worker_elsewhere_for_dead_when_its_lease_is_not_renewed
     ledger.renew(_trial(ledger), lease | {"beat": 3})
     # Nobody looked for long, because the storage was away: then it could not be renewed, either.
     assert found_dead_after(0, 10, 500, 10, 10) == [False, False, False, False, True]
+
+
+def test_keepers_of_many_trials_take_turns_in_looking_after_them(make_ledger, monkeypatch):
+    ledger, now_s, looks = make_ledger(), [100.0], []
+    monkeypatch.setattr(lease_module.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(lease_module, "LOOKING_AT_ONCE", 2)
+    keeper = Keeper(ledger, "a", is_told_to_leave=lambda: False, leave=lambda: None, on_death=pytest.fail)
+    keeper.claim()
+    alive = {"host": os.uname().nodename, "pid": os.getpid(), "started": process_start(os.getpid())}
+    for _ in range(4):
+        ledger.claim(alive | {"worker": "b"})
+    tally = ledger.tally
+    monkeypatch.setattr(ledger, "tally", lambda: looks.append(now_s[0]) or tally())
+    for _ in range(9):
+        keeper._give_sign()
+        now_s[0] += lease_module.BEAT_S
+    # Five trials, of whose workers two may look in a beat: each after two beats, as two and a half cannot be.
+    assert [look_s - 100 for look_s in looks] == [0, 20, 40, 60, 80]
+    own = [trial.user_attrs[LEASE]["beat"] for trial in tally().running if trial.user_attrs[LEASE]["worker"] == "a"]
+    assert own == [9]
 
 
 def _trial(ledger):
