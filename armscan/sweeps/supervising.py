@@ -219,9 +219,12 @@ def worker_main() -> None:
         return is_asked.is_set() or is_alone or (folder / STOP_FILE).exists()
 
     from armscan.log import say
+    from armscan.services import hand_over_local
     from armscan.sweeps.working import work
 
     try:
+        # For launchers that do not pass the environment on.
+        hand_over_local()
         work(
             words,
             f"{folder.name}/{number}",

@@ -81,26 +81,21 @@ class StartedStudy:
         return optuna.load_study(study_name=name, storage=self._storage).trials
 
     def holder(self, number: int) -> dict[str, Any]:
-        """Waits until a worker is in the middle of a trial; returns its lease, with the number of the trial."""
+        """Waits until a worker is in the middle of a trial; returns its lease."""
+        found: list[dict[str, Any]] = []
 
-        def leases() -> list[dict[str, Any]]:
+        def is_there() -> bool:
             running = [trial for trial in self.trials() if trial.state == TrialState.RUNNING]
-            held = [
-                trial.user_attrs.get(LEASE, {}) | {"trial": trial.number}
-                for trial in running
-                if len(trial.intermediate_values) > 1
-            ]
-            return [lease for lease in held if str(lease.get("worker", "")).endswith(f"/{number}")]
+            leases = [trial.user_attrs.get(LEASE, {}) for trial in running if len(trial.intermediate_values) > 1]
+            found.extend(lease for lease in leases if lease.get("worker", "").endswith(f"/{number}"))
+            return bool(found)
 
-        self.wait(lambda: bool(leases()))
-        found = leases()
-        return found[0] if found else self.holder(number)
+        self.wait(is_there)
+        return found[0]
 
-    def kill_worker(self, number: int) -> int:
-        """Kills a worker in the middle of a trial; returns the number of the trial."""
-        lease = self.holder(number)
-        os.kill(lease["pid"], signal.SIGKILL)
-        return lease["trial"]
+    def kill_worker(self, number: int) -> None:
+        """Kills a worker in the middle of a trial."""
+        os.kill(self.holder(number)["pid"], signal.SIGKILL)
 
     def wait(self, is_there: Callable[[], bool]) -> None:
         """Waits for a moment while it is at work."""

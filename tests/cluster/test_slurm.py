@@ -92,4 +92,13 @@ def test_a_cancelled_job_ends_its_worker_alone_and_an_interrupt_ends_all(cluster
     assert study.end() == 130, study.told()
     assert study.printed.read_text().endswith("interrupted; the same command goes on with the study\n")
     assert {trial.state.name for trial in study.trials()} <= {"COMPLETE", "WAITING"}
-    assert {run.info.status for run in study.runs()} == {"FINISHED", "KILLED"}
+    assert {run.info.status for run in study.runs()} <= {"FINISHED", "KILLED"}
+
+
+def test_study_that_slurm_does_not_take_says_why_in_one_line(cluster, start):
+    study = start(*WAITING, *SLURM, "hydra.launcher.partition=nowhere", environment=cluster.environment)
+    assert study.end() == 2
+    last = study.printed.read_text().splitlines()[-1]
+    assert last.startswith(
+        "error: hydra/launcher is 'submitit_slurm', which has failed: sbatch: error: invalid partition"
+    )
