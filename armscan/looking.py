@@ -99,8 +99,12 @@ def place_of_runs(request: Request) -> Place:
         TrackingError: if no runs can be there, or it cannot be reached.
     """
     if request.has_tracking_server:
-        parts = urlsplit(request.tracking)
-        address = parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl().rstrip("/")
+        try:
+            parts = urlsplit(request.tracking)
+            address = parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl().rstrip("/")
+        except ValueError as error:
+            shown = without_password(request.tracking)
+            raise TrackingError(f"tracking is {shown!r}, but that is no address of a server: {error}") from error
         return Place(key="tracking", what="runs", shown=address, is_there=is_answered(f"{address}/health"), server=None)
     shown, is_there = without_password(request.tracking), _has_runs(request.tracking)
     server = Server(

@@ -220,14 +220,12 @@ def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Ma
     Raises:
         TrackingError: if the store is away for longer than a run waits for it at its end.
     """
-    from armscan.tracking import TrackedRun, open_store, sync
+    from armscan.tracking import note_end, open_store, sync
 
-    store, experiment_id = open_store(**word["tracking"], patience_s=word["tracking"]["wait_s"])
-    parent = TrackedRun.joined(store, word["run_id"], name="multirun", folder=folder)
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}"[:MAX_TAG_CHARS] for number, each in failed.items()}
-    parent.set_tags(tags)
-    parent.end(status)
-    # What jobs have left because the store was away.
+    note_end(folder, word["run_id"], word["tracking"]["uri"], status, tags)
+    store, experiment_id = open_store(**word["tracking"], patience_s=word["tracking"]["wait_s"])
+    # With what jobs have left because the store was away.
     sync(folder, lambda _: store)
     children = store.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
     for child in children:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import unquote, urlsplit
+from urllib.parse import unquote
 
 from armscan.errors import InvalidValueError
 
@@ -21,27 +21,39 @@ TRACKING_PASSWORD = "ARMSCAN_TRACKING_PASSWORD"
 # A variable of this name holds a file's place instead, as containers are given their secrets.
 IN_A_FILE = "_FILE"
 ACCOUNT = re.compile(r"(?<=://)([^/@:?#\s]*):([^/@?#\s]*)@")
-IN_A_QUERY = re.compile(r"(?<=[?&])password=[^&]*&?")
+IN_A_QUERY = re.compile(r"(?<=[?&])\w*password=([^&]*)&?")
 REPLACED_BY = "***"
+# A shorter one is found in words that have nothing to do with it, and what is left of them would tell it.
+FEWEST_CHARS = 4
 
 
 def without_password(uri: str) -> str:
     """Returns an address as it may be shown."""
-    scheme, separator, rest = uri.partition("://")
-    account, at, host = rest.rpartition("@")
-    shown = f"{scheme}{separator}{account.partition(':')[0]}{at}{host}"
-    return IN_A_QUERY.sub("", shown).rstrip("?&")
+    scheme, separator, account, rest = _parts(uri)
+    shown = f"{scheme}{separator}{account.partition(':')[0]}{'@' if account else ''}{rest}"
+    return IN_A_QUERY.sub("", shown).rstrip("?&") if separator else uri
 
 
 def password_in(uri: str) -> str | None:
     """Returns the password that stands in an address, None where none does."""
-    if "://" not in uri:
-        return None
-    queried = re.search(r"[?&]password=([^&]*)", uri)
-    account, at, _ = uri.partition("://")[2].rpartition("@")
+    _, separator, account, rest = _parts(uri)
     _, colon, password = account.partition(":")
-    found = password if at and colon else queried[1] if queried else None
+    queried = IN_A_QUERY.search(rest) if separator else None
+    found = password if colon else queried[1] if queried else None
     return unquote(found) if found else None
+
+
+def _parts(uri: str) -> tuple[str, str, str, str]:
+    """Returns scheme, `://`, user with password, and the rest of an address; of a file the last alone."""
+    scheme, separator, rest = uri.partition("://")
+    if not separator or scheme.startswith(("sqlite", "file")):
+        return "", "", "", uri
+    # A password in the address of a database may have a slash in it.
+    host_ends = re.search(r"[/?#]" if scheme.startswith("http") else r"[?]", rest)
+    end = host_ends.start() if host_ends else len(rest)
+    account, at, host = rest[:end].rpartition("@")
+    is_account = bool(at) and "/" not in account.partition(":")[0]
+    return (scheme, separator, account, host + rest[end:]) if is_account else (scheme, separator, "", rest)
 
 
 def password_of(variable: str) -> str | None:
@@ -55,11 +67,15 @@ def password_of(variable: str) -> str | None:
     file = os.environ.get(variable + IN_A_FILE)
     if not file:
         return None
+    name = variable + IN_A_FILE
     try:
-        return Path(file).read_text().rstrip("\n")
-    except OSError as error:
-        name = variable + IN_A_FILE
-        raise InvalidValueError(f"{name} is {file!r}, but it cannot be read ({error.strerror})") from error
+        password = Path(file).read_text().rstrip("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise InvalidValueError(f"{name} is {file!r}, but it cannot be read ({reason})") from None
+    if not password:
+        raise InvalidValueError(f"{name} is {file!r}, but that file is empty")
+    return password
 
 
 def database_url(uri: str, variable: str) -> URL:
@@ -98,16 +114,17 @@ def hand_over_tracking(uri: str) -> str:
     if not uri.startswith("http"):
         os.environ[TRACKING_PASSWORD] = password
         return without_password(uri)
-    os.environ[TRACKING_USER], os.environ[SERVER_PASSWORD] = unquote(urlsplit(uri).username or ""), password
-    scheme, separator, rest = uri.partition("://")
-    return scheme + separator + rest.rpartition("@")[2]
+    scheme, separator, account, rest = _parts(uri)
+    os.environ[TRACKING_USER], os.environ[SERVER_PASSWORD] = unquote(account.partition(":")[0]), password
+    return scheme + separator + rest
 
 
 def masked(text: str) -> str:
     """Returns a text, an error's say, without the passwords of this process and of any address in it."""
     text = ACCOUNT.sub(rf"\1:{REPLACED_BY}@", text)
     for variable in (STORAGE_PASSWORD, TRACKING_PASSWORD, SERVER_PASSWORD):
-        if password := os.environ.get(variable):
+        password = os.environ.get(variable, "")
+        if len(password) >= FEWEST_CHARS:
             text = text.replace(password, REPLACED_BY)
     return text
 

@@ -79,8 +79,8 @@ class Patience:
                 reason, away = told, error
         # Nobody waits any more after one has: what is cleared up on the way out would take as long again.
         self._is_over = True
-        minutes = f"{self._patience_s / 60:.3g}"
-        raise self._error(f"{self._named}, but it has been away for {minutes} minutes: {reason}") from away
+        long = f"{self._patience_s:g} s" if self._patience_s < 60 else f"{self._patience_s / 60:g} minutes"
+        raise self._error(f"{self._named}, but it has been away for {long}: {reason}") from away
 
     @contextmanager
     def _told(self, reason: str) -> Iterator[None]:

@@ -107,7 +107,8 @@ def main() -> int:
     sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in MULTIRUN)
     try:
         check_words(sys.argv[1:])
-        hand_over_local()
+        if not {"-h", "--help"} & set(sys.argv):
+            hand_over_local()
         if any(word == PLAN or word.startswith(f"{SWEEPS}=") for word in sys.argv[1:]):
             from armscan.sweeps.command import run_study
 

@@ -60,6 +60,8 @@ def local_addresses() -> dict[str, str]:
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         # What a parser shows of the line may be the password.
         raise InvalidValueError(f"{LOCAL_FILE} cannot be read: {type(error).__name__}") from None
+    if said is None:
+        return {}
     if not isinstance(said, dict) or not all(isinstance(address, str) for address in said.values()):
         raise InvalidValueError(f"{LOCAL_FILE} must hold nothing but {listed(VARIABLES)}, each with an address")
     if unknown := [name for name in said if name not in VARIABLES]:

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from armscan import passwords
 from armscan.errors import InvalidValueError
 from armscan.passwords import check_words, masked, password_in, password_of, without_password
-from armscan.services import LOCAL_FILE, address_of, hand_over_local
+from armscan.services import LOCAL_FILE, address_of, hand_over_local, local_addresses
 from armscan.settings import usual_storage, usual_tracking
 
 VARIABLES = ("ARMSCAN_STORAGE", "MLFLOW_TRACKING_URI", "MLFLOW_TRACKING_USERNAME")
@@ -44,6 +44,10 @@ def write_local(here):
         ("https://me:secret@host/path", "secret", "https://me@host/path"),
         ("sqlite:///a.db", None, "sqlite:///a.db"),
         ("optuna.journal", None, "optuna.journal"),
+        ("sqlite:////home/a:b@c/x.db", None, "sqlite:////home/a:b@c/x.db"),
+        ("http://host:5000/a@b", None, "http://host:5000/a@b"),
+        ("postgresql://me:se/c@ret@host/db", "se/c@ret", "postgresql://me@host/db"),
+        ("postgresql://me@host/db?sslpassword=secret", "secret", "postgresql://me@host/db"),
     ],
 )
 def test_password_is_told_from_its_address(uri, password, shown):
@@ -76,6 +80,11 @@ def test_passwords_of_the_local_file_serve_every_command_where_none_are_set(writ
     assert os.environ[passwords.STORAGE_PASSWORD] == "other"
 
 
+def test_empty_local_file_says_nothing(write_local):
+    write_local("# storage: postgresql://me@host/db\n")
+    assert local_addresses() == {}
+
+
 def test_service_that_nobody_has_named_is_told_with_where_to_name_it():
     with pytest.raises(InvalidValueError, match=r"neither ARMSCAN_STORAGE is set nor is there a storage in conf/local"):
         address_of("storage")
@@ -101,6 +110,12 @@ def test_password_comes_from_a_file_where_the_environment_names_one(tmp_path, mo
     (tmp_path / "secret").write_text("a b\n")
     monkeypatch.setenv("ARMSCAN_STORAGE_PASSWORD_FILE", str(tmp_path / "secret"))
     assert password_of("ARMSCAN_STORAGE_PASSWORD") == "a b"
+    (tmp_path / "empty").write_text("\n")
+    (tmp_path / "binary").write_bytes(b"\xff")
+    for name, reason in (("empty", "is empty"), ("binary", "it is no text")):
+        monkeypatch.setenv("ARMSCAN_STORAGE_PASSWORD_FILE", str(tmp_path / name))
+        with pytest.raises(InvalidValueError, match=f"ARMSCAN_STORAGE_PASSWORD_FILE is .*{name}.*{reason}"):
+            password_of("ARMSCAN_STORAGE_PASSWORD")
     monkeypatch.setenv("ARMSCAN_STORAGE_PASSWORD_FILE", str(tmp_path / "nothing"))
     with pytest.raises(InvalidValueError, match=r"ARMSCAN_STORAGE_PASSWORD_FILE is .*nothing', but it cannot be read"):
         password_of("ARMSCAN_STORAGE_PASSWORD")

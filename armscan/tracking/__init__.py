@@ -7,7 +7,7 @@ from armscan.tracking.run import TrackedRun, flattened
 from armscan.tracking.source import source_tags
 from armscan.tracking.spool import take_over
 from armscan.tracking.store import open_existing_store, open_store
-from armscan.tracking.sync import abandon, sync
+from armscan.tracking.sync import abandon, note_end, sync
 
 __all__ = [
     "EVALUATED_TAG",
@@ -21,6 +21,7 @@ __all__ = [
     "flattened",
     "found_run",
     "jobs_of",
+    "note_end",
     "open_existing_store",
     "open_store",
     "source_tags",

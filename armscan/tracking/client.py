@@ -22,6 +22,10 @@ T = TypeVar("T")
 # What MLflow says of a store that it cannot reach, of one that fails, and of what is not there.
 AWAY, NOT_THERE = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "REQUEST_LIMIT_EXCEEDED"), "RESOURCE_DOES_NOT_EXIST"
 MAX_REASON_CHARS = 300
+# What is worth telling of an HTTP client's account of its attempts.
+SHORT = re.compile(
+    r"\[Errno -?\d+\] ([\w ]+)|(Connection reset by peer|Connection aborted|[Rr]ead timed out)|(too many 50\d)"
+)
 # A tag of each run: by which one is found again whose making was not answered.
 MADE_TAG = "made"
 
@@ -67,7 +71,14 @@ class TrackingStore:
 
     def _asked(self, operate: Callable[..., T], *args: Any, **kwargs: Any) -> T:
         asked = partial(operate, *args, **kwargs)
-        return asked() if self._patience is None else self._patience.through(asked)
+        if self._patience is not None:
+            return self._patience.through(asked)
+        try:
+            return asked()
+        except Exception as error:
+            if (reason := why_away(error)) is None:
+                raise
+            raise TrackingAwayError(f"tracking.uri is {self.uri!r}, but this store cannot be used: {reason}") from error
 
 
 def why_away(error: BaseException) -> str | None:
@@ -87,6 +98,6 @@ def why_away(error: BaseException) -> str | None:
 def reason_in(error: BaseException) -> str:
     """Returns what an error says, short and without a password."""
     text = masked(" ".join(str(error).split()))
-    if told := re.search(r"\[Errno -?\d+\] ([\w ]+)", text):
-        return told[1].strip()
+    if told := SHORT.search(text):
+        return next(part for part in told.groups() if part).strip()
     return text[:MAX_REASON_CHARS]

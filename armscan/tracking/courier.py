@@ -41,6 +41,11 @@ class Courier:
         self._thread = threading.Thread(target=self._work, name="courier", daemon=True)
         self._thread.start()
 
+    @property
+    def is_away(self) -> bool:
+        """Whether the store cannot be reached, as far as is known, and does not refuse what it is given."""
+        return self._failure is None or why_away(self._failure) is not None
+
     def wake(self) -> None:
         """Says that something was added."""
         with self._changing:
@@ -58,8 +63,7 @@ class Courier:
         """
         until_s, is_told = time.monotonic() + wait_s, False
         while not self._is_done.wait(min(LOOK_S, max(0.0, until_s - time.monotonic()))):
-            is_refused = self._failure is not None and why_away(self._failure) is None
-            if is_refused or time.monotonic() > until_s:
+            if not self.is_away or time.monotonic() > until_s:
                 break
             if self._failure is not None and not is_told:
                 is_told = True
@@ -110,22 +114,29 @@ class Courier:
             say(f"{self._store.uri} is back: everything is delivered")
 
 
-def deliver(spool: Spool, client: MlflowClient, lane: Lane) -> int:
+def deliver(spool: Spool, client: MlflowClient, lane: Lane, *, is_whole: bool = True) -> int:
     """Delivers what is to be delivered in a lane of a spool.
 
     Args:
         spool: of a run.
         client: of its store.
         lane: which entries.
+        is_whole: whether a file that is not there was removed, and not left behind when the folder was copied.
 
     Returns:
         How many there were.
+
+    Raises:
+        FileNotFoundError: if a file is not there that may be elsewhere.
     """
     n_delivered = 0
     while True:
         entries, end = spool.next_entries(lane, ENTRIES_AT_ONCE if lane == "figures" else 1)
         if not entries:
             return n_delivered
+        for entry in entries if lane == "files" and not is_whole else ():
+            if not (file := spool.folder / entry["file"]).exists():
+                raise FileNotFoundError(f"{file} is not there")
         for kind, group in itertools.groupby(entries, key=lambda entry: next(iter(entry))):
             _deliver(client, spool, kind, [entry[kind] for entry in group])
         spool.mark(lane, end)

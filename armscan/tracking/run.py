@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import time
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +18,7 @@ from armscan.tracking.client import TrackingStore
 from armscan.tracking.courier import Courier
 from armscan.tracking.pictures import draw_learning_curve
 from armscan.tracking.source import source_tags
-from armscan.tracking.spool import Address, Spool, file_of
+from armscan.tracking.spool import Address, Spool, file_of, now_ms
 from armscan.training import EpochReport, Evaluation, TrainingResult
 
 EVALUATION_FILE, CURVE_FILE = "evaluation.json", "learning_curve.png"
@@ -141,9 +140,9 @@ class TrackedRun:
 
     def log_figures(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
         """Logs figures at an environment step; none twice."""
-        now_ms = _now_ms()
+        at_ms = now_ms()
         points = [
-            (name, float(value), now_ms, n_env_steps)
+            (name, float(value), at_ms, n_env_steps)
             for name, value in figures.items()
             # MLflow has no place for a mean over no episodes, which is NaN.
             if value == value and (name, n_env_steps) not in self._logged
@@ -192,7 +191,7 @@ class TrackedRun:
 
     def set_status(self, status: str) -> None:
         """Says how the run stands, such as RUNNING."""
-        self._add(status=(status, _now_ms()))
+        self._add(status=(status, now_ms()))
 
     def end(self, status: str, *, reason: str | None = None, wait_s: float | None = None) -> bool:
         """Closes the run as FINISHED, FAILED (with the reason) or KILLED, and waits until the store has all of it.
@@ -219,16 +218,13 @@ class TrackedRun:
         self._is_delivered = failure is None
         if failure is not None:
             again = f"python -m armscan.track sync {shlex.quote(str(self._spool.folder))}"
-            say(f"run {self.run_id}: {self._store.uri} has not got all of it ({failure}): {again} delivers the rest")
+            how = "delivers the rest" if self._courier.is_away else "delivers the rest once the store takes it"
+            say(f"run {self.run_id}: {self._store.uri} has not got all of it ({failure}): {again} {how}")
         return self._is_delivered
 
     def _add(self, **entry: Any) -> None:
         self._spool.add(**entry)
         self._courier.wake()
-
-
-def _now_ms() -> int:
-    return time.time_ns() // 1_000_000
 
 
 def _logged_in(spool: Spool) -> set[tuple[str, int]]:

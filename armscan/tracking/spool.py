@@ -7,10 +7,10 @@ an entry that is delivered again, because only the answer was lost, changes noth
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -164,11 +164,25 @@ class Spool:
         return entry
 
     def _read_delivered(self) -> dict[Lane, int]:
-        # Without it everything is delivered once more, which changes nothing.
-        with contextlib.suppress(FileNotFoundError, ValueError):
-            delivered: dict[Lane, int] = json.loads(self._delivered_file.read_bytes())
-            return delivered
-        return {}
+        """Returns how far each lane is delivered; what cannot be is delivered once more, which changes nothing."""
+        try:
+            said = json.loads(self._delivered_file.read_bytes())
+        except (FileNotFoundError, ValueError):
+            said = None
+        ends = said if isinstance(said, dict) else {}
+        return {lane: ends[lane] for lane in LANES if self._is_end_of_a_line(ends.get(lane))}
+
+    def _is_end_of_a_line(self, end: Any) -> bool:
+        if type(end) is not int or not 0 < end <= self.file.stat().st_size:
+            return False
+        with self.file.open("rb") as lines:
+            lines.seek(end - 1)
+            return lines.read(1) == b"\n"
+
+
+def now_ms() -> int:
+    """Returns the time as MLflow has it."""
+    return time.time_ns() // 1_000_000
 
 
 def file_of(folder: Path, run_id: str) -> Path:

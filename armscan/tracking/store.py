@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from filelock import FileLock
 from mlflow import MlflowClient
@@ -102,6 +103,13 @@ def _store(uri: str, wait_s: float, patience_s: float | None) -> TrackingStore:
     return TrackingStore(connect, uri, patience_s=patience_s, wait_s=wait_s)
 
 
+def absolute(uri: str) -> str:
+    """Returns the address of a store as it is understood from everywhere."""
+    if not uri.startswith(SQLITE_PREFIX):
+        return uri
+    return f"{SQLITE_PREFIX}{Path(uri.removeprefix(SQLITE_PREFIX)).absolute()}"
+
+
 def _address(uri: str) -> str:
     """Returns the address of a store with its driver and password."""
     if not uri.startswith("postgresql"):
@@ -113,6 +121,13 @@ def _check_texts(**values: object) -> None:
     for name, value in values.items():
         if not isinstance(value, str) or not value.strip() or value == SQLITE_PREFIX:
             raise TrackingError(f"tracking.{name} is {value!r}, but it must be a text such as {EXAMPLES[name]!r}")
+    uri = str(values.get("uri"))
+    try:
+        is_server = not uri.startswith("http") or (urlsplit(uri).port != 0 and bool(urlsplit(uri).hostname))
+    except ValueError:
+        is_server = False
+    if not is_server:
+        raise TrackingError(f"tracking.uri is {without_password(uri)!r}, but that is no address of a server")
 
 
 @contextmanager

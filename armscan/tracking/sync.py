@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from armscan.errors import FolderInUseError
+from armscan.errors import FolderInUseError, TrackingError
 from armscan.tracking.client import TrackingStore, reason_in
 from armscan.tracking.courier import deliver
 from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
-from armscan.tracking.spool import LANES, Spool, spool_files
+from armscan.tracking.spool import LANES, Address, Spool, now_ms, spool_files
+from armscan.tracking.store import absolute
 
 # Of a run: how it ended, as its spool says it.
 ENDED = ("FINISHED", "FAILED", "KILLED")
@@ -43,30 +45,47 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore]) -> list[Delivery]
 
     Returns:
         What became of each run that had something left.
-
-    Raises:
-        TrackingError: if what a run has left is damaged, or a store cannot be used.
     """
-    deliveries = []
+    deliveries: list[Delivery] = []
+    stores: dict[str, TrackingStore | TrackingError] = {}
     for file in spool_files(folder):
         try:
             spool = Spool(file, timeout_s=0.0)
-        except FolderInUseError:
-            deliveries.append(Delivery(file.parent.parent, None, 0, IN_USE))
+        except (FolderInUseError, TrackingError) as error:
+            left = IN_USE if isinstance(error, FolderInUseError) else str(error)
+            deliveries.append(Delivery(file.parent.parent, None, 0, left))
             continue
-        try:
-            if not spool.is_delivered:
-                deliveries.append(_delivered(spool, opened(spool.address.uri)))
-        finally:
-            spool.close()
+        with contextlib.closing(spool):
+            deliveries += _what_became_of(spool, opened, stores)
     return deliveries
+
+
+def _what_became_of(
+    spool: Spool, opened: Callable[[str], TrackingStore], stores: dict[str, TrackingStore | TrackingError]
+) -> list[Delivery]:
+    """Returns what became of a run's entries, nothing where none were left."""
+    run_id, uri = spool.address.run_id, spool.address.uri
+    try:
+        if spool.is_delivered:
+            return []
+        if uri not in stores:
+            try:
+                stores[uri] = opened(uri)
+            except TrackingError as error:
+                # Not to be waited for again with the next run.
+                stores[uri] = error
+        if isinstance(store := stores[uri], TrackingError):
+            raise store
+    except TrackingError as error:
+        return [Delivery(spool.folder, run_id, 0, str(error))]
+    return [_delivered(spool, store)]
 
 
 def _delivered(spool: Spool, store: TrackingStore) -> Delivery:
     n_entries, left = 0, None
     for lane in LANES:
         try:
-            n_entries += deliver(spool, store.mlflow, lane)
+            n_entries += deliver(spool, store.mlflow, lane, is_whole=False)
         # Whatever a store raises: what it does not take stays there, and the next lane may be taken.
         except Exception as error:
             left = reason_in(error)
@@ -94,3 +113,19 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
         if not is_ended:
             run = TrackedRun.joined(store, run_id, name=run_id, folder=file.parent.parent)
             run.end("FAILED", reason=reason, wait_s=SHORT_WAIT_S)
+
+
+def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
+    """Notes how a run has ended, for `sync` to deliver, without asking its store.
+
+    Args:
+        folder: of the run.
+        run_id: of the run.
+        uri: of its store.
+        status: as MLflow calls it.
+        tags: to set.
+    """
+    with contextlib.closing(Spool.begin(folder, Address(run_id, absolute(uri)))) as spool:
+        if tags:
+            spool.add(tags=dict(tags))
+        spool.add(status=(status, now_ms()))

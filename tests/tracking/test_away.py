@@ -13,7 +13,7 @@ from mlflow import MlflowClient
 
 from armscan.errors import TrackingAwayError, TrackingError
 from armscan.track import main as track
-from armscan.tracking import TrackedRun, abandon, open_store, sync
+from armscan.tracking import TrackedRun, abandon, note_end, open_store, sync
 from armscan.tracking import courier as courier_module
 from armscan.tracking.client import reason_in, why_away
 from armscan.tracking.spool import file_of
@@ -103,8 +103,9 @@ def test_run_whose_server_never_comes_back_is_delivered_once_by_track_sync(serve
     try:
         assert not tracked.end("FINISHED")
         assert f"python -m armscan.track sync {tmp_path} delivers the rest" in capfd.readouterr().out
-        assert track(["sync", str(tmp_path)]) == 2
-        assert "this store cannot be used: Connection refused" in capfd.readouterr().err
+        assert track(["sync", str(tmp_path)]) == 1
+        assert "the rest is left: tracking.uri is 'http://" in (told := capfd.readouterr().out)
+        assert "this store cannot be used: Connection refused" in told
     finally:
         server.start()
     assert MlflowClient(server.uri).get_run(tracked.run_id).info.status == "RUNNING"
@@ -154,7 +155,7 @@ def test_store_is_waited_for_where_somebody_has_patience(server, capfd):
     server.stop()
     with pytest.raises(TrackingError, match="this store cannot be used: Connection refused"):
         open_store(server.uri, experiment="test", artifacts="-", wait_s=1.0)
-    with pytest.raises(TrackingAwayError, match=r"has been away for 0\.00\d+ minutes: Connection refused"):
+    with pytest.raises(TrackingAwayError, match=r"has been away for 0\.1 s: Connection refused"):
         open_store(server.uri, experiment="test", artifacts="-", wait_s=1.0, patience_s=0.1)
     back = threading.Timer(1.0, server.start)
     back.start()
@@ -242,6 +243,53 @@ def test_runs_of_a_dead_process_are_ended_and_those_of_a_living_one_are_not(open
     assert client.get_run(alive.run_id).info.status == "RUNNING"
     assert [delivery.left for delivery in sync(tmp_path, lambda _: store)] == ["it is still going on"]
     alive.end("FINISHED")
+
+
+def test_sync_goes_on_after_what_it_cannot_deliver(opened, server, tmp_path, capfd):
+    store, _ = opened
+    runs = [begun(opened, tmp_path / name) for name in ("damaged", "elsewhere", "whole")]
+    for run in runs:
+        run._courier.finish(60.0)
+        run.log_files(tmp_path / run._spool.folder / "best.pt")
+        run.log_figures({"x": 1.0}, n_env_steps=7)
+        run._spool.close()
+    with runs[0]._spool.file.open("ab") as file:
+        file.write(b"nonsense\n")
+    (tmp_path / "whole" / "best.pt").write_text("weights")
+    assert track(["sync", str(tmp_path)]) == 1
+    told = capfd.readouterr().out
+    assert "a line of it is damaged: b'nonsense" in told
+    assert f"the rest is left: {tmp_path}/elsewhere/best.pt is not there" in told
+    assert histories(server.uri, runs[2].run_id) == {"x": [(7, 1.0)]}
+    # What was copied without its files is not taken for delivered: these may come yet.
+    (tmp_path / "elsewhere" / "best.pt").write_text("weights")
+    assert [delivery.left for delivery in sync(tmp_path / "elsewhere", lambda _: store)] == [None]
+    files = MlflowClient(server.uri).list_artifacts(runs[1].run_id)
+    assert [file.path for file in files] == ["best.pt"]
+
+
+def test_end_of_a_run_is_noted_without_its_store(opened, server, tmp_path):
+    store, experiment_id = opened
+    run_id = store.create_run(experiment_id, name="parent", tags={}).info.run_id
+    note_end(tmp_path, run_id, server.uri, "FAILED", {"failure.0": "no luck"})
+    assert track(["sync", str(tmp_path)]) == 0
+    run = MlflowClient(server.uri).get_run(run_id)
+    assert (run.info.status, run.data.tags["failure.0"]) == ("FAILED", "no luck")
+
+
+def test_run_that_cannot_be_made_is_answered_in_one_line(server, opened, tmp_path):
+    server.stop()
+    try:
+        with pytest.raises(TrackingAwayError, match=r"tracking.uri is 'http://.*cannot be used: Connection refused"):
+            begun(opened, tmp_path)
+    finally:
+        server.start()
+
+
+@pytest.mark.parametrize("uri", ["http://[bad", "http://host:port", "http://"])
+def test_address_that_is_none_is_answered_at_once(uri):
+    with pytest.raises(TrackingError, match="but that is no address of a server"):
+        open_store(uri, experiment="test", artifacts="-", wait_s=1.0)
 
 
 @pytest.mark.parametrize("words", [[], ["sync"], ["sink", "."], ["sync", "nowhere"], ["sync", ".", "other=3"]])

@@ -83,9 +83,13 @@ def test_spool_names_a_file_that_does_not_say_what_it_is_of(tmp_path, contents):
     Spool(file, timeout_s=0.0).close()
 
 
-def test_spool_delivers_all_again_where_nobody_knows_what_was_delivered(spool, tmp_path):
+@pytest.mark.parametrize(
+    "said",
+    ["{", "[]", "5", *(f'{{"figures": {end}, "files": {end}}}' for end in ("99999999", "-5", '"x"', "7", "true"))],
+)
+def test_spool_delivers_all_again_where_nobody_knows_what_was_delivered(spool, tmp_path, said):
     spool.mark("figures", spool.next_entries("figures", 10)[1])
-    spool.file.with_suffix(".delivered.json").write_text("{")
+    spool.file.with_suffix(".delivered.json").write_text(said)
     spool.close()
     again = Spool.begin(tmp_path, ADDRESS)
     assert kinds(again.next_entries("figures", 10)[0]) == ["address"]
