@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
+from unittest import mock
 
 import optuna
 from omegaconf import DictConfig, OmegaConf
@@ -133,11 +134,8 @@ def round_trips_counted() -> Iterator[dict[int, int]]:
         counts[here] = counts.get(here, 0) + 1
         return through(patience, operate)
 
-    Patience.through = counted  # type: ignore[method-assign]
-    try:
+    with mock.patch.object(Patience, "through", counted):
         yield counts
-    finally:
-        Patience.through = through  # type: ignore[method-assign]
 
 
 def work(phase: Phase, name: str) -> None:

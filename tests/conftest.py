@@ -108,12 +108,20 @@ def unseen_windows():
 
 
 @pytest.fixture(scope="session")
-def postgres():
-    """A server for all tests of this process."""
-    from tests.postgres import postgres_server, programs
+def postgres_programs():
+    """The folder of PostgreSQL's programs, which tests that start a server of their own need, too."""
+    from tests.postgres import programs
 
-    if programs() is None:
+    if (folder := programs()) is None:
         pytest.skip("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def postgres(postgres_programs):
+    """A server for all tests of this process."""
+    from tests.postgres import postgres_server
+
     with postgres_server() as server:
         yield server
 

@@ -101,6 +101,9 @@ class Attempt:
         """Notes the figures of a seed that has been run to its end."""
         self._of_seeds = self._of_seeds | {str(seed): dict(figures)}
         self.notes.add(partial(self.trial.set_user_attr, SEEDS, self._of_seeds))
+        if any(each not in self.seeds_done for each in self.seeds):
+            # The next report may be long in coming, and whoever takes the trial up then need not train this one again.
+            self.notes.written_with(self.together, lambda: True)
 
     def report(self, figures: Mapping[str, float], *, seed: int, n_env_steps: int, grid: int, total: int) -> None:
         """Reports how a training is going.

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import optuna
 from omegaconf import DictConfig
-from scipy.stats import trim_mean
 
 from armscan.agents import Learner
 from armscan.building import build, check_keys
@@ -23,6 +22,7 @@ from armscan.patience import PATIENCE_S
 from armscan.settings import plain
 from armscan.stage import Stage
 from armscan.sweeps.attempt import Attempt
+from armscan.sweeps.figures import interquartile_mean
 from armscan.sweeps.tally import ENV_STEPS
 from armscan.sweeps.tasks import VolumesInMemory
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
@@ -31,17 +31,10 @@ from armscan.training import TEST, EpochReport, Evaluation, TrainingResult, film
 
 # Of each training, beside the figures of its best validation.
 TRAINING_FIGURES = (ENV_STEPS, "training_s", "solved")
-# What is cut from each end of the sorted values in an interquartile mean.
-QUARTER = 0.25
 RUN_FILE, FILM_FILE = "run.json", "episode.gif"
 # What a training leaves that is worth having in the tracking store.
 KEPT = (".pt", ".png", ".gif", ".json")
 Conclude = Callable[[Stage, TrainingResult, Path], dict[str, float]]
-
-
-def interquartile_mean(values: Sequence[float]) -> float:
-    """Returns the mean without the lowest and the highest quarter; of fewer than four values their mean."""
-    return float(trim_mean(values, QUARTER))
 
 
 @dataclass

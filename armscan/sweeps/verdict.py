@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
+from scipy.stats import bootstrap
 
+from armscan.sweeps.figures import interquartile_mean
 from armscan.sweeps.tally import FIGURES, JUDGED
 
 N_RESAMPLES = 2000
@@ -75,28 +76,18 @@ def _scores(name: str, of_seeds: Sequence[Mapping[str, float]]) -> NDArray[np.fl
 
 
 def _interval(name: str, scores: NDArray[np.float64], seed: int) -> tuple[float, float, float]:
-    # Deferred: it takes a second, and only who judges needs it.
-    from rliable import library, metrics
-
-    mean = metrics.aggregate_mean if "success_rate" in name else metrics.aggregate_iqm
+    mean = np.mean if "success_rate" in name else interquartile_mean
+    value = float(mean(scores))
     if len(scores) < 2 or np.isnan(scores).any():
-        return float(mean(scores)), float("nan"), float("nan")
-    with _numpy_seeded(seed):
-        points, ends = library.get_interval_estimates(
-            {"it": scores}, lambda each: np.array([mean(each)]), reps=N_RESAMPLES
-        )
-    return float(points["it"][0]), float(ends["it"][0, 0]), float(ends["it"][1, 0])
-
-
-@contextmanager
-def _numpy_seeded(seed: int) -> Iterator[None]:
-    """Seeds NumPy's global generator, and gives it back as it was.
-
-    rliable's bootstrap draws from that one, whatever `random_state` it is given (seen in 1.2.0).
-    """
-    before = np.random.get_state()  # noqa: NPY002
-    np.random.seed(seed)  # noqa: NPY002
-    try:
-        yield
-    finally:
-        np.random.set_state(before)  # noqa: NPY002
+        return value, float("nan"), float("nan")
+    # The seeds are drawn of each volume by itself.
+    resampled = bootstrap(
+        tuple(scores.T),
+        lambda *of_volumes: mean(np.array(of_volumes)),
+        n_resamples=N_RESAMPLES,
+        method="percentile",
+        vectorized=False,
+        rng=np.random.default_rng(seed),
+    )
+    low, high = resampled.confidence_interval
+    return value, float(low), float(high)

@@ -5,7 +5,7 @@ import pytest
 from armscan.passwords import STORAGE_PASSWORD
 from tests.cluster.studies import REPOSITORY, TRAINING, WAITING
 from tests.mlflow_server import mlflow_server
-from tests.postgres import PASSWORD, postgres_server, programs
+from tests.postgres import PASSWORD, postgres_server
 from tests.ray_cluster import ray_cluster, why_not_here
 
 
@@ -22,9 +22,7 @@ def cluster():
 
 
 @pytest.fixture(scope="module")
-def postgres(cluster):
-    if programs() is None:
-        pytest.skip("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
+def postgres(postgres_programs, cluster):
     with postgres_server(cluster.head.address) as server:
         yield server
 

@@ -18,7 +18,7 @@ from mlflow import MlflowClient
 from armscan.sweeps.supervising import LEFT
 from tests.docker.containers import Containers
 from tests.docker.files import FOLDER
-from tests.postgres import PASSWORD, postgres_server, programs
+from tests.postgres import PASSWORD, postgres_server
 
 # Trials that only wait, between one and five seconds, and of which only one key is searched.
 TRIALS = (
@@ -30,18 +30,16 @@ MOST_CONNECTIONS = 6
 
 
 @pytest.fixture
-def postgres_there():
+def postgres_there(postgres_programs):
     """A server of this test's own."""
-    if programs() is None:
-        pytest.skip("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
     with postgres_server() as server:
         yield server
 
 
 @pytest.fixture
-def containers(postgres_there, tmp_path):
+def containers(postgres_programs, postgres_there, tmp_path):
     """The services on this machine; of them PostgreSQL is there, as its image leaves it at its first start."""
-    services = Containers(tmp_path, postgres_there.port, programs(), PASSWORD, ARMSCAN_WORDS=TRIALS)
+    services = Containers(tmp_path, postgres_there.port, postgres_programs, PASSWORD, ARMSCAN_WORDS=TRIALS)
     postgres_there.execute(f"CREATE DATABASE {services.services['postgres']['environment']['POSTGRES_DB']}")
     postgres_there.execute((FOLDER / "databases.sql").read_text())
     try:
@@ -93,11 +91,11 @@ def wait_for(come_true, within_s=60.0):
         time.sleep(0.1)
 
 
-def test_postgres_understands_its_words_and_says_when_it_is_away(containers, postgres_there):
+def test_postgres_understands_its_words_and_says_when_it_is_away(containers, postgres_there, postgres_programs):
     words = shlex.split(containers.services["postgres"]["command"])
     (data,) = selected(postgres_there, "SHOW data_directory")
     # What it would have with these words, said without a start.
-    asking = [programs() / words[0], "-C", "max_connections", *words[1:], "-D", data]
+    asking = [postgres_programs / words[0], "-C", "max_connections", *words[1:], "-D", data]
     said = subprocess.run(asking, capture_output=True, text=True, check=True)
     assert int(said.stdout) >= 300
     assert containers.is_healthy("postgres")

@@ -14,7 +14,7 @@ from mlflow import MlflowClient
 from armscan.sweeps.storage import open_storage
 from armscan.sweeps.tally import RETRY_OF
 from tests.mlflow_server import mlflow_server
-from tests.postgres import postgres_server, programs
+from tests.postgres import postgres_server
 
 REPOSITORY = Path(__file__).parents[2]
 # A real, short training with a report after each of its epochs: four seconds and more of them.
@@ -26,10 +26,8 @@ TRAINING = [
 
 
 @pytest.fixture
-def services(tmp_path):
+def services(postgres_programs, tmp_path):
     """A PostgreSQL server, and an MLflow server that keeps its runs in another."""
-    if programs() is None:
-        pytest.skip("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
     with (
         postgres_server() as postgres,
         postgres_server() as of_runs,
