@@ -24,6 +24,13 @@ LOCK_FILE = ".lock"
 # The folder of what is to be tracked, in that of a run.
 SPOOLS = "tracking"
 UNFINISHED = "unfinished"
+# How the address of a database in a file begins.
+SQLITE_PREFIX = "sqlite:///"
+
+
+def sqlite_file(uri: str) -> Path:
+    """Returns the file of a database, as it is understood from everywhere."""
+    return Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:

@@ -7,12 +7,12 @@ from pathlib import Path
 from urllib.parse import quote, urlsplit
 
 from armscan.errors import TrackingError
+from armscan.files import SQLITE_PREFIX, sqlite_file
 from armscan.passwords import STORAGE_PASSWORD, TRACKING_PASSWORD, database_url, without_password
 from armscan.servers import HOST, Server, is_answered
 
 # Where the notes of trials say that MLflow's UI is (`armscan.sweeps.dashboard`), where runs are kept by no server.
 USUAL_UI = f"http://{HOST}:5000"
-SQLITE_PREFIX = "sqlite:///"
 # Of the tables of MLflow.
 A_TABLE = "experiments"
 MAX_REASON_CHARS = 300
@@ -131,7 +131,7 @@ def _has_runs(uri: str) -> bool:
         raise TrackingError(
             f"tracking is {shown!r}, but it must be sqlite:///FILE, postgresql://... or the address of an MLflow server"
         )
-    if uri.startswith(SQLITE_PREFIX) and not Path(uri.removeprefix(SQLITE_PREFIX)).is_file():
+    if uri.startswith(SQLITE_PREFIX) and not sqlite_file(uri).is_file():
         return False
     try:
         return A_TABLE in tables_in(database_url(uri, TRACKING_PASSWORD))

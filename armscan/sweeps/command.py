@@ -40,7 +40,6 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     settings, task, config = read_settings(given.of_trials)
     for key, uri in ((STORAGE, settings.storage), (TRACKING_URI, config.tracking.uri)):
         check_written(key, uri)
-    given = given.with_services({STORAGE: settings.storage, TRACKING_URI: config.tracking.uri})
     launcher = composed(given.launching)[1][LAUNCHER]
     if launcher in ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,9 +12,8 @@ from hydra.core.override_parser.types import Override, QuotedString
 
 from armscan.errors import InvalidValueError
 from armscan.launchers import LAUNCHER
-from armscan.settings import CLUSTER, MULTIRUN, PLAN, RESUME, SWEEPS
+from armscan.settings import MULTIRUN, PLAN, RESUME, SWEEPS
 from armscan.sweeps.describing import NOT_SEARCHED
-from armscan.sweeps.values import written
 
 STUDY = "study"
 USUAL_LAUNCHER = "submitit_local"
@@ -58,21 +57,6 @@ class CommandLine:
         _check_single_values(overrides)
         _check_search_path(overrides)
         return cls(own, PLAN in options)
-
-    def with_services(self, addresses: Mapping[str, str]) -> Self:
-        """Returns the same with these addresses instead of what has said them.
-
-        Args:
-            addresses: without passwords, by `study.storage` and `tracking.uri`; workers need not find them out.
-        """
-        said = {word: word.lstrip("+").partition("=")[0] for word in self.words}
-        if CLUSTER in said.values():
-            given = addresses
-        else:
-            fixed = fixed_by(self.words)
-            given = {key: uri for key, uri in addresses.items() if fixed.get(key, uri) != uri}
-        others = (word for word, key in said.items() if key not in (CLUSTER, *given))
-        return replace(self, words=(*others, *(f"{key}={written(uri)}" for key, uri in given.items())))
 
     @property
     def launching(self) -> list[str]:

@@ -16,12 +16,12 @@ from optuna.storages import BaseStorage, JournalStorage
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.errors import StudyError
+from armscan.files import SQLITE_PREFIX, sqlite_file
 from armscan.passwords import masked, without_password
 from armscan.sweeps.database import DatabaseStorage, open_database, tables_in, url_of
 from armscan.sweeps.journal import open_journal, read_journal
 
 T = TypeVar("T")
-SQLITE_PREFIX = "sqlite:///"
 MAX_REASON_CHARS = 300
 # Of the tables of Optuna.
 A_TABLE, OTHER_TABLES = "studies", ("trials", "version_info")
@@ -133,7 +133,7 @@ def _open_database(uri: str, where: str, *, is_patient: bool) -> Storage:
     with _refused_in_one_line(uri, where):
         if not uri.startswith(SQLITE_PREFIX):
             return _in_database(uri, is_patient=is_patient)
-        file = _file_of(uri)
+        file = sqlite_file(uri)
         file.parent.mkdir(parents=True, exist_ok=True)
         # A lock that cannot be made would be waited for for ever.
         _lock_file_of(file).touch()
@@ -145,7 +145,7 @@ def _open_database(uri: str, where: str, *, is_patient: bool) -> Storage:
 
 def _existing_database(uri: str, where: str) -> Storage | None:
     with _refused_in_one_line(uri, where):
-        if uri.startswith(SQLITE_PREFIX) and not _is_there(_file_of(uri), where):
+        if uri.startswith(SQLITE_PREFIX) and not _is_there(sqlite_file(uri), where):
             return None
         _check_is_for_studies(uri)
         return _in_database(uri, is_made=False) if A_TABLE in tables_in(url_of(uri)) else None
@@ -162,13 +162,9 @@ def _in_database(uri: str, *, is_patient: bool = False, is_made: bool = True) ->
     logging.getLogger("alembic").setLevel(logging.WARNING)
     shown, lock_file = without_password(uri), None
     if uri.startswith(SQLITE_PREFIX):
-        lock_file = _lock_file_of(_file_of(uri))
-        uri = f"{SQLITE_PREFIX}{_file_of(uri)}"
+        lock_file = _lock_file_of(sqlite_file(uri))
+        uri = f"{SQLITE_PREFIX}{sqlite_file(uri)}"
     return Storage(shown, open_database(url_of(uri), shown, is_patient=is_patient, is_made=is_made), lock_file)
-
-
-def _file_of(uri: str) -> Path:
-    return Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
 
 
 def _lock_file_of(file: Path) -> Path:

@@ -96,8 +96,8 @@ def here() -> Path:
 def local_workers(folder: Path) -> list[Process]:
     """Returns the workers of a start that are at work on this machine."""
     workers = [Process.read(file) for file in folder.glob(WORKER_FILES)]
-    here = socket.gethostname()
-    return [each for each in workers if each.host == here and process_start(each.pid) == each.started]
+    host = socket.gethostname()
+    return [each for each in workers if each.host == host and process_start(each.pid) == each.started]
 
 
 def run_worker(config: DictConfig, words: Sequence[str], folder: Path) -> None:

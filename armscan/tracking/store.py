@@ -18,6 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.checks import check_float
 from armscan.errors import TrackingError
+from armscan.files import SQLITE_PREFIX, sqlite_file
 from armscan.passwords import (
     SERVER_PASSWORD,
     TRACKING_PASSWORD,
@@ -28,7 +29,6 @@ from armscan.passwords import (
 )
 from armscan.tracking.client import TrackingStore, reason_in
 
-SQLITE_PREFIX = "sqlite:///"
 EXAMPLES = {"uri": "sqlite:///mlruns.db", "experiment": "armscan", "artifacts": "mlartifacts"}
 LOCK_TIMEOUT_S = 120
 # Where there is no configuration that says it.
@@ -63,6 +63,7 @@ def open_store(
         TrackingError: if the store cannot be reached or used.
     """
     _check_texts(uri=uri, experiment=experiment, artifacts=artifacts)
+    _check_address(uri)
     check_float("tracking.wait_s", wait_s, at_least=0.0)
     shown = hand_over_tracking(uri)
     with usable_store(shown):
@@ -70,7 +71,7 @@ def open_store(
             store = _store(shown, wait_s, patience_s)
             return store, _experiment_in(store, experiment, None if shown.startswith("http") else artifacts)
         # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
-        database = Path(shown.removeprefix(SQLITE_PREFIX)).absolute()
+        database = sqlite_file(shown)
         database.parent.mkdir(parents=True, exist_ok=True)
         # MLflow would try for minutes to open what cannot be opened, and the lock for ever to be made.
         database.open("ab").close()
@@ -86,9 +87,10 @@ def open_existing_store(uri: str) -> TrackingStore:
         TrackingError: if there is none, or it cannot be used.
     """
     _check_texts(uri=uri)
+    _check_address(uri)
     uri = hand_over_tracking(uri)
     if uri.startswith(SQLITE_PREFIX):
-        database = Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
+        database = sqlite_file(uri)
         if not database.is_file():
             raise TrackingError(f"tracking.uri is {uri!r}, but there is no {database}; give the one that the run is in")
         uri = f"{SQLITE_PREFIX}{database}"
@@ -105,9 +107,7 @@ def _store(uri: str, wait_s: float, patience_s: float | None) -> TrackingStore:
 
 def absolute(uri: str) -> str:
     """Returns the address of a store as it is understood from everywhere."""
-    if not uri.startswith(SQLITE_PREFIX):
-        return uri
-    return f"{SQLITE_PREFIX}{Path(uri.removeprefix(SQLITE_PREFIX)).absolute()}"
+    return f"{SQLITE_PREFIX}{sqlite_file(uri)}" if uri.startswith(SQLITE_PREFIX) else uri
 
 
 def _address(uri: str) -> str:
@@ -121,7 +121,9 @@ def _check_texts(**values: object) -> None:
     for name, value in values.items():
         if not isinstance(value, str) or not value.strip() or value == SQLITE_PREFIX:
             raise TrackingError(f"tracking.{name} is {value!r}, but it must be a text such as {EXAMPLES[name]!r}")
-    uri = str(values.get("uri"))
+
+
+def _check_address(uri: str) -> None:
     try:
         is_server = not uri.startswith("http") or (urlsplit(uri).port != 0 and bool(urlsplit(uri).hostname))
     except ValueError:

@@ -105,14 +105,14 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
     for file in spool_files(folder):
         try:
             spool = Spool(file, timeout_s=0.0)
-        # Its process is alive, or another has just taken it over.
-        except (FolderInUseError, FileNotFoundError):
+            is_ended = spool.status in ENDED
+        # Its process is alive, another has just taken it over, or it is damaged, which whoever delivers it is told.
+        except (FolderInUseError, FileNotFoundError, TrackingError):
             continue
-        is_ended, run_id = spool.status in ENDED, spool.address.run_id
-        spool.close()
-        if not is_ended:
-            run = TrackedRun.joined(store, run_id, name=run_id, folder=file.parent.parent)
-            run.end("FAILED", reason=reason, wait_s=SHORT_WAIT_S)
+        if is_ended:
+            spool.close()
+        else:
+            TrackedRun(store, spool, name=spool.address.run_id).end("FAILED", reason=reason, wait_s=SHORT_WAIT_S)
 
 
 def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
