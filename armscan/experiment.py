@@ -25,6 +25,8 @@ from armscan.console import print_results, print_where_to_look, progress_reporte
 from armscan.files import (
     BEST_CHECKPOINT,
     CONFIG_FILE,
+    DIFF_FILE,
+    ENVIRONMENT_FILE,
     LAST_CHECKPOINT,
     SUM_TAGS,
     VOLUMES_FILE,
@@ -36,7 +38,7 @@ from armscan.invocation import Invocation
 from armscan.multirun import JOB_TAG
 from armscan.settings import evaluate_command, plain, resume_command
 from armscan.stage import Stage
-from armscan.tracking import FAMILIAR_TAG, TrackedRun, open_store
+from armscan.tracking import FAMILIAR_TAG, TrackedRun, environment_file, environment_tags, open_store, source, tags_of
 from armscan.training import (
     TEST,
     TRAINING,
@@ -45,14 +47,15 @@ from armscan.training import (
     EpochReport,
     Evaluation,
     Familiar,
-    Split,
+    Fingerprints,
     TrainingResult,
     evaluate,
     film_episode,
     train,
 )
 
-MAX_TAG_CHARS = 5000
+# Of a volume's fingerprint in a tag; the whole stands in a file.
+N_PRINT_CHARS = 16
 CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")
 # First seeds of the episodes that are played for each purpose, so that none is played for two.
 VALIDATION_SEED, TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED, FILM_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
@@ -96,14 +99,17 @@ def start_tracking(
         name=run_name(resolved, choices),
         config=resolved,
         tags={
+            **environment_tags(),
+            "command": invocation.command,
+            "seed": str(resolved["seed"]),
             "overrides": " ".join(invocation.overrides),
             **{f"choice.{group}": choices[group] for group in CHOICES_IN_TAGS},
-            **volume_tags(stage.experiment.split),
+            **volume_tags(stage.fingerprints),
             # Where it is applied to other volumes, later, the agent must see what it has learned to see.
             FAMILIAR_TAG: Familiar.of(stage.training_env, stage.experiment.smallest_slice_px).to_json(),
             **place_tags(invocation.folder),
             "working_folder": str(Path.cwd()),
-            **{SUM_TAGS[name]: sum_of(contents) for name, contents in files.items()},
+            **{SUM_TAGS[name]: sum_of(files[name]) for name in SUM_TAGS},
             **({JOB_TAG: str(job.number)} if job else {}),
         },
         folder=invocation.folder,
@@ -114,16 +120,22 @@ def start_tracking(
 
 
 def started_with(config: dict[str, Any], stage: Stage) -> dict[str, bytes]:
-    """Returns the files that say what a run was started with, by their names: its configuration and its volumes."""
+    """Returns the files that say what a run was started with, by their names: its configuration, its volumes, its code."""
+    diff = source().diff
     return {
         CONFIG_FILE: yaml.safe_dump(config, sort_keys=False).encode(),
         VOLUMES_FILE: json.dumps(stage.fingerprints, indent=1).encode(),
+        ENVIRONMENT_FILE: environment_file(),
+        **({} if diff is None else {DIFF_FILE: diff}),
     }
 
 
-def volume_tags(split: Split) -> dict[str, str]:
-    """Returns the names of the volumes, as tags of a run."""
-    return {f"volumes.{part}": " ".join(volumes)[:MAX_TAG_CHARS] for part, volumes in split.parts.items()}
+def volume_tags(prints: Fingerprints) -> dict[str, str]:
+    """Returns the names of the volumes, each with the beginning of its fingerprint, as tags of a run."""
+    named = {
+        part: (f"{name}:{each[:N_PRINT_CHARS]}" for name, each in volumes.items()) for part, volumes in prints.items()
+    }
+    return tags_of({f"volumes.{part}": " ".join(names) for part, names in named.items()}, whole_in=VOLUMES_FILE)
 
 
 def place_tags(folder: Path) -> dict[str, str]:

@@ -18,6 +18,8 @@ from armscan.errors import FolderInUseError
 # What training keeps in the folder of its run, what the run was started with, and who is at work in it.
 BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
 CONFIG_FILE, VOLUMES_FILE = "config.yaml", "volumes.json"
+# The code as it differed from its commit, and the versions of all that it was run with.
+DIFF_FILE, ENVIRONMENT_FILE = "code.diff", "environment.json"
 # The tags of a run that hold the sums of what it was started with.
 SUM_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
 LOCK_FILE = ".lock"

@@ -9,6 +9,7 @@ from typing import Self
 from hydra.core.hydra_config import HydraConfig
 
 from armscan.multirun import Job
+from armscan.settings import run_command
 
 
 @dataclass(frozen=True)
@@ -18,12 +19,14 @@ class Invocation:
     Args:
         folder: where it leaves its files.
         overrides: of the command line.
+        command: that line.
         choices: what was chosen of each configuration group.
         job: which one of a multirun it is, None for a single run.
     """
 
     folder: Path
     overrides: list[str]
+    command: str
     choices: dict[str, str]
     job: Job | None
 
@@ -34,6 +37,8 @@ class Invocation:
         return cls(
             folder=Path(hydra_config.runtime.output_dir),
             overrides=list(hydra_config.overrides.task),
+            # Of a job: that which repeats it alone.
+            command=run_command(hydra_config.overrides.task),
             choices={str(group): str(choice) for group, choice in hydra_config.runtime.choices.items()},
             job=Job.current(),
         )

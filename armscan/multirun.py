@@ -30,7 +30,6 @@ PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
 # Of a job's run: its number.
 JOB_TAG = "job"
-MAX_TAG_CHARS = 5000
 NO_OUTCOME, INTERRUPTED = "ended without a word", "interrupted"
 
 
@@ -222,7 +221,7 @@ def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Ma
     """
     from armscan.tracking import note_end, open_store, sync
 
-    tags = {f"failure.{number}": f"{each.varied}: {each.failure}"[:MAX_TAG_CHARS] for number, each in failed.items()}
+    tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
     note_end(folder, word["run_id"], word["tracking"]["uri"], status, tags)
     store, experiment_id = open_store(**word["tracking"], patience_s=word["tracking"]["wait_s"])
     # With what jobs have left because the store was away.

@@ -80,9 +80,9 @@ def go_on(client: TrackingStore, run_id: str, *, job_label: str | None = None) -
         print(f"preparing to go on with {run.info.run_name}, run {run_id}", flush=True)
         stage = Stage.built(config)
         _check_volumes(run, folder, stage.fingerprints)
-        agent, split = stage.experiment.agent, stage.experiment.split
+        agent = stage.experiment.agent
         earlier = take_up(agent, folder, stage.origin(run_id)) if isinstance(agent, Learner) else []
-        tags = volume_tags(split) | place_tags(folder)
+        tags = volume_tags(stage.fingerprints) | place_tags(folder)
         tracked = TrackedRun.go_on(client, run_id, folder=folder, config=plain(config), tags=tags)
         return carry_out(stage, tracked, folder, client.uri, job_label=job_label, earlier=earlier)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterable
 from importlib import resources
 from typing import Any, cast
 
@@ -49,6 +50,11 @@ def usual_tracking() -> dict[str, Any]:
 def usual_storage() -> str:
     """Returns where studies are kept where nobody says anything else; without a password."""
     return address_of(STORAGE, "optuna.journal")
+
+
+def run_command(words: Iterable[str]) -> str:
+    """Returns what one types to run what words describe."""
+    return shlex.join(["python", "-m", "armscan.run", *words])
 
 
 def resume_command(run_id: str, tracking_uri: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from tianshou.highlevel.logger import LoggerFactory
 from tianshou.utils.logger.logger_base import BaseLogger
 
 
@@ -80,3 +81,20 @@ class EpochMetrics(BaseLogger):
     def restore_logged_data(log_path: str) -> dict[str, Any]:
         """Has nothing to restore."""
         return {}
+
+
+class EpochMetricsFactory(LoggerFactory):
+    """Gives a Tianshou experiment the logger whose figures a learner hands on: to training, and so to tracking.
+
+    Tianshou's own loggers write to TensorBoard or elsewhere at every gradient step, while training waits.
+    """
+
+    def create_logger(
+        self, log_dir: str, experiment_name: str, run_id: str | None, config_dict: dict[str, Any] | None = None
+    ) -> EpochMetrics:
+        """Returns a logger that has gathered nothing yet; the arguments are for those that write."""
+        return EpochMetrics()
+
+    def get_logger_class(self) -> type[EpochMetrics]:
+        """Returns the class of the logger."""
+        return EpochMetrics

@@ -9,6 +9,7 @@ from tianshou.highlevel.experiment import PPOExperimentBuilder
 from tianshou.highlevel.params.algorithm_params import PPOParams
 
 from armscan.agents.budget import check_batch, check_collection
+from armscan.agents.epoch_metrics import EpochMetricsFactory
 from armscan.agents.image_replay import replay_for
 from armscan.agents.networks import Spread
 from armscan.agents.parameters import PolicyParameters, number
@@ -86,6 +87,7 @@ class PPO(PolicyParameters):
                 batch_size=self.batch_size,
             ),
         )
+        builder.with_logger_factory(EpochMetricsFactory())
         builder.with_ppo_params(
             PPOParams(
                 lr=self.lr,

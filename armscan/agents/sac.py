@@ -11,6 +11,7 @@ from tianshou.highlevel.params.algorithm_params import SACParams
 from tianshou.highlevel.params.alpha import AutoAlphaFactoryDefault
 
 from armscan.agents.budget import check_batch, check_collection, check_updates, kept_at_most, rounded_up
+from armscan.agents.epoch_metrics import EpochMetricsFactory
 from armscan.agents.image_replay import replay_for
 from armscan.agents.networks import Spread
 from armscan.agents.parameters import PolicyParameters, number
@@ -89,6 +90,7 @@ class SAC(PolicyParameters):
                 batch_size=self.batch_size,
             ),
         )
+        builder.with_logger_factory(EpochMetricsFactory())
         builder.with_sac_params(
             SACParams(
                 deterministic_eval=not self.judged_by_sampling,

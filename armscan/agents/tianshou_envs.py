@@ -27,6 +27,10 @@ class SideBySide(BaseVectorEnv):
 
     Args:
         envs: steps all environments at once.
+
+    Attributes:
+        n_ended: episodes that have ended since somebody set it to 0.
+        n_successes: those among them that ended on a rewarded plane.
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
@@ -35,6 +39,7 @@ class SideBySide(BaseVectorEnv):
         self.is_closed = False
         self._envs = envs
         self._seeds: list[int | None] | None = None
+        self.n_ended = self.n_successes = 0
         self._action_spaces = [deepcopy(envs.single_action_space) for _ in range(envs.num_envs)]
 
     def get_env_attr(self, key: str, id: Ids = None) -> list[Any]:  # noqa: A002 - Tianshou's name
@@ -55,6 +60,9 @@ class SideBySide(BaseVectorEnv):
         """Takes a step in all environments."""
         assert id is None or len(np.atleast_1d(id)) == self.env_num, "the environments are only stepped all at once"
         observations, rewards, terminated, truncated, _ = self._envs.step(np.asarray(action))
+        # Nothing but success terminates an episode.
+        self.n_ended += int(np.count_nonzero(terminated | truncated))
+        self.n_successes += int(np.count_nonzero(terminated))
         return _batched(observations), rewards, terminated, truncated, self._no_info(np.arange(self.env_num))
 
     def seed(self, seed: int | list[int] | None = None) -> list[list[int] | None]:

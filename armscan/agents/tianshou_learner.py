@@ -17,6 +17,7 @@ from armscan.agents.parameters import lr_share
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
 from armscan.agents.steady_updates import SteadyTrainer
+from armscan.agents.tianshou_envs import SideBySide
 from armscan.envs.actions import ActionBounds
 from armscan.envs.task import Observed
 from armscan.errors import CheckpointError, DivergedError
@@ -51,12 +52,16 @@ class TianshouLearner:
         setup: AgentSetup,
     ) -> None:
         world = experiment.create_experiment_world()
-        self._metrics = EpochMetrics()
-        world.logger = self._metrics
+        # Tianshou asks for it by itself only where it keeps a folder of its own.
+        logger = experiment.logger_factory.create_logger(log_dir="", experiment_name=experiment.name, run_id=None)
+        assert isinstance(logger, EpochMetrics)
+        world.logger = self._metrics = logger
         world.test_collector = None
         assert world.training_collector is not None
         self._collector = world.training_collector
         self._collector.buffer = replay
+        assert isinstance(self._collector.env, SideBySide)
+        self._envs = self._collector.env
         trainer: Any = experiment.algorithm_factory.create_trainer(world, _NoPersistence())
         trainer.params.show_progress = False
         if isinstance(trainer, OffPolicyTrainer):
@@ -111,6 +116,8 @@ class TianshouLearner:
         metrics["speed/env_steps_per_s"] = (self.n_env_steps - n_before) / seconds
         metrics["speed/updates_per_s"] = metrics.pop("updates") / seconds
         metrics["replay_size"] = float(len(self._replay))
+        if (n_ended := self._envs.n_ended) > 0:
+            metrics["train/success_rate"] = self._envs.n_successes / n_ended
         return metrics
 
     def _begin_epoch(self) -> None:
@@ -121,7 +128,8 @@ class TianshouLearner:
         # Tianshou shuffles with NumPy's global generator.
         np.random.seed(for_numpy.generate_state(1))  # noqa: NPY002
         self._replay.seed(int(for_replay.generate_state(1)[0]))
-        self._collector.env.seed([int(word) for word in for_envs.generate_state(self._collector.env_num)])
+        self._envs.seed([int(word) for word in for_envs.generate_state(self._collector.env_num)])
+        self._envs.n_ended = self._envs.n_successes = 0
         self._collector.reset_env()
         share = lr_share(self._final_lr_share, self.n_env_steps, self._total_env_steps)
         for group, first_lr in zip(self._lr_groups(), self._first_lrs, strict=True):

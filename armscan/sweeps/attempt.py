@@ -37,6 +37,7 @@ class Attempt:
         trial: as it stands in the storage.
         chosen: its values by name.
         composed: its configuration, but for the seed, and what was chosen of each group.
+        command: that started the worker.
         seeds: it is run with, one after another.
         study_folder: of the study.
         run_id: of its tracked run.
@@ -52,6 +53,7 @@ class Attempt:
     trial: Trial
     chosen: Mapping[str, Value]
     composed: tuple[DictConfig, dict[str, str]]
+    command: str
     seeds: tuple[int, ...]
     study_folder: Path
     run_id: str

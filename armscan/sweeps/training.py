@@ -185,11 +185,12 @@ def _begun(
             stage = Stage.built(config)
         else:
             client, _ = open_store(**plain(config.tracking), patience_s=PATIENCE_S)
-            tags = volume_tags(stage.experiment.split) | place_tags(folder)
+            tags = volume_tags(stage.fingerprints) | place_tags(folder)
             tags["mlflow.parentRunId"] = attempt.run_id
             return stage, TrackedRun.go_on(client, run_id, folder=folder, config=plain(config), tags=tags), earlier
     job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
-    tracked = start_tracking(config, Invocation(folder, attempt.overrides, choices, job), stage, patience_s=PATIENCE_S)
+    invocation = Invocation(folder, attempt.overrides, attempt.command, choices, job)
+    tracked = start_tracking(config, invocation, stage, patience_s=PATIENCE_S)
     tracked.set_tags({"study": attempt.trial.study.study_name, "trial": str(attempt.trial.number)})
     write_whole(begun, lambda file: file.write(json.dumps({"run_id": tracked.run_id}).encode()))
     return stage, tracked, []

@@ -18,7 +18,7 @@ from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.files import CONFIG_FILE, SUM_TAGS
 from armscan.log import say
 from armscan.mistakes import mistake_in_one_line
-from armscan.settings import plain
+from armscan.settings import MULTIRUN, plain, run_command
 from armscan.sweeps.attempt import CONFIG_SUM, FOLDER, RUN, Attempt, composed, sum_of_config, trial_folder
 from armscan.sweeps.dashboard import note_run, show_picture
 from armscan.sweeps.figures import checked_figures
@@ -132,6 +132,7 @@ class Worker:
             trial=trial,
             chosen=chosen,
             composed=(config, choices),
+            command=run_command([MULTIRUN[0], *self._words]),
             seeds=phase.seeds_of(trial),
             study_folder=phase.folder,
             run_id=self._tracked.run_id,

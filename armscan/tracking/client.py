@@ -17,6 +17,7 @@ from sqlalchemy.exc import DBAPIError, OperationalError
 from armscan.errors import TrackingAwayError
 from armscan.passwords import masked
 from armscan.patience import Patience
+from armscan.tracking.limits import tags_of
 
 T = TypeVar("T")
 # What MLflow says of a store that it cannot reach, of one that fails, and of what is not there.
@@ -38,12 +39,19 @@ class TrackingStore:
         uri: of the store, as it may be shown.
         patience_s: how long it is waited for; None for not at all.
         wait_s: how long a run waits for it at its end.
+        system_metrics_s: seconds between two looks at the machine while a run trains; None for none.
     """
 
     def __init__(
-        self, connect: Callable[[], MlflowClient], uri: str, *, patience_s: float | None, wait_s: float
+        self,
+        connect: Callable[[], MlflowClient],
+        uri: str,
+        *,
+        patience_s: float | None,
+        wait_s: float,
+        system_metrics_s: float | None = None,
     ) -> None:
-        self.uri, self.wait_s = uri, wait_s
+        self.uri, self.wait_s, self.system_metrics_s = uri, wait_s, system_metrics_s
         self._patience = None
         if patience_s is not None:
             named = f"tracking.uri is {uri!r}"
@@ -65,7 +73,7 @@ class TrackingStore:
             n_asked += 1
             if n_asked > 1 and (found := self.mlflow.search_runs([experiment_id], f"tags.{MADE_TAG} = '{made}'")):
                 return found[0]
-            return self.mlflow.create_run(experiment_id, run_name=name, tags={**tags, MADE_TAG: made})
+            return self.mlflow.create_run(experiment_id, run_name=name, tags={**tags_of(tags), MADE_TAG: made})
 
         return self._asked(create)
 

@@ -13,18 +13,22 @@ from typing import Any, Self
 from mlflow.entities import Run
 
 from armscan.errors import is_interruption
+from armscan.files import DIFF_FILE, write_whole
 from armscan.log import say
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.courier import Courier
+from armscan.tracking.environment import environment_tags
+from armscan.tracking.limits import params_of, tags_of
 from armscan.tracking.pictures import draw_learning_curve
-from armscan.tracking.source import source_tags
+from armscan.tracking.source import DIFF_SUM, source, source_tags
 from armscan.tracking.spool import Address, Spool, file_of, now_ms
+from armscan.tracking.system import PREFIX, SystemMetrics
 from armscan.training import EpochReport, Evaluation, TrainingResult
 
 EVALUATION_FILE, CURVE_FILE = "evaluation.json", "learning_curve.png"
-MAX_PARAM_CHARS = 6000
 # Why a run ended before its end.
 FAILURE_TAG = "failure"
+MAX_REASON_CHARS = 5000
 # For a store that is away, where somebody waits for this process to end.
 SHORT_WAIT_S = 2.0
 
@@ -49,6 +53,7 @@ class TrackedRun:
         self._courier = Courier(spool, store)
         self._logged = frozenset(logged)
         self._is_closed, self._is_delivered, self._is_resumed = False, False, False
+        self._system: SystemMetrics | None = None
         self.run_id = spool.address.run_id
         self.name = name
 
@@ -100,8 +105,9 @@ class TrackedRun:
             tags: to set anew.
         """
         run = store.get_run(run_id)
-        code = {f"resumed.{key}": value for key, value in source_tags().items() if key.startswith("git.")}
-        resumed = {"resumed": str(int(run.data.tags.get("resumed", "0")) + 1)}
+        n_resumed = int(run.data.tags.get("resumed", "0")) + 1
+        now = {**source_tags(), **environment_tags()}
+        changed = {f"resumed.{key}": value for key, value in now.items() if run.data.tags.get(key) != value}
         is_spooled = file_of(folder, run_id).exists()
         spool = Spool.begin(folder, Address(run_id, store.uri))
         logged = _logged_in(spool) if is_spooled else _logged_of(store, run)
@@ -109,25 +115,30 @@ class TrackedRun:
         tracked._is_resumed = True
         tracked.set_status("RUNNING")
         tracked._add(untagged=FAILURE_TAG)
-        tracked.set_tags(dict(tags) | code | resumed)
+        tracked.set_tags(dict(tags) | changed | {"resumed": str(n_resumed)})
         tracked.log_config(config)
+        if (diff := source().diff) is not None and f"resumed.{DIFF_SUM}" in changed:
+            tracked.keep(f"resumed_{n_resumed}_{DIFF_FILE}", diff)
         return tracked
 
     def set_tags(self, tags: Mapping[str, str]) -> None:
         """Sets tags."""
         if tags:
-            self._add(tags=dict(tags))
+            self._add(tags=tags_of(tags))
 
     def log_config(self, config: Mapping[str, Any]) -> None:
         """Logs a configuration's leaves as parameters; those that are there already stay as they are."""
-        params = {key: str(value)[:MAX_PARAM_CHARS] for key, value in flattened(config).items()}
-        if params:
+        if params := params_of(config):
             self._add(params=params)
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Makes up for what was not logged any more when the run was killed."""
+        """Makes up for what was not logged any more when the run was killed, and looks after the machine from now on."""
         for report in earlier:
             self.on_epoch(report)
+        if (every_s := self._store.system_metrics_s) is not None:
+            looks = [step for name, step in self._logged if name.startswith(PREFIX)]
+            take = self._log_system_metrics
+            self._system = SystemMetrics(take, every_s=every_s, first=max(looks, default=-1) + 1)
 
     def on_epoch(self, report: EpochReport) -> None:
         """Logs an epoch's figures by environment step."""
@@ -137,6 +148,12 @@ class TrackedRun:
 
     def on_end(self) -> None:
         """The run goes on: evaluation and artifacts come after the training."""
+        if self._system is not None:
+            self._system.finish()
+            self._system = None
+
+    def _log_system_metrics(self, figures: Mapping[str, float], number: int) -> None:
+        self.log_figures(figures, n_env_steps=number)
 
     def log_figures(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
         """Logs figures at an environment step; none twice."""
@@ -149,6 +166,12 @@ class TrackedRun:
         ]
         if points:
             self._add(metrics=points)
+
+    def keep(self, name: str, contents: bytes) -> None:
+        """Keeps something as a file of the run's folder, and as an artifact."""
+        file = self._spool.folder / name
+        write_whole(file, lambda opened: opened.write(contents))
+        self.log_files(file)
 
     def log_files(self, *files: Path) -> None:
         """Keeps files as artifacts; they stay as they are until the run has ended."""
@@ -208,7 +231,7 @@ class TrackedRun:
             return self._is_delivered
         self._is_closed = True
         if reason is not None:
-            self._add(tags={FAILURE_TAG: reason[:MAX_PARAM_CHARS]})
+            self._add(tags={FAILURE_TAG: reason[:MAX_REASON_CHARS]})
         elif self._is_resumed:
             # Who took the one before for dead may have said so since.
             self._add(untagged=FAILURE_TAG)
@@ -235,14 +258,3 @@ def _logged_of(store: TrackingStore, run: Run) -> set[tuple[str, int]]:
     """Returns what the store has of a run whose folder has no spool: an older version has made it."""
     run_id = run.info.run_id
     return {(name, point.step) for name in run.data.metrics for point in store.get_metric_history(run_id, name)}
-
-
-def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Returns the leaves of nested mappings by their dotted keys; lists are leaves, written as JSON."""
-    leaves: dict[str, Any] = {}
-    for key, value in config.items():
-        if isinstance(value, Mapping) and value:
-            leaves |= flattened(value, f"{prefix}{key}.")
-        else:
-            leaves[f"{prefix}{key}"] = json.dumps(value) if isinstance(value, list | dict) else value
-    return leaves

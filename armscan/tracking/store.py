@@ -45,7 +45,13 @@ DEFAULTS = {
 
 
 def open_store(
-    uri: str, *, experiment: str, artifacts: str, wait_s: float, patience_s: float | None = None
+    uri: str,
+    *,
+    experiment: str,
+    artifacts: str,
+    wait_s: float,
+    system_metrics_s: float | None = None,
+    patience_s: float | None = None,
 ) -> tuple[TrackingStore, str]:
     """Opens a tracking store and makes the experiment where it does not exist yet.
 
@@ -54,6 +60,7 @@ def open_store(
         experiment: the experiment's name.
         artifacts: folder of its artifacts where the store is a database; a server has its own place for them.
         wait_s: how long a run waits for it at its end.
+        system_metrics_s: seconds between two looks at the machine while a run trains; None for none.
         patience_s: how long it is waited for otherwise, already while it is opened; None for not at all.
 
     Returns:
@@ -65,10 +72,13 @@ def open_store(
     _check_texts(uri=uri, experiment=experiment, artifacts=artifacts)
     _check_address(uri)
     check_float("tracking.wait_s", wait_s, at_least=0.0)
+    if system_metrics_s is not None:
+        check_float("tracking.system_metrics_s", system_metrics_s, above=0.0)
+    connected = partial(_store, wait_s=wait_s, system_metrics_s=system_metrics_s, patience_s=patience_s)
     shown = hand_over_tracking(uri)
     with usable_store(shown):
         if not shown.startswith(SQLITE_PREFIX):
-            store = _store(shown, wait_s, patience_s)
+            store = connected(shown)
             return store, _experiment_in(store, experiment, None if shown.startswith("http") else artifacts)
         # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
         database = sqlite_file(shown)
@@ -76,7 +86,7 @@ def open_store(
         # MLflow would try for minutes to open what cannot be opened, and the lock for ever to be made.
         database.open("ab").close()
         with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
-            store = _store(f"{SQLITE_PREFIX}{database}", wait_s, patience_s)
+            store = connected(f"{SQLITE_PREFIX}{database}")
             return store, _experiment_in(store, experiment, artifacts)
 
 
@@ -95,14 +105,14 @@ def open_existing_store(uri: str) -> TrackingStore:
             raise TrackingError(f"tracking.uri is {uri!r}, but there is no {database}; give the one that the run is in")
         uri = f"{SQLITE_PREFIX}{database}"
     with usable_store(uri):
-        store = _store(uri, USUAL_WAIT_S, None)
+        store = _store(uri, wait_s=USUAL_WAIT_S, system_metrics_s=None, patience_s=None)
         store.search_experiments(max_results=1)
         return store
 
 
-def _store(uri: str, wait_s: float, patience_s: float | None) -> TrackingStore:
+def _store(uri: str, *, wait_s: float, system_metrics_s: float | None, patience_s: float | None) -> TrackingStore:
     connect = partial(MlflowClient, tracking_uri=_address(uri))
-    return TrackingStore(connect, uri, patience_s=patience_s, wait_s=wait_s)
+    return TrackingStore(connect, uri, patience_s=patience_s, wait_s=wait_s, system_metrics_s=system_metrics_s)
 
 
 def absolute(uri: str) -> str:

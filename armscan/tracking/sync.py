@@ -10,6 +10,7 @@ from pathlib import Path
 from armscan.errors import FolderInUseError, TrackingError
 from armscan.tracking.client import TrackingStore, reason_in
 from armscan.tracking.courier import deliver
+from armscan.tracking.limits import tags_of
 from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
 from armscan.tracking.spool import LANES, Address, Spool, now_ms, spool_files
 from armscan.tracking.store import absolute
@@ -127,5 +128,5 @@ def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str
     """
     with contextlib.closing(Spool.begin(folder, Address(run_id, absolute(uri)))) as spool:
         if tags:
-            spool.add(tags=dict(tags))
+            spool.add(tags=tags_of(tags))
         spool.add(status=(status, now_ms()))

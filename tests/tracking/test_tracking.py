@@ -15,7 +15,7 @@ from armscan.tracking import (
     open_store,
     source_tags,
 )
-from armscan.tracking.run import flattened
+from armscan.tracking.limits import flattened
 from armscan.training import EpochReport, TrainingResult
 
 from ..training.test_train import evaluation_of
