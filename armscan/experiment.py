@@ -120,7 +120,7 @@ def start_tracking(
 
 
 def started_with(config: dict[str, Any], stage: Stage) -> dict[str, bytes]:
-    """Returns the files that say what a run was started with, by their names: its configuration, its volumes, its code."""
+    """Returns the files that say what a run was started with, by their names: configuration, volumes, code."""
     diff = source().diff
     return {
         CONFIG_FILE: yaml.safe_dump(config, sort_keys=False).encode(),
@@ -132,10 +132,11 @@ def started_with(config: dict[str, Any], stage: Stage) -> dict[str, bytes]:
 
 def volume_tags(prints: Fingerprints) -> dict[str, str]:
     """Returns the names of the volumes, each with the beginning of its fingerprint, as tags of a run."""
-    named = {
-        part: (f"{name}:{each[:N_PRINT_CHARS]}" for name, each in volumes.items()) for part, volumes in prints.items()
+    told = {
+        f"volumes.{part}": " ".join(f"{name}:{each[:N_PRINT_CHARS]}" for name, each in volumes.items())
+        for part, volumes in prints.items()
     }
-    return tags_of({f"volumes.{part}": " ".join(names) for part, names in named.items()}, whole_in=VOLUMES_FILE)
+    return tags_of(told, whole_in=VOLUMES_FILE)
 
 
 def place_tags(folder: Path) -> dict[str, str]:

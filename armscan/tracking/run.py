@@ -132,7 +132,7 @@ class TrackedRun:
             self._add(params=params)
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Makes up for what was not logged any more when the run was killed, and looks after the machine from now on."""
+        """Makes up for what was not logged any more when the run was killed; from now on the machine is watched."""
         for report in earlier:
             self.on_epoch(report)
         if (every_s := self._store.system_metrics_s) is not None:

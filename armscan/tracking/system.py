@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from typing import Any
 
-from mlflow.system_metrics.metrics.base_metrics_monitor import BaseMetricsMonitor
 from mlflow.system_metrics.metrics.cpu_monitor import CPUMonitor
 from mlflow.system_metrics.metrics.disk_monitor import DiskMonitor
 from mlflow.system_metrics.metrics.gpu_monitor import GPUMonitor
@@ -13,7 +13,7 @@ from mlflow.system_metrics.metrics.network_monitor import NetworkMonitor
 
 # As MLflow names them; its UI shows these on a page of their own.
 PREFIX = "system/"
-MONITORS: tuple[type[BaseMetricsMonitor], ...] = (CPUMonitor, DiskMonitor, NetworkMonitor, GPUMonitor)
+MONITORS: tuple[type[Any], ...] = (CPUMonitor, DiskMonitor, NetworkMonitor, GPUMonitor)
 
 
 class SystemMetrics:
@@ -53,7 +53,7 @@ class SystemMetrics:
             self._number += 1
 
 
-def _monitors() -> list[BaseMetricsMonitor]:
+def _monitors() -> list[Any]:
     monitors = []
     for kind in MONITORS:
         try:
