@@ -69,7 +69,7 @@ class Asked(NamedTuple):
 class NoStore:
     """A tracking store that takes everything and keeps nothing."""
 
-    uri, wait_s = "nowhere", 5.0
+    uri, wait_s, system_metrics_s = "nowhere", 5.0, None
 
     def __init__(self) -> None:
         self.mlflow = self

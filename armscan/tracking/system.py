@@ -29,7 +29,6 @@ class SystemMetrics:
 
     def __init__(self, take: Callable[[Mapping[str, float], int], None], *, every_s: float, first: int = 0) -> None:
         self._take, self._every_s, self._number = take, every_s, first
-        self._monitors = _monitors()
         self._is_over = threading.Event()
         self._thread = threading.Thread(target=self._work, name="system metrics", daemon=True)
         self._thread.start()
@@ -40,12 +39,11 @@ class SystemMetrics:
         self._thread.join()
 
     def _work(self) -> None:
-        is_over = False
+        monitors, is_over = _monitors(), False
         while not is_over:
-            # The first figure of the CPU is of the time since the look before.
             is_over = self._is_over.wait(self._every_s)
             figures: dict[str, float] = {}
-            for monitor in self._monitors:
+            for monitor in monitors:
                 monitor.collect_metrics()
                 figures |= {f"{PREFIX}{name}": float(value) for name, value in monitor.aggregate_metrics().items()}
                 monitor.clear_metrics()
@@ -58,6 +56,7 @@ def _monitors() -> list[Any]:
     for kind in MONITORS:
         try:
             monitor = kind()
+            # That of the CPU says how busy it was since this thread has looked last.
             monitor.collect_metrics()
             monitor.clear_metrics()
         # Whatever a machine without such a thing raises, as one without a GPU does.
