@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,9 @@ import yaml
 from mlflow.entities import Run
 from omegaconf import DictConfig, OmegaConf
 
-import armscan
 from armscan.agents import Learner
 from armscan.errors import InvalidValueError, ResumeError
-from armscan.experiment import carry_out, place_tags, volume_tags
+from armscan.experiment import carry_out
 from armscan.files import (
     CONFIG_FILE,
     LAST_CHECKPOINT,
@@ -30,9 +28,10 @@ from armscan.files import (
     remove_unfinished,
     sum_of,
 )
+from armscan.provenance import place_tags, volume_tags
 from armscan.settings import RESUME, TRACKING_URI, plain, usual_tracking
 from armscan.stage import Stage
-from armscan.tracking import TrackedRun, TrackingStore, find_run, jobs_of, open_existing_store, sync
+from armscan.tracking import TrackedRun, TrackingStore, check_version, find_run, jobs_of, open_existing_store, sync
 from armscan.training import Fingerprints, check_unchanged, take_up
 
 
@@ -112,11 +111,7 @@ def _folder_of(client: TrackingStore, run: Run) -> Path:
             which = ", ".join(cut_off) if cut_off else "all of them have finished"
             raise ResumeError(f"run {run_id} is the parent of a multirun, whose jobs are resumed one by one: {which}")
         raise ResumeError(f"run {run_id} cannot be resumed: it is none of armscan.run, which notes the folder of a run")
-    if _release(tags["armscan.version"]) > _release(armscan.__version__):
-        raise ResumeError(
-            f"run {run_id} was made by armscan {tags['armscan.version']}, but this is {armscan.__version__}: "
-            "it goes on with that version or a newer one"
-        )
+    check_version(run)
     # Asked before the folder, which may have been cleared away since.
     if run.info.status == "FINISHED":
         raise ResumeError(f"run {run_id} has finished: there is nothing to resume")
@@ -126,10 +121,6 @@ def _folder_of(client: TrackingStore, run: Run) -> Path:
             f"run {run_id} cannot be resumed: its folder {folder} is not there; it last ran on the host {tags['host']}"
         )
     return folder
-
-
-def _release(version: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
 
 
 def _config_of(run: Run, folder: Path) -> DictConfig:

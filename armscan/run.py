@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 
-# One compute thread a process, set before any library starts its pool: small networks are fastest so, and jobs side by
-# side never claim more threads than there are cores.
-for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(_variable, "1")
+from armscan.threads import one_a_process
+
+one_a_process()
 # Ray reads it when it is imported, which other libraries do where it is installed: it would abort a study that is told
 # to end with a trace.
 os.environ.setdefault("RAY_DISABLE_FAILURE_SIGNAL_HANDLER", "1")

@@ -56,7 +56,7 @@ def subject_of_run(tracking: str, run_id: str, changes: Mapping[str, Any]) -> Su
     if EVALUATED_TAG in run.tags:
         raise InvalidValueError(f"run is {run_id!r}, but that is an evaluation, of {run.tags[EVALUATED_TAG]}")
     with tempfile.TemporaryDirectory() as folder:
-        config = _from_its_folder(changed(OmegaConf.create(run.config(Path(folder))), changes), run.tags)
+        config = from_its_folder(changed(OmegaConf.create(run.config(Path(folder))), changes), run.tags)
         weights, facts = _weights(run, Path(folder))
         # Of learners that were trained before runs kept them, the checkpoint has them.
         volumes = run.volumes(Path(folder)) or facts.get("volumes") or None
@@ -97,7 +97,7 @@ def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
     return config
 
 
-def _from_its_folder(config: DictConfig, tags: Mapping[str, str]) -> DictConfig:
+def from_its_folder(config: DictConfig, tags: Mapping[str, str]) -> DictConfig:
     """Returns a run's configuration with the files of its data named from anywhere, not from where it was started."""
     for key in PATHS:
         if isinstance(path := config.data.get(key), str) and "working_folder" in tags:

@@ -14,11 +14,12 @@ from omegaconf import DictConfig
 from armscan.agents import Learner
 from armscan.building import build, check_keys
 from armscan.errors import CheckpointError, InvalidValueError
-from armscan.experiment import FILM_SEED, judged, learned, place_tags, start_tracking, volume_tags
+from armscan.experiment import FILM_SEED, judged, learned
 from armscan.files import LAST_CHECKPOINT, held, write_whole
 from armscan.invocation import Invocation
 from armscan.multirun import Job
 from armscan.patience import PATIENCE_S
+from armscan.provenance import place_tags, start_tracking, volume_tags
 from armscan.settings import plain
 from armscan.stage import Stage
 from armscan.sweeps.attempt import Attempt

@@ -2,7 +2,16 @@
 
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import environment_file, environment_tags
-from armscan.tracking.finding import EVALUATED_TAG, FAMILIAR_TAG, FoundRun, find_run, found_run, jobs_of
+from armscan.tracking.finding import (
+    EVALUATED_TAG,
+    FAMILIAR_TAG,
+    VERSION_TAG,
+    FoundRun,
+    check_version,
+    find_run,
+    found_run,
+    jobs_of,
+)
 from armscan.tracking.limits import flattened, tags_of
 from armscan.tracking.pictures import draw_learning_curve
 from armscan.tracking.run import TrackedRun
@@ -14,10 +23,12 @@ from armscan.tracking.sync import abandon, note_end, sync
 __all__ = [
     "EVALUATED_TAG",
     "FAMILIAR_TAG",
+    "VERSION_TAG",
     "FoundRun",
     "TrackedRun",
     "TrackingStore",
     "abandon",
+    "check_version",
     "draw_learning_curve",
     "environment_file",
     "environment_tags",

@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 from mlflow.entities import Run
 
+import armscan
 from armscan.errors import TrackingError, listed
 from armscan.files import BEST_CHECKPOINT, CONFIG_FILE, SUM_TAGS, VOLUMES_FILE, sum_of
 from armscan.tracking.client import TrackingStore
@@ -22,6 +23,8 @@ from armscan.training import Fingerprints
 FAMILIAR_TAG = "trained_on"
 # Which run an evaluation is of; only evaluations have it.
 EVALUATED_TAG = "evaluation.of"
+# Which version of armscan a run was made by.
+VERSION_TAG = "armscan.version"
 ID = re.compile(r"[0-9a-f]{1,32}")
 MAX_EXPERIMENTS = 1000
 N_SHOWN = 4
@@ -35,6 +38,7 @@ class FoundRun:
         client: of the store.
         uri: of the store.
         experiment_id: that the run is in.
+        experiment_name: of that one.
         run_id: of the run.
         name: what the UI calls it.
         status: how it ended, or that it is RUNNING.
@@ -45,6 +49,7 @@ class FoundRun:
     client: TrackingStore = field(repr=False)
     uri: str
     experiment_id: str
+    experiment_name: str
     run_id: str
     name: str
     status: str
@@ -80,6 +85,10 @@ class FoundRun:
         volumes: Fingerprints = json.loads(self._started_with(VOLUMES_FILE, folder))
         return volumes
 
+    def text(self, file: str, folder: Path) -> str | None:
+        """Returns what an artifact says, fetched into `folder`; None where the run has none of this name."""
+        return self._fetched(file, folder).read_text() if file in self.files else None
+
     def _started_with(self, file: str, folder: Path) -> bytes:
         if file not in self.files:
             raise TrackingError(
@@ -112,6 +121,7 @@ def found_run(uri: str, run_id: str) -> FoundRun:
     client = open_existing_store(uri)
     with usable_store(uri):
         run = find_run(client, run_id)
+        check_version(run)
         if jobs := jobs_of(client, run):
             ids = listed([job.info.run_id for job in jobs])
             raise TrackingError(f"run {run.info.run_id} is the parent of a multirun: give one of its jobs, {ids}")
@@ -147,6 +157,20 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
     return run
 
 
+def check_version(run: Run) -> None:
+    """Raises `TrackingError` where a run was made by a newer version, which may have kept it otherwise."""
+    version = run.data.tags.get(VERSION_TAG, armscan.__version__)
+    if _release(version) > _release(armscan.__version__):
+        raise TrackingError(
+            f"run {run.info.run_id} was made by armscan {version}, but this is {armscan.__version__}: "
+            "it needs that version or a newer one"
+        )
+
+
+def _release(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
+
+
 def jobs_of(client: TrackingStore, run: Run) -> list[Run]:
     """Returns the runs of a multirun's jobs, by its parent run; none where the run is another."""
     children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
@@ -158,6 +182,7 @@ def _found(client: TrackingStore, uri: str, run: Run) -> FoundRun:
         client=client,
         uri=uri,
         experiment_id=run.info.experiment_id,
+        experiment_name=client.get_experiment(run.info.experiment_id).name,
         run_id=run.info.run_id,
         name=run.info.run_name,
         status=run.info.status,

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 from filelock import FileLock
 from mlflow import MlflowClient
@@ -18,7 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.checks import check_float
 from armscan.errors import TrackingError
-from armscan.files import SQLITE_PREFIX, sqlite_file
+from armscan.files import SQLITE_PREFIX, check_writable, sqlite_file
 from armscan.passwords import (
     SERVER_PASSWORD,
     TRACKING_PASSWORD,
@@ -171,6 +172,7 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
     location = Path(artifacts).absolute().as_uri() if artifacts else None
     found = store.get_experiment_by_name(name)
     if found is None:
+        _check_artifacts(location)
         try:
             return str(store.create_experiment(name, artifact_location=location))
         except MlflowException as error:
@@ -180,4 +182,21 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
             found = store.get_experiment_by_name(name)
     if found.lifecycle_stage != "active":
         raise TrackingError(f"tracking.experiment is {name!r}, but it was deleted; restore it, or name another")
+    _check_artifacts(found.artifact_location)
     return str(found.experiment_id)
+
+
+def _check_artifacts(location: str | None) -> None:
+    """Raises `TrackingError` where the artifacts are files of this machine, and cannot be written."""
+    # A server is asked when it is given the first file; what it does not take stays in the folder of the run.
+    if location is None or not location.startswith("file:"):
+        return
+    folder = Path(url2pathname(urlsplit(location).path))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        check_writable(folder / "any")
+    except OSError as error:
+        raise TrackingError(
+            f"the artifacts of runs lie in {folder}, as their experiment or tracking.artifacts says, but no file can "
+            f"be written there: {error.strerror}"
+        ) from error
