@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+from collections.abc import Mapping
 from operator import methodcaller
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,7 @@ def start_tracking(
             FAMILIAR_TAG: Familiar.of(stage.training_env, stage.experiment.smallest_slice_px).to_json(),
             **place_tags(invocation.folder),
             "working_folder": str(Path.cwd()),
-            **{SUM_TAGS[name]: sum_of(files[name]) for name in SUM_TAGS},
+            **sum_tags(files),
             **({JOB_TAG: str(job.number)} if job else {}),
         },
         folder=invocation.folder,
@@ -93,6 +94,11 @@ def started_with(config: dict[str, Any], stage: Stage) -> dict[str, bytes]:
         ENVIRONMENT_FILE: environment_file(),
         **({} if diff is None else {DIFF_FILE: diff}),
     }
+
+
+def sum_tags(files: Mapping[str, bytes]) -> dict[str, str]:
+    """Returns the sums of those files that a run must not be gone on with where they are others, as its tags."""
+    return {tag: sum_of(files[name]) for name, tag in SUM_TAGS.items()}
 
 
 def volume_tags(prints: Fingerprints) -> dict[str, str]:

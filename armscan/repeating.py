@@ -11,10 +11,11 @@ from mlflow.entities import Run
 from omegaconf import DictConfig
 
 from armscan.building import check_keys
-from armscan.experiment import run_experiment, started_with
-from armscan.files import LAST_CHECKPOINT, SUM_TAGS, sum_of
+from armscan.experiment import run_experiment
+from armscan.files import LAST_CHECKPOINT
 from armscan.invocation import Invocation
 from armscan.multirun import JOB_TAG, Job
+from armscan.provenance import started_with, sum_tags
 from armscan.resume import go_on
 from armscan.settings import plain
 from armscan.stage import Stage
@@ -50,7 +51,7 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Figures:
 
 def _earlier_runs(client: TrackingStore, experiment_id: str, stage: Stage, config: DictConfig) -> list[Run]:
     """Returns the runs of this configuration on these volumes, the latest first."""
-    sums = {SUM_TAGS[name]: sum_of(contents) for name, contents in started_with(plain(config), stage).items()}
+    sums = sum_tags(started_with(plain(config), stage))
     wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
     return list(client.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"]))
 

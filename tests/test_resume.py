@@ -83,7 +83,7 @@ def named_tensors(tree, name=""):
 
 def figures(client, run):
     """The history of every figure but the times, which no two runs share."""
-    names = [name for name in run.data.metrics if not name.startswith(("wall_s", "speed/"))]
+    names = [name for name in run.data.metrics if not name.startswith(("wall_s", "speed/", "system/"))]
     return {name: [(p.step, p.value) for p in client.get_metric_history(run.info.run_id, name)] for name in names}
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -11,7 +12,10 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+import torch
 from mlflow import MlflowClient
+
+from armscan.files import sum_of
 
 SMALL = [
     "data.n_training=1",
@@ -61,9 +65,25 @@ def test_run_trains_evaluates_and_tracks(tmp_path):
     assert tracked.data.params["network.hidden_sizes"] == "[16]"
     assert tracked.data.params["env.transform.rz_deg"] == "10.0"
     assert {"git.commit", "git.dirty", "overrides"} <= tracked.data.tags.keys()
+    assert tracked.data.tags["seed"] == "3"
+    assert tracked.data.tags["command"] == shlex.join(["python", "-m", "armscan.run", *SMALL, "seed=3"])
+    assert tracked.data.tags["version.torch"] == torch.__version__
+    assert tracked.data.tags["constraints.sha256"] == sum_of((REPOSITORY / "constraints.txt").read_bytes())
+    logged = {
+        "validation/mean_return",
+        "validation/mean_steps",
+        "validation/success_rate",
+        "train/return",
+        "train/length",
+    }
+    logged |= {"train/success_rate", "update/actor_loss", "update/critic_loss", "update/entropy_coefficient"}
+    logged |= {"speed/updates_per_s", "speed/env_steps_per_s", "replay_size", "wall_s"}
+    assert logged <= tracked.data.metrics.keys()
+    assert {"system/cpu_utilization_percentage", "system/system_memory_usage_megabytes"} <= tracked.data.metrics.keys()
     assert tracked.info.run_name == "sac-cluster-y-phantom-seed3"
-    assert tracked.data.tags["volumes.validation"] == "phantom-1000000"
-    assert tracked.data.tags["volumes.test"] == "phantom-2000000"
+    (folder,) = (tmp_path / "outputs").glob("*/*")
+    prints = json.loads((folder / "volumes.json").read_text())
+    assert tracked.data.tags["volumes.test"] == f"phantom-2000000:{prints['test']['phantom-2000000'][:16]}"
     for volumes in ("training_volumes", "test_volumes"):
         for figure in ("success_rate", "mean_steps", "mean_distance_mm", "mean_distance_deg"):
             assert f"{volumes}/{figure}" in tracked.data.metrics
@@ -71,10 +91,12 @@ def test_run_trains_evaluates_and_tracks(tmp_path):
     assert steps == sorted(set(steps))
     assert steps[-1] >= 400
     artifacts = {file.path for file in client.list_artifacts(tracked.info.run_id)}
-    assert artifacts == {
-        *("best.pt", "last.pt", "config.yaml", "volumes.json", "episode.gif", "evaluation.json", "learning_curve.png")
+    # Where the code is not that of its commit, beside them what differs.
+    assert artifacts - {"code.diff"} == {
+        *("best.pt", "last.pt", "config.yaml", "volumes.json", "environment.json"),
+        *("episode.gif", "evaluation.json", "learning_curve.png"),
     }
-    (folder,) = (tmp_path / "outputs").glob("*/*")
+    assert ("code.diff" in artifacts) == (tracked.data.tags["git.dirty"] == "true")
     evaluation = json.loads((folder / "evaluation.json").read_text())
     assert len(evaluation["test volumes"]["episodes"]) == 3
 
@@ -83,7 +105,11 @@ def test_run_of_the_same_seed_gives_the_same_figures(tmp_path):
     for _ in range(2):
         assert armscan_run(*SMALL, "seed=3", cwd=tmp_path).returncode == 0
     first, second = (
-        {name: value for name, value in tracked.data.metrics.items() if not name.startswith(("wall_s", "speed/"))}
+        {
+            name: value
+            for name, value in tracked.data.metrics.items()
+            if not name.startswith(("wall_s", "speed/", "system/"))
+        }
         for tracked in runs_in(tmp_path)[1]
     )
     assert first == second

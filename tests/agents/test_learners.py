@@ -63,6 +63,7 @@ def test_learner_reports_episodes_losses_and_speed(make_learner):
     if metrics["train/episodes"]:
         assert 1 <= metrics["train/length"] <= 50
         assert -50 <= metrics["train/return"] <= 0
+        assert 0 <= metrics["train/success_rate"] <= 1
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "regression"], indirect=True)
