@@ -2,6 +2,8 @@
 
 import json
 import os
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -105,6 +107,18 @@ def unseen_windows():
     yield
     pyplot.close("all")
     pyplot.switch_backend(before)
+
+
+@pytest.fixture
+def read_only_folder(tmp_path):
+    """A folder that nobody can write to, not even root: a mounted file system."""
+    folder = tmp_path / "read_only"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "ro,size=64k", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("a read-only disk cannot be mounted here: it needs root")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 @pytest.fixture(scope="session")

@@ -20,7 +20,7 @@ from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, held, writ
 from armscan.tracking import open_store
 from armscan.training import load_checkpoint
 
-from .test_run import SMALL, armscan_run, job_process_ids, runs_in
+from .test_run import SMALL, TIMES, armscan_run, job_process_ids, runs_in
 
 LONGER = [*SMALL, "training.env_steps=1000", "training.solved=null"]
 PPO = [*(each for each in LONGER if not each.startswith("agent.random")), "agent=ppo", "agent.num_envs=4"]
@@ -83,7 +83,7 @@ def named_tensors(tree, name=""):
 
 def figures(client, run):
     """The history of every figure but the times, which no two runs share."""
-    names = [name for name in run.data.metrics if not name.startswith(("wall_s", "speed/", "system/"))]
+    names = [name for name in run.data.metrics if not name.startswith(TIMES)]
     return {name: [(p.step, p.value) for p in client.get_metric_history(run.info.run_id, name)] for name in names}
 
 

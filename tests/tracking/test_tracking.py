@@ -6,11 +6,14 @@ import time
 
 import pytest
 
+import armscan
 from armscan.errors import TrackingError
 from armscan.tracking import (
+    VERSION_TAG,
     TrackedRun,
     draw_learning_curve,
     find_run,
+    found_run,
     open_existing_store,
     open_store,
     source_tags,
@@ -129,6 +132,34 @@ def test_run_that_goes_on_logs_what_is_missing_and_nothing_twice(store, tmp_path
         history = client.get_metric_history(first.run_id, name)
         assert [(point.step, point.value) for point in history] == list(zip([100, 200, 300], values, strict=True))
     assert client.get_run(first.run_id).info.status == "FINISHED"
+
+
+def test_store_whose_artifacts_cannot_be_written_is_refused_before_anything_is_made(tmp_path):
+    (tmp_path / "taken").write_text("no folder")
+    uri = f"sqlite:///{tmp_path}/runs.db"
+    with pytest.raises(TrackingError, match=r"the artifacts of runs lie in .*taken/inside.*: Not a directory"):
+        open_store(uri, experiment="new", artifacts=str(tmp_path / "taken" / "inside"), wait_s=60.0)
+    client, _ = open_store(uri, experiment="other", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
+    assert {each.name for each in client.search_experiments()} == {"Default", "other"}
+    # Where the experiment is there already, it says where its artifacts lie.
+    (tmp_path / "artifacts").rmdir()
+    (tmp_path / "artifacts").write_text("no folder")
+    with pytest.raises(TrackingError, match=r"the artifacts of runs lie in .*artifacts, as their experiment"):
+        open_store(uri, experiment="other", artifacts="elsewhere", wait_s=60.0)
+
+
+def test_store_with_read_only_artifacts_is_refused(tmp_path, read_only_folder):
+    with pytest.raises(TrackingError, match=r"no file can be written there: Read-only file system"):
+        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="e", artifacts=str(read_only_folder), wait_s=60.0)
+
+
+def test_found_run_refuses_one_of_a_newer_version(store):
+    client, experiment_id = store
+    run = client.create_run(experiment_id, name="n", tags={VERSION_TAG: "99.1.0"})
+    with pytest.raises(
+        TrackingError, match=f"made by armscan 99.1.0, but this is {armscan.__version__}: it needs that"
+    ):
+        found_run(client.uri, run.info.run_id)
 
 
 def test_find_run_takes_the_beginning_of_an_id_and_names_what_is_wrong(store):
