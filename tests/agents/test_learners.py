@@ -66,20 +66,6 @@ def test_learner_reports_episodes_losses_and_speed(make_learner):
         assert 0 <= metrics["train/success_rate"] <= 1
 
 
-@by_reinforcement
-def test_learner_counts_the_episodes_of_an_epoch_that_succeed(make_learner):
-    learner = make_learner()
-    learner.warm_up()
-    for _ in range(3):
-        metrics = learner.learn(60)
-        n_ended = metrics["train/episodes"]
-        assert learner._envs.n_ended == n_ended
-        if n_ended:
-            # Rewards are above the threshold where an episode succeeds, and nowhere else.
-            assert (metrics["train/success_rate"] * n_ended) % 1 == pytest.approx(0, abs=1e-6)
-            assert (metrics["train/success_rate"] == 1) == (learner._envs.n_successes == n_ended)
-
-
 @pytest.mark.parametrize("algorithm", ["sac", "regression"], indirect=True)
 @pytest.mark.parametrize("share", [0.1, 0.26, 0.7, 2.0])
 def test_learner_takes_as_many_gradient_steps_as_are_asked_for_also_after_going_on(algorithm, phantom, share):

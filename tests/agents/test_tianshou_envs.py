@@ -48,6 +48,21 @@ def test_side_by_side_resets_only_those_it_is_asked_for(make):
     np.testing.assert_array_equal(observed[0, -3:-1], [0, 0])
 
 
+def test_side_by_side_counts_episodes_and_those_that_succeed(make, phantom):
+    envs = make(delta=0.6)
+    envs.reset()
+    rng, n_ended, n_successes = np.random.default_rng(0), 0, 0
+    for _ in range(12):
+        _, rewards, terminated, truncated, _ = envs.step(rng.uniform(-1, 1, (3, 2)))
+        is_over = terminated | truncated
+        # An episode succeeds on a rewarded plane, and ends there.
+        n_ended, n_successes = n_ended + is_over.sum(), n_successes + (rewards[is_over] > -0.6).sum()
+        if is_over.any():
+            envs.reset(np.flatnonzero(is_over))
+    assert (envs.n_ended, envs.n_successes) == (n_ended, n_successes)
+    assert 0 < envs.n_successes < envs.n_ended
+
+
 def test_side_by_side_gives_images_as_batches(make):
     envs = make(observation="slice", stack=2)
     envs.reset()
