@@ -98,12 +98,13 @@ def _tracked(
 ) -> tuple[Judgement, Path]:
     """Plays, and keeps what comes of it: in a JSON file, and in a tracked run, a child of the run that is evaluated."""
     from armscan.judging import Judgement, data_name
-    from armscan.tracking import EVALUATED_TAG, TrackedRun, open_store
+    from armscan.tracking import EVALUATED_TAG, TrackedRun, deliver_leftovers, open_store
 
     if subject.run is not None:
         client, experiment_id = subject.run.client, subject.run.experiment_id
     else:
         client, experiment_id = open_store(**store)
+    deliver_leftovers(client)
     of, data = subject.run.run_id if subject.run else subject.name, data_name(request.data)
     facts = {
         "of": of,

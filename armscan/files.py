@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+import platformdirs
 from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError
@@ -28,6 +29,12 @@ SPOOLS = "tracking"
 UNFINISHED = "unfinished"
 # How the address of a database in a file begins.
 SQLITE_PREFIX = "sqlite:///"
+
+
+def cache_folder() -> Path:
+    """Returns the folder of what a machine keeps for all runs: `$ARMSCAN_CACHE`, or else the user's cache folder."""
+    named = os.environ.get("ARMSCAN_CACHE")
+    return Path(named) if named else Path(platformdirs.user_cache_dir("armscan"))
 
 
 def sqlite_file(uri: str) -> Path:

@@ -32,6 +32,7 @@ from armscan.tracking import (
     FAMILIAR_TAG,
     VERSION_TAG,
     TrackedRun,
+    deliver_leftovers,
     environment_file,
     environment_tags,
     open_store,
@@ -51,6 +52,7 @@ def start_tracking(
     """Writes down what is run, opens the tracking store and starts a run in it; see `open_store`."""
     resolved = plain(config)
     client, experiment_id = open_store(**resolved["tracking"], patience_s=patience_s)
+    deliver_leftovers(client)
     choices, job = invocation.choices, invocation.job
     files = started_with(resolved, stage)
     # Another run's, left in a folder that somebody named: they would be taken for this one's.

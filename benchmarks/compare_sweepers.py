@@ -20,7 +20,7 @@ from pathlib import Path
 import optuna
 from optuna.trial import TrialState
 
-from armscan.volumes.phantom.cache import default_cache_dir
+from armscan.files import cache_folder
 from benchmarks.occupation import Occupation, share_in_trials, slept
 from benchmarks.studies import N_WORKERS, REPOSITORY
 from benchmarks.waiting import WAITED_FILE, Waited
@@ -70,7 +70,7 @@ def environment() -> Path:
     """Returns the interpreter of the environment of Hydra's sweeper, which is made where there is none."""
     requirements = HYDRA_OPTUNA / "requirements.txt"
     version = hashlib.sha256(requirements.read_bytes()).hexdigest()[:12]
-    folder = default_cache_dir() / f"hydra_optuna-{version}"
+    folder = cache_folder() / f"hydra_optuna-{version}"
     python, is_whole = folder / "bin" / "python", folder / "installed"
     if not is_whole.exists():
         print(f"installing {requirements} in {folder}", flush=True)

@@ -38,7 +38,7 @@ SMALL = [
     *("agent.random_env_steps=100", "network.vector.hidden_sizes=[16]"),
 ]
 TRAINING = "sac-cluster-y-phantom-seed0"
-START_S, END_S = 150, 15
+START_S, END_S = 150, 60
 
 
 def free_ports(n=2):

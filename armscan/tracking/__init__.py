@@ -18,7 +18,7 @@ from armscan.tracking.run import TrackedRun
 from armscan.tracking.source import source, source_tags
 from armscan.tracking.spool import take_over
 from armscan.tracking.store import open_existing_store, open_store
-from armscan.tracking.sync import abandon, note_end, sync
+from armscan.tracking.sync import abandon, deliver_leftovers, note_end, sync
 
 __all__ = [
     "EVALUATED_TAG",
@@ -29,6 +29,7 @@ __all__ = [
     "TrackingStore",
     "abandon",
     "check_version",
+    "deliver_leftovers",
     "draw_learning_curve",
     "environment_file",
     "environment_tags",

@@ -15,6 +15,7 @@ from mlflow.entities import Run
 from armscan.errors import is_interruption
 from armscan.files import DIFF_FILE, write_whole
 from armscan.log import say
+from armscan.tracking import leftovers
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.courier import Courier
 from armscan.tracking.environment import environment_tags
@@ -50,6 +51,7 @@ class TrackedRun:
         self, store: TrackingStore, spool: Spool, *, name: str, logged: Collection[tuple[str, int]] = ()
     ) -> None:
         self._store, self._spool = store, spool
+        leftovers.note(spool)
         self._courier = Courier(spool, store)
         self._logged = frozenset(logged)
         self._is_closed, self._is_delivered, self._is_resumed = False, False, False
@@ -237,8 +239,10 @@ class TrackedRun:
             self._add(untagged=FAILURE_TAG)
         self.set_status(status)
         failure = self._courier.finish(self._store.wait_s if wait_s is None else wait_s)
-        self._spool.close()
         self._is_delivered = failure is None
+        if self._is_delivered:
+            leftovers.forget(self._spool)
+        self._spool.close()
         if failure is not None:
             again = f"python -m armscan.track sync {shlex.quote(str(self._spool.folder))}"
             how = "delivers the rest" if self._courier.is_away else "delivers the rest once the store takes it"

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from armscan.errors import FolderInUseError, TrackingError
+from armscan.log import say
+from armscan.tracking import leftovers
 from armscan.tracking.client import TrackingStore, reason_in
 from armscan.tracking.courier import deliver
 from armscan.tracking.limits import tags_of
@@ -18,6 +21,8 @@ from armscan.tracking.store import absolute
 # Of a run: how it ended, as its spool says it.
 ENDED = ("FINISHED", "FAILED", "KILLED")
 IN_USE = "it is still going on"
+# Stores whose leftovers this process has looked for.
+_looked_for: set[str] = set()
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,34 @@ def _delivered(spool: Spool, store: TrackingStore) -> Delivery:
         except Exception as error:
             left = reason_in(error)
     return Delivery(spool.folder, spool.address.run_id, n_entries, left)
+
+
+def deliver_leftovers(store: TrackingStore) -> None:
+    """Delivers what earlier runs of a store have left on this machine; in the background, and once in a process."""
+    if store.uri not in _looked_for:
+        _looked_for.add(store.uri)
+        threading.Thread(target=_deliver_leftovers, args=(store,), name="leftovers", daemon=True).start()
+
+
+def _deliver_leftovers(store: TrackingStore) -> None:
+    for note, file in leftovers.noted():
+        try:
+            spool = Spool(file, timeout_s=0.0)
+        except FolderInUseError:
+            # Its run goes on, and delivers for itself.
+            continue
+        except (OSError, TrackingError):
+            # Removed with its folder, or damaged, which `armscan.track sync` tells whoever asks.
+            note.unlink(missing_ok=True)
+            continue
+        with contextlib.closing(spool):
+            if spool.address.uri != store.uri:
+                continue
+            delivery = _delivered(spool, store)
+            if delivery.left is None:
+                note.unlink(missing_ok=True)
+            if delivery.n_entries:
+                say(f"run {delivery.run_id}: {delivery.n_entries} entries that it had left are delivered now")
 
 
 def abandon(folder: Path, store: TrackingStore, reason: str) -> None:

@@ -3,6 +3,7 @@
 import os
 import shutil
 import subprocess
+import sys
 import threading
 import time
 from collections import Counter
@@ -13,9 +14,10 @@ from mlflow import MlflowClient
 
 from armscan.errors import TrackingAwayError, TrackingError
 from armscan.track import main as track
-from armscan.tracking import TrackedRun, abandon, note_end, open_store, sync
+from armscan.tracking import TrackedRun, abandon, deliver_leftovers, note_end, open_store, sync
 from armscan.tracking import courier as courier_module
 from armscan.tracking.client import reason_in, why_away
+from armscan.tracking.leftovers import noted
 from armscan.tracking.spool import file_of
 from tests.mlflow_server import mlflow_server
 
@@ -43,6 +45,33 @@ def histories(uri, run_id):
     client = MlflowClient(uri)
     names = client.get_run(run_id).data.metrics
     return {name: [(point.step, point.value) for point in client.get_metric_history(run_id, name)] for name in names}
+
+
+def test_what_a_run_could_not_deliver_the_next_start_delivers(server, opened, tmp_path, monkeypatch, capfd):
+    tracked = begun(opened, tmp_path)
+    server.stop()
+    tracked.log_figures({"x": 1.0}, n_env_steps=7)
+    assert not tracked.end("FINISHED", wait_s=0.1)
+    # One that is still going on delivers for itself; one whose folder was removed is forgotten.
+    gone = tmp_path / "gone"
+    server.start()
+    going_on, removed = begun(opened, tmp_path / "going on"), begun(opened, gone)
+    removed._spool.close()
+    shutil.rmtree(gone)
+    assert {tracked.run_id, going_on.run_id, removed.run_id} <= {note.name for note, _ in noted()}
+    # Of the package, `sync` is the function.
+    monkeypatch.setattr(sys.modules["armscan.tracking.sync"], "_looked_for", set())
+    for _ in range(2):
+        deliver_leftovers(opened[0])
+    until_s = time.monotonic() + 60
+    while tracked.run_id in {note.name for note, _ in noted()}:
+        assert time.monotonic() < until_s
+        time.sleep(0.05)
+    assert histories(server.uri, tracked.run_id) == {"x": [(7, 1.0)]}
+    assert MlflowClient(server.uri).get_run(tracked.run_id).info.status == "FINISHED"
+    assert f"run {tracked.run_id}: " in capfd.readouterr().out.splitlines()[-1]
+    assert going_on.end("FINISHED")
+    assert not {tracked.run_id, going_on.run_id} & {note.name for note, _ in noted()}
 
 
 def test_run_goes_on_while_the_server_is_away_and_nothing_is_lost_or_there_twice(server, opened, tmp_path, capfd):

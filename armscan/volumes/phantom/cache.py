@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import zipfile
 from collections.abc import Iterable
 from functools import cache
@@ -11,11 +10,10 @@ from pathlib import Path
 from weakref import WeakValueDictionary
 
 import numpy as np
-import platformdirs
 
 from armscan.checks import check_seed
 from armscan.errors import InvalidValueError
-from armscan.files import write_whole
+from armscan.files import cache_folder, write_whole
 from armscan.volumes.phantom import generate, tube, wrist
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.volume import LabelVolume
@@ -40,7 +38,7 @@ def load_phantom(seed: int, cache_dir: Path | None = None) -> LabelVolume:
         The same volume as `make_phantom(seed)`.
     """
     check_seed("seed", seed)
-    path = (cache_dir or default_cache_dir()) / f"phantom-{_generator_version()}-{seed}.npz"
+    path = (cache_dir or cache_folder()) / f"phantom-{_generator_version()}-{seed}.npz"
     volume = _IN_MEMORY.get(path)
     if volume is None:
         _IN_MEMORY[path] = volume = _read_or_made(path, seed)
@@ -61,12 +59,6 @@ def _read_or_made(path: Path, seed: int) -> LabelVolume:
             "or the environment variable ARMSCAN_CACHE"
         ) from error
     return volume
-
-
-def default_cache_dir() -> Path:
-    """Returns the folder that phantoms are kept in."""
-    named = os.environ.get("ARMSCAN_CACHE")
-    return Path(named) if named else Path(platformdirs.user_cache_dir("armscan"))
 
 
 @cache

@@ -1,0 +1,38 @@
+"""Where runs are that have something to be delivered: noted on this machine, so that the next start finds them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from armscan.files import cache_folder
+from armscan.tracking.spool import Spool
+
+FOLDER = "undelivered"
+
+
+def note(spool: Spool) -> None:
+    """Notes that a run has something to be delivered."""
+    # Where it cannot be noted, nothing is lost: `armscan.track sync` finds it.
+    with contextlib.suppress(OSError):
+        file = _note_of(spool)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(str(spool.file.absolute()))
+
+
+def forget(spool: Spool) -> None:
+    """Notes that everything of a run is delivered."""
+    with contextlib.suppress(OSError):
+        _note_of(spool).unlink(missing_ok=True)
+
+
+def noted() -> Iterator[tuple[Path, Path]]:
+    """All notes, with the spools that they are of."""
+    for file in sorted((cache_folder() / FOLDER).glob("*")):
+        with contextlib.suppress(OSError):
+            yield file, Path(file.read_text())
+
+
+def _note_of(spool: Spool) -> Path:
+    return cache_folder() / FOLDER / spool.address.run_id
