@@ -17,6 +17,7 @@ from armscan.experiment import carry_out
 from armscan.files import DIFF_FILE, ENVIRONMENT_FILE, held
 from armscan.invocation import Invocation
 from armscan.judging.subject import from_its_folder
+from armscan.multirun import remove_if_untracked
 from armscan.provenance import CHOICES_IN_TAGS, start_tracking
 from armscan.stage import Stage
 from armscan.tracking import EVALUATED_TAG, FoundRun, environment_tags, found_run, source_tags
@@ -137,10 +138,14 @@ def reproduced(original: Original, folder: Path, differing: Sequence[str]) -> Co
     command = shlex.join(["python", "-m", "armscan.reproduce", run.run_id])
     invocation = Invocation(folder, run.tags.get("overrides", "").split(), command, choices, None)
     uri = original.config.tracking.uri
-    with held(folder):
-        tracked = start_tracking(original.config, invocation, original.stage)
-        tracked.set_tags({OF_TAG: run.run_id})
-        carry_out(original.stage, tracked, folder, uri)
+    try:
+        with held(folder):
+            tracked = start_tracking(original.config, invocation, original.stage)
+            tracked.set_tags({OF_TAG: run.run_id})
+            carry_out(original.stage, tracked, folder, uri)
+    except BaseException as error:
+        remove_if_untracked(folder, error)
+        raise
     comparison = compared(run.client, run.run_id, tracked.run_id)
     facts = {"of": run.run_id, "run": tracked.run_id, "differences": list(differing), **comparison.to_dict()}
     (folder / FILE).write_text(json.dumps(facts, indent=1))

@@ -1,5 +1,6 @@
 """What many tests need: volumes, an environment's arguments, a folder for cached phantoms."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -110,15 +111,21 @@ def unseen_windows():
 
 
 @pytest.fixture
-def read_only_folder(tmp_path):
-    """A folder that nobody can write to, not even root: a mounted file system."""
-    folder = tmp_path / "read_only"
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "ro,size=64k", "tmpfs", str(folder)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("a read-only disk cannot be mounted here: it needs root")
-    yield folder
-    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+def made_read_only():
+    """Makes a folder one that nobody can write to for a while, not even root: mounted upon itself, read-only."""
+
+    @contextlib.contextmanager
+    def read_only(folder):
+        mounts = (["--bind", str(folder), str(folder)], ["-o", "remount,ro,bind", str(folder)])
+        if shutil.which("mount") is None or subprocess.run(["mount", *mounts[0]], check=False).returncode:
+            pytest.skip("a read-only disk cannot be mounted here: it needs root")
+        try:
+            subprocess.run(["mount", *mounts[1]], check=True)
+            yield
+        finally:
+            subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+    return read_only
 
 
 @pytest.fixture(scope="session")

@@ -170,6 +170,26 @@ def test_reproduce_refuses_what_is_no_run_to_make_again(made, answer):
         client.set_terminated(run_id)
 
 
+def test_reproduce_leaves_nothing_where_artifacts_are_read_only(made, answer, made_read_only):
+    folder, _, run = made
+    with made_read_only(folder / "mlartifacts"):
+        code, _, errors = answer(run.info.run_id)
+    assert code == 2
+    assert f"the artifacts of runs lie in {folder}/mlartifacts" in errors
+    assert "no file can be written there: Read-only file system" in errors
+
+
+def test_reproduce_refuses_a_run_whose_artifacts_are_gone(made, answer):
+    folder, _, run = made
+    moved = folder / "moved"
+    artifacts = folder / "mlartifacts"
+    (artifacts / run.info.run_id).rename(moved)
+    try:
+        assert "has no config.yaml among its artifacts" in answer(run.info.run_id)[2]
+    finally:
+        moved.rename(artifacts / run.info.run_id)
+
+
 def test_reproduce_writes_into_no_folder_that_holds_something(made, answer):
     folder, _, run = made
     code, _, errors = answer(run.info.run_id, f"out={folder}")

@@ -148,9 +148,13 @@ def test_store_whose_artifacts_cannot_be_written_is_refused_before_anything_is_m
         open_store(uri, experiment="other", artifacts="elsewhere", wait_s=60.0)
 
 
-def test_store_with_read_only_artifacts_is_refused(tmp_path, read_only_folder):
-    with pytest.raises(TrackingError, match=r"no file can be written there: Read-only file system"):
-        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="e", artifacts=str(read_only_folder), wait_s=60.0)
+def test_store_with_read_only_artifacts_is_refused(tmp_path, made_read_only):
+    (folder := tmp_path / "artifacts").mkdir()
+    with (
+        made_read_only(folder),
+        pytest.raises(TrackingError, match=r"no file can be written there: Read-only file system"),
+    ):
+        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="e", artifacts=str(folder), wait_s=60.0)
 
 
 def test_found_run_refuses_one_of_a_newer_version(store):
