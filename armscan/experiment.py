@@ -34,6 +34,7 @@ from armscan.files import (
 )
 from armscan.invocation import Invocation
 from armscan.multirun import JOB_TAG
+from armscan.policies.making import keep_policy
 from armscan.settings import evaluate_command, plain, resume_command
 from armscan.stage import Stage
 from armscan.tracking import FAMILIAR_TAG, TrackedRun, open_store
@@ -179,6 +180,8 @@ def carry_out(
             stage.experiment.agent, stage.film_env, folder / "episode.gif", seed=FILM_SEED + stage.experiment.seed
         )
         tracked.keep_results(result, evaluations, folder)
+        if isinstance(stage.experiment.agent, Learner):
+            keep_policy(stage.experiment.agent, stage.test_env, tracked, folder, tell)
     if job_label is None:
         _show(result, evaluations, folder, tracking_uri)
         print(f"judge it  {evaluate_command(tracked.run_id, tracking_uri)}")

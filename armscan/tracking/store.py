@@ -16,7 +16,7 @@ from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 from sqlalchemy.exc import SQLAlchemyError
 
-from armscan.checks import check_float
+from armscan.checks import check_bool, check_float
 from armscan.errors import TrackingError
 from armscan.files import SQLITE_PREFIX, sqlite_file
 from armscan.passwords import (
@@ -39,13 +39,20 @@ DEFAULTS = {
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
     # Nobody has asked for it, and on a cluster it goes nowhere.
     "MLFLOW_DISABLE_TELEMETRY": "true",
-    # Between the lines of a worker's log nobody looks for addresses.
+    # Between the lines of a worker's log nobody looks for bars and addresses.
+    "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
 }
 
 
 def open_store(
-    uri: str, *, experiment: str, artifacts: str, wait_s: float, patience_s: float | None = None
+    uri: str,
+    *,
+    experiment: str,
+    artifacts: str,
+    wait_s: float,
+    policy: bool = True,
+    patience_s: float | None = None,
 ) -> tuple[TrackingStore, str]:
     """Opens a tracking store and makes the experiment where it does not exist yet.
 
@@ -54,6 +61,7 @@ def open_store(
         experiment: the experiment's name.
         artifacts: folder of its artifacts where the store is a database; a server has its own place for them.
         wait_s: how long a run waits for it at its end.
+        policy: whether runs keep their policies in it; only checked here, with the rest of the section.
         patience_s: how long it is waited for otherwise, already while it is opened; None for not at all.
 
     Returns:
@@ -65,6 +73,7 @@ def open_store(
     _check_texts(uri=uri, experiment=experiment, artifacts=artifacts)
     _check_address(uri)
     check_float("tracking.wait_s", wait_s, at_least=0.0)
+    check_bool("tracking.policy", policy)
     shown = hand_over_tracking(uri)
     with usable_store(shown):
         if not shown.startswith(SQLITE_PREFIX):
