@@ -4,7 +4,7 @@
     python -m armscan.policy register run=ID name=NAME      a new version of a model in MLflow's registry
 
 run=ID              the run's id, or its first four or more characters, as the UI shows them
-out=FOLDER          takes the model; a model that was made so is replaced, and nothing else
+out=FOLDER          takes the model; a model of ours is replaced, and nothing else
 name=NAME           of the registered model, which is made where there is none
 tracking=URI        the store, MLFLOW_TRACKING_URI or sqlite:///mlruns.db where nothing is said; its registry, too
 
@@ -13,7 +13,7 @@ docs/policy.md says what goes in and what comes out.
 
 from __future__ import annotations
 
-import os
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -45,17 +45,14 @@ def _run(words: Sequence[str]) -> int:
 
 def _export(tracking: str, run: str, out: Path) -> None:
     # Deferred: a mistake on the command line should be answered before these are loaded.
-    from armscan.policies.making import is_model
+    from armscan.policies.model import is_model
     from armscan.policies.registry import export_policy
 
-    if out.exists() and not is_model(out) and not (out.is_dir() and not any(out.iterdir())):
+    if out.exists() and not is_model(out):
         raise InvalidValueError(f"out is {str(out)!r}, but something else is there, and would be lost: name another")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidValueError(f"out is {str(out)!r}, but no folder can be made there: {error.strerror}") from error
     export_policy(tracking, run, out)
-    _tell(str(out), "exported")
+    print(f"exported   {out}")
+    _tell_how_to_use(str(out))
 
 
 def _register(tracking: str, run: str, name: str) -> None:
@@ -63,14 +60,14 @@ def _register(tracking: str, run: str, name: str) -> None:
     from armscan.policies.registry import register_policy
 
     address = register_policy(tracking, run, name)
-    _tell(address, "registered")
-    print(f"from elsewhere, with MLFLOW_TRACKING_URI={without_password(tracking)}")
+    print(f"registered {address}")
+    print(f"its store  export MLFLOW_TRACKING_URI={shlex.quote(without_password(tracking))}")
+    _tell_how_to_use(address)
 
 
-def _tell(where: str, done: str) -> None:
-    print(f"{done:10} {where}")
+def _tell_how_to_use(where: str) -> None:
     print(f"load it    mlflow.pyfunc.load_model({where!r}).predict(observations)")
-    print(f"serve it   mlflow models serve -m {where} --env-manager local")
+    print(f"serve it   mlflow models serve -m {shlex.quote(where)} --env-manager local")
 
 
 def _read(words: Sequence[str]) -> tuple[str, dict[str, str]]:
@@ -84,9 +81,7 @@ def _read(words: Sequence[str]) -> tuple[str, dict[str, str]]:
     values = read_words([word for word in words if "=" in word], keys, keys)
     for key in keys[:2]:
         if key not in values:
-            raise InvalidValueError(
-                f"{key} is not set, but it must be: give {command} run=ID {keys[1]}=... (--help explains)"
-            )
+            raise InvalidValueError(f"{key} is not set, but it must be: give {key}=... (--help explains)")
     return command, values
 
 

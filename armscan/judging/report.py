@@ -123,7 +123,8 @@ def figures_in_markdown(figures: Mapping[str, Figures]) -> str:
     rows = [["figures, with 95 % intervals", *figures], ["---", *("---:" for _ in figures)]]
     for text, key, form in SUMMARY_ROWS:
         times = SHOWN_TIMES.get(key, 1.0)
-        rows.append([text, *(_cell(each.estimates[key], form, times=times, apart="; ") for each in figures.values())])
+        cells = (_cell(each.estimates[key], form, times=times, apart=" (") for each in figures.values())
+        rows.append([text, *(f"{cell})" if "(" in cell else cell for cell in cells)])
     for text, count in COUNTS:
         rows.append([text, *(str(getattr(each, count)) for each in figures.values())])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)

@@ -49,9 +49,9 @@ class Card:
         judgements = _judgements(run, folder)
         if not judgements:
             text += f"\n\nNothing is known of how good it is: `{evaluate_command(run.run_id, run.uri)}` says it."
-        tags = {}
+        tags: dict[str, str] = {}
         for title, judgement in judgements.items():
-            section = f"\n\n### {title}\n{figures_in_markdown(judgement.figures)}"
+            section = f"\n\n### {title}\n\n{figures_in_markdown(judgement.figures)}"
             # Where there is no room for both, the run's own evaluation stays.
             if len(text + section) <= MAX_CHARS:
                 text += section

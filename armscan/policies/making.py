@@ -10,7 +10,6 @@ from typing import Any
 
 import mlflow.pyfunc
 import numpy as np
-import onnxruntime
 import yaml
 from numpy.typing import NDArray
 
@@ -149,6 +148,9 @@ def _check(folder: Path, policy: Policy, played: list[tuple[Observed, FloatArray
 
 def onnx_answers(file: Path, arrays: Arrays) -> NDArray[np.float32]:
     """Returns what onnxruntime answers a batch of observations with, shape (n, n_free)."""
+    # Deferred: few commands need it.
+    import onnxruntime
+
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     inputs = arrays if isinstance(arrays, dict) else {OBSERVATION: arrays}
     (answers,) = session.run(None, inputs)

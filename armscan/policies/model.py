@@ -11,13 +11,14 @@ from typing import Any
 import mlflow.pyfunc
 import numpy as np
 import torch
+import yaml
 from mlflow.models import ModelSignature
 from mlflow.types import Schema, TensorSpec
 from numpy.typing import NDArray
-from packaging.version import Version
 
 from armscan.agents.export import exported, save_onnx, save_program
 from armscan.agents.policy import Batch, Policy
+from armscan.tracking.run import MODEL_FILE
 
 PROGRAM_FILE, ONNX_FILE = "policy.pt2", "policy.onnx"
 CODE = Path(__file__).with_name("served.py")
@@ -49,10 +50,19 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
             artifacts={"program": str(file)},
             signature=_signature(arrays_of(batch), arrays_of(policy(batch))),
             input_example=_first(2, arrays_of(batch)),
-            pip_requirements=[f"{name}=={Version(metadata.version(name)).public}" for name in REQUIREMENTS],
+            pip_requirements=[f"{name}=={_release(name)}" for name in REQUIREMENTS],
             metadata=dict(facts),
         )
     save_onnx(program, batch, folder / ONNX_FILE)
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder is a model that was written here."""
+    try:
+        said = yaml.safe_load((folder / MODEL_FILE).read_bytes())
+        return "armscan" in said["metadata"]
+    except (OSError, yaml.YAMLError, TypeError, KeyError):
+        return False
 
 
 def arrays_of(batch: Batch) -> Arrays:
@@ -60,6 +70,11 @@ def arrays_of(batch: Batch) -> Arrays:
     if isinstance(batch, torch.Tensor):
         return batch.numpy()
     return {name: part.numpy() for name, part in batch.items()}
+
+
+def _release(name: str) -> str:
+    """Returns the version of a library without the build that is installed here, such as `+cpu`."""
+    return metadata.version(name).partition("+")[0]
 
 
 def _first(n: int, arrays: Arrays) -> Arrays:

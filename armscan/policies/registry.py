@@ -109,7 +109,7 @@ def _check_answers(run: FoundRun, folder: Path) -> None:
     # Whatever is wrong with its files.
     except Exception as error:
         raise ExportError(
-            f"run {run.run_id}: its {POLICY_FOLDER}/ is damaged, and does not answer its own example: {reason_in(error)}"
+            f"run {run.run_id}: its {POLICY_FOLDER}/ is damaged, it does not answer its own example: {reason_in(error)}"
         ) from error
 
 

@@ -5,11 +5,11 @@ from typing import Any
 import mlflow
 import numpy as np
 import torch
-from mlflow.pyfunc import PythonModel, PythonModelContext
+from mlflow.pyfunc.model import PythonModel, PythonModelContext
 from numpy.typing import NDArray
 
 
-class Policy(PythonModel):  # type: ignore[misc]
+class Policy(PythonModel):
     """A batch of observations in, shape (n, k), or each part by its name, shape (n, ...); actions out."""
 
     def load_context(self, context: PythonModelContext) -> None:
@@ -20,7 +20,7 @@ class Policy(PythonModel):  # type: ignore[misc]
         self,
         context: PythonModelContext,
         # Or a dict of arrays; MLflow warns of any other hint.
-        model_input: np.ndarray,  # type: ignore[type-arg]
+        model_input: np.ndarray,
         params: dict[str, Any] | None = None,
     ) -> NDArray[np.float32]:
         """Returns the actions, shape (n, n_free), within [-1, 1]."""
