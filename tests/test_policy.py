@@ -10,11 +10,14 @@ from mlflow import MlflowClient
 from armscan import evaluate, policy
 from armscan.files import BEST_CHECKPOINT
 from armscan.policies.card import MAX_CHARS
+from armscan.tracking import EVALUATED_TAG
 from armscan.training import load_checkpoint, save_checkpoint
 
 from .test_evaluate import GUESSER, IMAGES, tracked
 from .test_run import runs_in
 from .training.test_train import evaluation_of
+
+EXPORT, REGISTER = ("export", "out=new"), ("register", "name=n")
 
 
 @pytest.fixture
@@ -140,27 +143,24 @@ def test_bad_words_are_answered_in_one_line_and_change_nothing(answer, tmp_path)
     assert "policy" not in {file.path for file in store_of(tmp_path).list_artifacts(run_id)}
 
 
-@pytest.mark.parametrize("words", [["export", "out=new"], ["register", "name=n"]])
-def test_run_without_a_policy_is_refused(answer, tmp_path, words):
+def test_run_without_a_policy_is_refused(answer, tmp_path):
     baseline = tracked(tmp_path, agent=GUESSER)
-    assert answer(*words, f"run={baseline}")[2] == (
-        f"error: run is '{baseline}', but its agent is none that learns: it has no policy"
-    )
-    learner = tracked(tmp_path)
-    assert answer(f"run={learner}", "episodes=1", of=evaluate)[0] == 0
-    ours = (baseline, learner)
-    (evaluation,) = [run.info.run_id for run in runs_in(tmp_path)[1] if run.info.run_id not in ours]
-    assert answer(*words, f"run={evaluation}")[2] == (
-        f"error: run is '{evaluation}', but that is an evaluation, of {learner}"
-    )
+    evaluation = tracked(tmp_path)
+    store_of(tmp_path).set_tag(evaluation, EVALUATED_TAG, baseline)
     unfinished = tracked(tmp_path, kept=("config.yaml", "volumes.json"))
-    assert answer(*words, f"run={unfinished}")[2].startswith(f"error: run {unfinished} has kept no checkpoint")
+    lines = {
+        baseline: f"run is '{baseline}', but its agent is none that learns: it has no policy",
+        evaluation: f"run is '{evaluation}', but that is an evaluation, of {baseline}",
+        unfinished: f"run {unfinished} has kept no checkpoint",
+    }
+    for words in EXPORT, REGISTER:
+        for run_id, line in lines.items():
+            assert answer(*words, f"run={run_id}")[2].startswith(f"error: {line}")
     assert not (tmp_path / "new").exists()
     assert store_of(tmp_path).search_registered_models() == []
 
 
-@pytest.mark.parametrize("words", [["export", "out=new"], ["register", "name=n"]])
-def test_damaged_checkpoint_is_told_and_changes_nothing(answer, tmp_path, words):
+def test_damaged_checkpoint_is_told_and_changes_nothing(answer, tmp_path):
     run_id = tracked(tmp_path)
     file, client = tmp_path / BEST_CHECKPOINT, store_of(tmp_path)
     weights, facts = load_checkpoint(file)
@@ -173,10 +173,10 @@ def test_damaged_checkpoint_is_told_and_changes_nothing(answer, tmp_path, words)
     for line, contents in damages.items():
         file.write_bytes(contents)
         client.log_artifact(run_id, str(file))
-        assert answer(*words, f"run={run_id}")[2].startswith(f"error: run {run_id}: {line}")
+        assert answer(*EXPORT, f"run={run_id}")[2].startswith(f"error: run {run_id}: {line}")
     save_checkpoint(file, {"other": next(iter(weights.values()))}, facts)
     client.log_artifact(run_id, str(file))
-    assert answer(*words, f"run={run_id}")[2].startswith(f"error: run {run_id}: the checkpoint is another agent's")
+    assert answer(*REGISTER, f"run={run_id}")[2].startswith(f"error: run {run_id}: the checkpoint is another agent's")
     assert not (tmp_path / "new").exists()
     assert client.search_registered_models() == []
     assert "policy" not in {file.path for file in client.list_artifacts(run_id)}

@@ -10,6 +10,7 @@ import zipfile
 from collections import Counter
 from pathlib import Path
 
+import mlflow.pyfunc
 import pytest
 from mlflow import MlflowClient
 
@@ -48,7 +49,7 @@ def runs_in(folder):
     return client, client.search_runs([experiment.experiment_id])
 
 
-def test_run_trains_evaluates_and_tracks(tmp_path):
+def test_run_trains_evaluates_and_tracks(tmp_path, monkeypatch):
     ended = armscan_run(*SMALL, "seed=3", cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
@@ -72,8 +73,14 @@ def test_run_trains_evaluates_and_tracks(tmp_path):
     assert steps[-1] >= 400
     artifacts = {file.path for file in client.list_artifacts(tracked.info.run_id)}
     assert artifacts == {
-        *("best.pt", "last.pt", "config.yaml", "volumes.json", "episode.gif", "evaluation.json", "learning_curve.png")
+        *("best.pt", "last.pt", "config.yaml", "volumes.json", "episode.gif", "evaluation.json", "learning_curve.png"),
+        "policy",
     }
+    assert tracked.data.tags["policy"] == "kept"
+    with monkeypatch.context() as patched:
+        patched.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlruns.db")
+        model = mlflow.pyfunc.load_model(f"runs:/{tracked.info.run_id}/policy")
+    assert model.predict(model.input_example).shape == (2, 1)
     (folder,) = (tmp_path / "outputs").glob("*/*")
     evaluation = json.loads((folder / "evaluation.json").read_text())
     assert len(evaluation["test volumes"]["episodes"]) == 3
