@@ -31,7 +31,8 @@ SECTIONS = (
     "compute",
 )
 SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
-EVALUATION_KEYS, TRACKING_KEYS = ("episodes",), ("uri", "experiment", "artifacts", "wait_s", "system_metrics_s")
+EVALUATION_KEYS = ("episodes",)
+TRACKING_KEYS = ("uri", "experiment", "artifacts", "wait_s", "system_metrics_s", "policy")
 
 
 @dataclass(frozen=True, kw_only=True)

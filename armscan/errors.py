@@ -40,6 +40,10 @@ class ResetNeededError(ArmscanError, RuntimeError):
     """An environment was stepped or rendered without a running episode."""
 
 
+class ExportError(ArmscanError, RuntimeError):
+    """A policy cannot be written down as a model, or the model does not answer as the agent does."""
+
+
 class DivergedError(ArmscanError, ArithmeticError):
     """Learning has led to weights that are not finite."""
 

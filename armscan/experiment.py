@@ -18,6 +18,7 @@ from armscan.building import check_keys
 from armscan.console import print_results, print_where_to_look, progress_reporter
 from armscan.files import LAST_CHECKPOINT, held
 from armscan.invocation import Invocation
+from armscan.policies.making import keep_policy
 from armscan.provenance import start_tracking
 from armscan.settings import evaluate_command, resume_command
 from armscan.stage import Stage
@@ -93,6 +94,8 @@ def carry_out(
             stage.experiment.agent, stage.film_env, folder / "episode.gif", seed=FILM_SEED + stage.experiment.seed
         )
         tracked.keep_results(result, evaluations, folder)
+        if isinstance(stage.experiment.agent, Learner):
+            keep_policy(stage.experiment.agent, stage.test_env, tracked, folder, tell)
     if job_label is None:
         _show(result, evaluations, folder, tracking_uri)
         print(f"judge it  {evaluate_command(tracked.run_id, tracking_uri)}")

@@ -11,6 +11,7 @@ import zipfile
 from collections import Counter
 from pathlib import Path
 
+import mlflow.pyfunc
 import pytest
 import torch
 from mlflow import MlflowClient
@@ -54,7 +55,7 @@ def runs_in(folder):
     return client, client.search_runs([experiment.experiment_id])
 
 
-def test_run_trains_evaluates_and_tracks(tmp_path):
+def test_run_trains_evaluates_and_tracks(tmp_path, monkeypatch):
     ended = armscan_run(*SMALL, "seed=3", cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
@@ -96,9 +97,14 @@ def test_run_trains_evaluates_and_tracks(tmp_path):
     # Where the code is not that of its commit, beside them what differs.
     assert artifacts - {"code.diff"} == {
         *("best.pt", "last.pt", "config.yaml", "volumes.json", "environment.json"),
-        *("episode.gif", "evaluation.json", "learning_curve.png"),
+        *("episode.gif", "evaluation.json", "learning_curve.png", "policy"),
     }
     assert ("code.diff" in artifacts) == (tracked.data.tags["git.dirty"] == "true")
+    assert tracked.data.tags["policy"] == "kept"
+    with monkeypatch.context() as patched:
+        patched.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlruns.db")
+        model = mlflow.pyfunc.load_model(f"runs:/{tracked.info.run_id}/policy")
+    assert model.predict(model.input_example).shape == (2, 1)
     evaluation = json.loads((folder / "evaluation.json").read_text())
     assert len(evaluation["test volumes"]["episodes"]) == 3
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +45,11 @@ class Compute:
         """The device that tensors are on: `cpu` or `cuda`."""
         return "cuda" if self.device == "cuda" or (self.device == "auto" and torch.cuda.is_available()) else "cpu"
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether all is computed in 32 bits on the CPU, as a plain copy of a network does."""
+        return self.torch_device == "cpu" and self.precision == "float32"
+
     def apply_to(self, network: nn.Module) -> None:
         """Makes a network compute in this way from now on; its inputs and outputs stay of 32 bits."""
         if self.precision == "bfloat16":
@@ -57,6 +63,14 @@ class Compute:
             network.forward = precise
         if self.compile:
             network.compile()
+
+
+def plain_copy(network: nn.Module) -> nn.Module:
+    """Returns a copy of a network that computes in 32 bits on the CPU, whatever `Compute.apply_to` has done to it."""
+    # The copy of what was compiled is not.
+    copied = deepcopy(network)
+    vars(copied).pop("forward", None)
+    return copied.to("cpu", torch.float32)
 
 
 def _in_32_bits(output: Any) -> Any:

@@ -147,7 +147,7 @@ class MultimodalBody(ModuleWithVectorOutput):
         for name, convolutions in self.convolutions.items():
             image = torch.as_tensor(obs[name], device=device)
             # Frames, and a channel for each tissue, side by side as channels.
-            frames = image.reshape(len(image), -1, *image.shape[-2:]).float() * self._scales[name]
+            frames = image.reshape(image.shape[0], -1, *image.shape[-2:]).float() * self._scales[name]
             features.append(convolutions(frames))
         return self.head(torch.cat(features, dim=1)), state
 

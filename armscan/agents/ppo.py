@@ -13,6 +13,7 @@ from armscan.agents.epoch_metrics import EpochMetricsFactory
 from armscan.agents.image_replay import replay_for
 from armscan.agents.networks import Spread
 from armscan.agents.parameters import PolicyParameters, number
+from armscan.agents.policy import clipped
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.tianshou_envs import SideBySideFactory
 from armscan.agents.tianshou_learner import TianshouLearner, experiment_config
@@ -112,5 +113,6 @@ class PPO(PolicyParameters):
             replay=replay_for(setup.observation_space, n_collected, self.num_envs),
             random_env_steps=0,
             final_lr_share=self.final_lr_share,
+            bounded=clipped,
             setup=setup,
         )

@@ -10,6 +10,7 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from armscan.agents.compute import Compute
+from armscan.agents.policy import Policy
 from armscan.envs.actions import ActionBounds
 from armscan.envs.task import Observed
 from armscan.volumes.plane import FloatArray
@@ -54,6 +55,9 @@ class Learner(Agent, Protocol):
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
         """Learns for `n_env_steps`, or as few more as its environments allow; returns its training metrics by name."""
+
+    def policy(self) -> Policy:
+        """Returns a copy of what `act` computes with, for batches of observations; later learning leaves it alone."""
 
     def weights(self) -> dict[str, Any]:
         """Returns what `act` needs: tensors by name."""

@@ -15,6 +15,7 @@ from armscan.agents.budget import check_batch, check_updates, kept_at_most
 from armscan.agents.examples import Examples
 from armscan.agents.networks import Spread
 from armscan.agents.parameters import Parameters, lr_share, number
+from armscan.agents.policy import Policy, clipped
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.tianshou_envs import SideBySideFactory
 from armscan.agents.tianshou_learner import load_into
@@ -111,7 +112,7 @@ class RegressionLearner:
         self._network = network
         self._examples = examples
         self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
-        self._device = setup.compute.torch_device
+        self._compute, self._device = setup.compute, setup.compute.torch_device
         self._optimiser = torch.optim.Adam(network.parameters(), lr=regression.lr)
         self._n_env_steps = self._n_epochs = 0
         setup.compute.apply_to(network)
@@ -219,6 +220,10 @@ class RegressionLearner:
         one = observation_of({name: part[None] for name, part in parts_of(observation).items()})
         with torch.no_grad():
             return self._predicted(one)[0].clamp(-1.0, 1.0).cpu().numpy()
+
+    def policy(self) -> Policy:
+        """Returns a copy of the network that `act` asks."""
+        return Policy(self._network, clipped, self._compute)
 
     def weights(self) -> dict[str, Any]:
         """Returns the network's weights."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import torch
 from tianshou.highlevel.config import OffPolicyTrainingConfig
 from tianshou.highlevel.experiment import SACExperimentBuilder
 from tianshou.highlevel.params.algorithm_params import SACParams
@@ -113,5 +114,6 @@ class SAC(PolicyParameters):
             replay=replay_for(setup.observation_space, n_kept, self.num_envs),
             random_env_steps=n_random,
             final_lr_share=self.final_lr_share,
+            bounded=torch.tanh,
             setup=setup,
         )

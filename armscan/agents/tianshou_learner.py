@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from tianshou.trainer import OffPolicyTrainer
 
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.parameters import lr_share
+from armscan.agents.policy import Policy
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
 from armscan.agents.steady_updates import SteadyTrainer
@@ -39,6 +41,7 @@ class TianshouLearner:
         random_env_steps: steps with random actions before the first update.
         final_lr_share: what the learning rates of actor and critics have come down to at the training's end, as a share
             of what they were; they fall by as much in each epoch as it has steps.
+        bounded: takes the mean of the policy's actions to [-1, 1], as the experiment's policy does.
         setup: what the agent was given.
     """
 
@@ -49,6 +52,7 @@ class TianshouLearner:
         replay: Replay,
         random_env_steps: int,
         final_lr_share: float,
+        bounded: Callable[[torch.Tensor], torch.Tensor],
         setup: AgentSetup,
     ) -> None:
         world = experiment.create_experiment_world()
@@ -73,6 +77,7 @@ class TianshouLearner:
         self._random_env_steps = random_env_steps
         self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
         self._final_lr_share = final_lr_share
+        self._bounded, self._compute = bounded, setup.compute
         self._n_epochs = 0
         self._first_lrs = [group["lr"] for group in self._lr_groups()]
         for network in networks_of(self._algorithm):
@@ -156,6 +161,11 @@ class TianshouLearner:
         with torch.no_grad():
             result = policy(Batch(obs=_batch_of_one(observation), info=Batch()))
         return np.asarray(policy.map_action(result.act.cpu().numpy())[0])
+
+    def policy(self) -> Policy:
+        """Returns a copy of the actor that `act` asks, with the mode of its actions as its answer."""
+        policy = self._algorithm.policy
+        return Policy(policy.actor, self._bounded, self._compute, is_sampling=not policy.deterministic_eval)
 
     def weights(self) -> dict[str, Any]:
         """Returns the policy's weights."""

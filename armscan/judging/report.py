@@ -36,6 +36,7 @@ SUMMARY_ROWS = (
     ("mean Dice, artery", "mean_dice_artery", "{:.2f}"),
     ("time per plane (ms)", "mean_seconds_per_plane", "{:.2f}"),
 )
+COUNTS = (("volumes", "n_volumes"), ("episodes", "n_episodes"), ("started solved", "n_started_solved"))
 ROWS_OF_THE_OTHERS = (
     ("success rate", f"success_rate{NOT_STARTED_SOLVED}", "{:.1%}"),
     ("mean steps", f"mean_steps{NOT_STARTED_SOLVED}", "{:.2f}"),
@@ -117,6 +118,18 @@ def judgement_tables(judgement: Judgement) -> list[Table]:
     return [_summary(judgement.figures), *(_by_volume(*each) for each in judgement.volume_figures.items())]
 
 
+def figures_in_markdown(figures: Mapping[str, Figures]) -> str:
+    """Returns the figures by what their volumes are called, each with its interval, as a table in Markdown."""
+    rows = [["figures, with 95 % intervals", *figures], ["---", *("---:" for _ in figures)]]
+    for text, key, form in SUMMARY_ROWS:
+        times = SHOWN_TIMES.get(key, 1.0)
+        cells = (_cell(each.estimates[key], form, times=times, apart=" (") for each in figures.values())
+        rows.append([text, *(f"{cell})" if "(" in cell else cell for cell in cells)])
+    for text, count in COUNTS:
+        rows.append([text, *(str(getattr(each, count)) for each in figures.values())])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
 def _summary(figures: Mapping[str, Figures]) -> Table:
     table = Table(title="figures, with 95 % intervals", title_justify="left")
     table.add_column("")
@@ -130,7 +143,7 @@ def _summary(figures: Mapping[str, Figures]) -> Table:
             wilson = (each.estimates["success_rate_wilson"] for each in figures.values())
             table.add_row("  its interval by Wilson", *(_interval(estimate, form) for estimate in wilson))
     table.add_section()
-    for text, count in (("volumes", "n_volumes"), ("episodes", "n_episodes"), ("started solved", "n_started_solved")):
+    for text, count in COUNTS:
         table.add_row(text, *(str(getattr(each, count)) for each in figures.values()))
     table.add_section()
     table.add_row("those not started solved:")

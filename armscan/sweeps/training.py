@@ -17,8 +17,10 @@ from armscan.errors import CheckpointError, InvalidValueError
 from armscan.experiment import FILM_SEED, judged, learned
 from armscan.files import LAST_CHECKPOINT, held, write_whole
 from armscan.invocation import Invocation
+from armscan.log import say
 from armscan.multirun import Job
 from armscan.patience import PATIENCE_S
+from armscan.policies.making import keep_policy
 from armscan.provenance import place_tags, start_tracking, volume_tags
 from armscan.settings import plain
 from armscan.stage import Stage
@@ -28,14 +30,14 @@ from armscan.sweeps.tally import ENV_STEPS
 from armscan.sweeps.tasks import VolumesInMemory
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
 from armscan.tracking.run import CURVE_FILE, EVALUATION_FILE
-from armscan.training import TEST, EpochReport, Evaluation, TrainingResult, film_episode, take_up
+from armscan.training import TEST, EpochReport, Evaluation, film_episode, take_up
 
 # Of each training, beside the figures of its best validation.
 TRAINING_FIGURES = (ENV_STEPS, "training_s", "solved")
 RUN_FILE, FILM_FILE = "run.json", "episode.gif"
 # What a training leaves that is worth having in the tracking store.
 KEPT = (".pt", ".png", ".gif", ".json")
-Conclude = Callable[[Stage, TrainingResult, Path], dict[str, float]]
+Conclude = Callable[[Stage, TrackedRun, Path], dict[str, float]]
 
 
 @dataclass
@@ -109,17 +111,19 @@ class Training:
         return {name: interquartile_mean([figures[name] for figures in of_seeds]) for name in of_seeds[0]}
 
     def judge(self, attempt: Attempt) -> dict[str, float]:
-        """Trains, plays the final evaluations, films an episode; returns the figures on the test volumes."""
+        """Trains, plays the final evaluations, films an episode, keeps the policy; returns the test's figures."""
         (seed,) = attempt.seeds
         return trained(attempt, seed, _concluded)
 
 
-def _concluded(stage: Stage, result: TrainingResult, folder: Path) -> dict[str, float]:
+def _concluded(stage: Stage, tracked: TrackedRun, folder: Path) -> dict[str, float]:
     evaluations = judged(stage)
     contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
     (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
     agent, seed = stage.experiment.agent, FILM_SEED + stage.experiment.seed
     film_episode(agent, stage.film_env, folder / FILM_FILE, seed=seed)
+    assert isinstance(agent, Learner)
+    keep_policy(agent, stage.test_env, tracked, folder, say)
     figures = {f"test/{name}": value for name, value in evaluations[TEST].metrics().items()}
     for volume, evaluation in evaluations[TEST].by_volume().items():
         figures |= {f"test/volume/{volume}/{name}": value for name, value in evaluation.metrics().items()}
@@ -156,7 +160,7 @@ def trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> di
             except optuna.TrialPruned as error:
                 pruned = error
             else:
-                concluded = conclude(stage, result, folder) if conclude else {}
+                concluded = conclude(stage, tracked, folder) if conclude else {}
             draw_learning_curve(reporter.reports, folder / CURVE_FILE, title=tracked.name)
             attempt.show_picture(folder / CURVE_FILE)
             # Nobody goes on with it; the best one stays.

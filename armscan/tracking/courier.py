@@ -135,7 +135,7 @@ def deliver(spool: Spool, client: MlflowClient, lane: Lane, *, is_whole: bool = 
         if not entries:
             return n_delivered
         for entry in entries if lane == "files" and not is_whole else ():
-            if not (file := spool.folder / entry["file"]).exists():
+            if not (file := spool.folder / _file_of(entry["file"])[0]).exists():
                 raise FileNotFoundError(f"{file} is not there")
         for kind, group in itertools.groupby(entries, key=lambda entry: next(iter(entry))):
             _deliver(client, spool, kind, [entry[kind] for entry in group])
@@ -162,8 +162,8 @@ def _deliver(client: MlflowClient, spool: Spool, kind: str, values: list[Any]) -
             for status, at_ms in values:
                 _set_status(client, run_id, status, at_ms)
         case "file":
-            for name in values:
-                _keep_file(client, run_id, spool.folder / name)
+            for name, place in map(_file_of, values):
+                _keep_file(client, run_id, spool.folder / name, place)
         case "address":
             return
         case _:
@@ -191,8 +191,16 @@ def _set_status(client: MlflowClient, run_id: str, status: str, at_ms: int) -> N
         client.set_terminated(run_id, status, end_time=at_ms)
 
 
-def _keep_file(client: MlflowClient, run_id: str, path: Path) -> None:
+def _file_of(value: str | list[str]) -> tuple[str, str | None]:
+    """Returns the name of a file that is to be kept, and the folder among the artifacts that it goes to."""
+    if isinstance(value, str):
+        return value, None
+    name, place = value
+    return name, place
+
+
+def _keep_file(client: MlflowClient, run_id: str, path: Path, place: str | None) -> None:
     if not path.exists():
         say(f"run {run_id}: {path} was removed before the store could keep it")
         return
-    client.log_artifact(run_id, str(path))
+    client.log_artifact(run_id, str(path), place)

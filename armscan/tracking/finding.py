@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -117,7 +116,6 @@ def found_run(uri: str, run_id: str) -> FoundRun:
     Raises:
         TrackingError: if no run is meant, or several are, or the store does not exist or cannot be used.
     """
-    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     client = open_existing_store(uri)
     with usable_store(uri):
         run = find_run(client, run_id)

@@ -26,7 +26,7 @@ from armscan.tracking.spool import Address, Spool, file_of, now_ms
 from armscan.tracking.system import PREFIX, SystemMetrics
 from armscan.training import EpochReport, Evaluation, TrainingResult
 
-EVALUATION_FILE, CURVE_FILE = "evaluation.json", "learning_curve.png"
+EVALUATION_FILE, CURVE_FILE, MODEL_FILE = "evaluation.json", "learning_curve.png", "MLmodel"
 # Why a run ended before its end.
 FAILURE_TAG = "failure"
 MAX_REASON_CHARS = 5000
@@ -179,6 +179,14 @@ class TrackedRun:
         """Keeps files as artifacts; they stay as they are until the run has ended."""
         for file in files:
             self._add(file=os.path.relpath(file, self._spool.folder))
+
+    def log_folder(self, folder: Path) -> None:
+        """Keeps a folder with all that is in it, under its own name; it stays as it is until the run has ended."""
+        files = [file for file in folder.rglob("*") if file.is_file()]
+        # Last what says of a folder that it is a model: who finds it finds all of it.
+        for file in sorted(files, key=lambda file: (file.name == MODEL_FILE, file)):
+            name, place = os.path.relpath(file, self._spool.folder), file.parent.relative_to(folder.parent)
+            self._add(file=[name, place.as_posix()])
 
     def keep_results(self, result: TrainingResult | None, evaluations: Mapping[str, Evaluation], folder: Path) -> None:
         """Logs the final evaluations, and keeps what the run has made in its folder.

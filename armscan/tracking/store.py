@@ -17,7 +17,7 @@ from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 from sqlalchemy.exc import SQLAlchemyError
 
-from armscan.checks import check_float
+from armscan.checks import check_bool, check_float
 from armscan.errors import TrackingError
 from armscan.files import SQLITE_PREFIX, check_writable, sqlite_file
 from armscan.passwords import (
@@ -40,7 +40,8 @@ DEFAULTS = {
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
     # Nobody has asked for it, and on a cluster it goes nowhere.
     "MLFLOW_DISABLE_TELEMETRY": "true",
-    # Between the lines of a worker's log nobody looks for addresses.
+    # Between the lines of a worker's log nobody looks for bars and addresses.
+    "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
 }
 
@@ -52,6 +53,7 @@ def open_store(
     artifacts: str,
     wait_s: float,
     system_metrics_s: float | None = None,
+    policy: bool = True,
     patience_s: float | None = None,
 ) -> tuple[TrackingStore, str]:
     """Opens a tracking store and makes the experiment where it does not exist yet.
@@ -62,6 +64,7 @@ def open_store(
         artifacts: folder of its artifacts where the store is a database; a server has its own place for them.
         wait_s: how long a run waits for it at its end.
         system_metrics_s: seconds between two looks at the machine while a run trains; None for none.
+        policy: whether runs keep their policies in it; only checked here, with the rest of the section.
         patience_s: how long it is waited for otherwise, already while it is opened; None for not at all.
 
     Returns:
@@ -76,6 +79,7 @@ def open_store(
     if system_metrics_s is not None:
         check_float("tracking.system_metrics_s", system_metrics_s, above=0.0)
     connected = partial(_store, wait_s=wait_s, system_metrics_s=system_metrics_s, patience_s=patience_s)
+    check_bool("tracking.policy", policy)
     shown = hand_over_tracking(uri)
     with usable_store(shown):
         if not shown.startswith(SQLITE_PREFIX):

@@ -1,8 +1,10 @@
 """Runs in MLflow, on a real SQLite store."""
 
+import json
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -18,7 +20,9 @@ from armscan.tracking import (
     open_store,
     source_tags,
 )
+from armscan.tracking.courier import deliver
 from armscan.tracking.limits import flattened
+from armscan.tracking.spool import Address, Spool, file_of
 from armscan.training import EpochReport, TrainingResult
 
 from ..training.test_train import evaluation_of
@@ -80,6 +84,42 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
     assert [(point.step, point.value) for point in history] == [(100, 9.0), (200, 4.0), (300, 3.0)]
     files = {file.path for file in client.list_artifacts(tracked.run_id)}
     assert files == {"best.pt", "evaluation.json", "learning_curve.png"}
+
+
+def test_tracked_run_keeps_a_folder_with_all_in_it_and_what_makes_it_a_model_last(store, tmp_path):
+    client, experiment_id = store
+    model = tmp_path / "run" / "policy"
+    contents = {"MLmodel": "m", "artifacts/policy.pt2": "p", "artifacts/more/a": "a", "zero": "z"}
+    for name, text in contents.items():
+        (model / name).parent.mkdir(parents=True, exist_ok=True)
+        (model / name).write_text(text)
+    (tmp_path / "run" / "beside").write_text("not in it")
+    with TrackedRun.start(client, experiment_id, name="n", config={}, tags={}, folder=tmp_path / "run") as tracked:
+        tracked.log_folder(model)
+    spooled = [json.loads(line) for line in file_of(tmp_path / "run", tracked.run_id).read_text().splitlines()]
+    files = [entry["file"] for entry in spooled if "file" in entry]
+    assert files[-1] == ["policy/MLmodel", "policy"]
+    assert ["policy/artifacts/more/a", "policy/artifacts/more"] in files
+    assert [file.path for file in client.list_artifacts(tracked.run_id)] == ["policy"]
+    kept = client.download_artifacts(tracked.run_id, "policy", str(tmp_path))
+    for name, text in contents.items():
+        assert (Path(kept) / name).read_text() == text
+
+
+def test_folder_that_was_removed_before_it_was_delivered_is_told(store, tmp_path, capsys):
+    client, experiment_id = store
+    run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id
+    spool = Spool.begin(tmp_path, Address(run_id, client.uri))
+    spool.add(file=["policy/MLmodel", "policy"])
+    spool.add(file="best.pt")
+    # Of a folder that was copied, the file may be elsewhere.
+    with pytest.raises(FileNotFoundError, match="policy/MLmodel is not there"):
+        deliver(spool, client.mlflow, "files", is_whole=False)
+    assert deliver(spool, client.mlflow, "files") == 2
+    spool.close()
+    said = capsys.readouterr().out
+    assert "policy/MLmodel was removed before the store could keep it" in said
+    assert "best.pt was removed" in said
 
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), "KILLED"), (ValueError("no"), "FAILED")])

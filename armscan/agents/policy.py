@@ -1,0 +1,61 @@
+"""A learner's policy alone, as a plain network: a batch of observations in, actions out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import nn
+
+from armscan.agents.compute import Compute, plain_copy
+from armscan.envs.history import observation_of, parts_of
+from armscan.envs.task import Observed
+
+# A batch of observations as tensors: one of shape (n, k), or the parts by their names, each of shape (n, ...).
+Batch = torch.Tensor | dict[str, torch.Tensor]
+
+
+class Policy(nn.Module):
+    """A copy of a learner's actor, in 32 bits on the CPU, with the mean of its actions as its answer.
+
+    Args:
+        actor: gives mean and spread of the actions.
+        bounded: takes the mean to [-1, 1], as the learner does when it acts.
+        compute: what the learner computes with.
+        is_sampling: whether the learner draws its actions from mean and spread, also where it is judged.
+    """
+
+    def __init__(
+        self,
+        actor: nn.Module,
+        bounded: Callable[[torch.Tensor], torch.Tensor],
+        compute: Compute,
+        *,
+        is_sampling: bool = False,
+    ) -> None:
+        super().__init__()
+        self.actor = plain_copy(actor).eval().requires_grad_(requires_grad=False)
+        self._bounded = bounded
+        self.differs = "the agent draws its actions, of which this is the most likely one" if is_sampling else None
+        """Why the learner's own `act` may give other numbers; None where it gives the same."""
+        if self.differs is None and not compute.is_plain:
+            self.differs = f"the agent has computed with {compute.precision} on {compute.torch_device}"
+
+    def forward(self, observations: Batch) -> torch.Tensor:
+        """Returns the actions for a batch of observations, shape (n, n_free), within [-1, 1]."""
+        (mean, _), _ = self.actor(observations)
+        return self._bounded(mean)
+
+
+def clipped(mean: torch.Tensor) -> torch.Tensor:
+    """Returns a mean as a policy has it that is bounded by clipping."""
+    return mean.clamp(-1.0, 1.0)
+
+
+def batch_of(observations: Sequence[Observed]) -> Batch:
+    """Returns single observations, one of them at least, as one batch of tensors."""
+    parts = [parts_of(observation) for observation in observations]
+    stacked = {name: np.stack([each[name] for each in parts]) for name in parts[0]}
+    batch: Batch = observation_of({name: torch.from_numpy(array) for name, array in stacked.items()})  # type: ignore
+    return batch

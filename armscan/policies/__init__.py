@@ -1,0 +1,1 @@
+"""Trained policies as models: written, checked, kept with their runs, registered."""

@@ -1,0 +1,91 @@
+"""A policy as a folder that MLflow loads and serves wherever torch, NumPy and MLflow are, and nothing of armscan."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import mlflow.pyfunc
+import numpy as np
+import torch
+import yaml
+from mlflow.models import ModelSignature
+from mlflow.types import Schema, TensorSpec
+from numpy.typing import NDArray
+
+from armscan.agents.export import exported, save_onnx, save_program
+from armscan.agents.policy import Batch, Policy
+from armscan.tracking.run import MODEL_FILE
+
+PROGRAM_FILE, ONNX_FILE = "policy.pt2", "policy.onnx"
+CODE = Path(__file__).with_name("served.py")
+# What the code needs; others come with these.
+REQUIREMENTS = ("mlflow", "numpy", "torch")
+# As the model takes them: one array of shape (n, k), or the parts by their names, each of shape (n, ...).
+Arrays = NDArray[Any] | dict[str, NDArray[Any]]
+
+
+def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, Any]) -> None:
+    """Writes a policy as a model, with an ONNX file beside it.
+
+    Args:
+        folder: of the model, which is not there yet.
+        policy: of a learner.
+        batch: two observations or more, which show their shapes; two of them stay with the model as its example.
+        facts: about the policy, which stay with the model; plain values.
+
+    Raises:
+        ExportError: if torch.export or ONNX cannot take the policy.
+    """
+    program = exported(policy, batch)
+    with tempfile.TemporaryDirectory() as beside:
+        file = Path(beside, PROGRAM_FILE)
+        save_program(program, file)
+        mlflow.pyfunc.save_model(
+            folder,
+            python_model=str(CODE),
+            artifacts={"program": str(file)},
+            signature=_signature(arrays_of(batch), arrays_of(policy(batch))),
+            input_example=_first(2, arrays_of(batch)),
+            pip_requirements=[f"{name}=={_release(name)}" for name in REQUIREMENTS],
+            metadata=dict(facts),
+        )
+    save_onnx(program, batch, folder / ONNX_FILE)
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder is a model that was written here."""
+    try:
+        said = yaml.safe_load((folder / MODEL_FILE).read_bytes())
+        return "armscan" in said["metadata"]
+    except (OSError, yaml.YAMLError, TypeError, KeyError):
+        return False
+
+
+def arrays_of(batch: Batch) -> Arrays:
+    """Returns a batch of tensors as the model takes it."""
+    if isinstance(batch, torch.Tensor):
+        return batch.numpy()
+    return {name: part.numpy() for name, part in batch.items()}
+
+
+def _release(name: str) -> str:
+    """Returns the version of a library without the build that is installed here, such as `+cpu`."""
+    return metadata.version(name).partition("+")[0]
+
+
+def _first(n: int, arrays: Arrays) -> Arrays:
+    return {name: part[:n] for name, part in arrays.items()} if isinstance(arrays, dict) else arrays[:n]
+
+
+def _signature(observations: Arrays, actions: Arrays) -> ModelSignature:
+    """Of batches of every size."""
+    return ModelSignature(inputs=_schema(observations), outputs=_schema(actions))
+
+
+def _schema(arrays: Arrays) -> Schema:
+    parts = arrays if isinstance(arrays, dict) else {None: arrays}
+    return Schema([TensorSpec(np.dtype(part.dtype), (-1, *part.shape[1:]), name) for name, part in parts.items()])

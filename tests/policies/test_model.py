@@ -1,0 +1,248 @@
+"""Policies as models: loaded where nothing of armscan is, served over HTTP, and refused where they answer otherwise."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from armscan.agents.policy import batch_of
+from armscan.errors import ExportError
+from armscan.policies.making import FIRST_SEED, keep_policy, make_model, onnx_answers
+from armscan.policies.model import arrays_of, is_model
+from armscan.tracking import TrackedRun, open_store
+
+from ..agents.conftest import ALGORITHMS, MAKERS, setup_for
+from ..agents.test_policy import observed, taught
+
+LOOPBACK, START_S = "127.0.0.1", 120.0
+VARIANTS = [(algorithm, made_of) for algorithm in ALGORITHMS for made_of in MAKERS]
+# Loads each model that it is given and asks it, for a batch of one and for all; what it has loaded is said at its end.
+ASK = """
+import sys, mlflow.pyfunc, numpy
+for folder in sys.argv[1:]:
+    model = mlflow.pyfunc.load_model(folder + "/model")
+    with numpy.load(folder + "/observations.npz") as file:
+        parts = dict(file)
+    for n in (1, 7):
+        some = {name: part[:n] for name, part in parts.items()}
+        numpy.save(f"{folder}/answers_{n}.npy", model.predict(some.get("only", some)))
+print([name for name in ("armscan", "tianshou", "gymnasium") if name in sys.modules])
+"""
+
+
+def learner_of(algorithm, made_of, phantom):
+    kind, small = ALGORITHMS[algorithm]
+    maker, network = MAKERS[made_of]
+    return taught(kind(network=network, **small).agent(setup_for(maker, phantom))), maker.one([phantom])
+
+
+@pytest.fixture(scope="module")
+def made(phantom, tmp_path_factory):
+    """A model of every learner, observations, and how the learner acts on them, by what it is made of."""
+    everything = {}
+    for algorithm, made_of in VARIANTS:
+        folder = tmp_path_factory.mktemp(f"{algorithm}-{made_of}")
+        learner, env = learner_of(algorithm, made_of, phantom)
+        make_model(learner, env, folder / "model", {"armscan": "0"})
+        observations = observed(env)
+        arrays = arrays_of(batch_of(observations))
+        np.savez(folder / "observations.npz", **(arrays if isinstance(arrays, dict) else {"only": arrays}))
+        everything[algorithm, made_of] = folder, arrays, np.array([learner.act(each, -0.1) for each in observations])
+    return everything
+
+
+def test_models_answer_in_a_fresh_process_without_armscan_as_the_learners_act(made):
+    folders = [str(folder) for folder, _, _ in made.values()]
+    asked = subprocess.run([sys.executable, "-c", ASK, *folders], capture_output=True, text=True, check=False)
+    assert (asked.returncode, asked.stderr, asked.stdout.strip()) == (0, "", "[]")
+    for variant, (folder, arrays, acted) in made.items():
+        for n in (1, 7):
+            answers = np.load(folder / f"answers_{n}.npy")
+            np.testing.assert_allclose(answers, acted[:n], rtol=0, atol=1e-6, err_msg=str(variant))
+        answers = onnx_answers(folder / "model" / "policy.onnx", arrays)
+        np.testing.assert_allclose(answers, acted, rtol=0, atol=1e-5, err_msg=str(variant))
+
+
+def test_model_says_what_goes_in_and_comes_out(made):
+    folder, _, _ = made["ppo", "images"]
+    said = yaml.safe_load((folder / "model" / "MLmodel").read_text())
+    inputs = {each["name"]: each["tensor-spec"] for each in json.loads(said["signature"]["inputs"])}
+    assert inputs["channels"] == {"dtype": "uint8", "shape": [-1, 2, 3, 36, 36]}
+    assert {name for name, spec in inputs.items() if spec["dtype"] == "float32"} == {"action", "reward", "memory"}
+    outputs = json.loads(said["signature"]["outputs"])
+    assert outputs == [{"type": "tensor", "tensor-spec": {"dtype": "float32", "shape": [-1, 2]}}]
+    requirements = (folder / "model" / "requirements.txt").read_text().split()
+    assert [line.partition("==")[0] for line in requirements] == ["mlflow", "numpy", "torch"]
+    assert "+" not in "".join(requirements)
+    assert is_model(folder / "model")
+    assert not is_model(folder)
+    example = json.loads((folder / "model" / "serving_input_example.json").read_text())["inputs"]
+    assert len(example["reward"]) == 2
+
+
+def test_model_is_served_and_answers_over_http_as_the_learner_acts(made):
+    variants = [("sac", "vector"), ("ppo", "images")]
+    servers = [serve(made[variant][0] / "model") for variant in variants]
+    try:
+        for variant, (server, port, log) in zip(variants, servers, strict=True):
+            _, arrays, acted = made[variant]
+            wait_for(server, port, log)
+            for n in (1, 7):
+                parts = {name: part[:n].tolist() for name, part in arrays.items()} if isinstance(arrays, dict) else None
+                given = {"inputs": parts or arrays[:n].tolist()}
+                np.testing.assert_allclose(invoke(port, given), acted[:n], rtol=0, atol=1e-6)
+    finally:
+        for server, _, _ in servers:
+            os.killpg(server.pid, signal.SIGTERM)
+            server.wait(30)
+
+
+def serve(model):
+    with socket.socket() as free:
+        free.bind((LOOPBACK, 0))
+        port = free.getsockname()[1]
+    log = model.parent / "server.log"
+    words = ["models", "serve", "-m", str(model), "--env-manager", "local", "-h", LOOPBACK, "-p", str(port)]
+    bin_folder = Path(sys.executable).parent
+    with log.open("wb") as said:
+        # It looks for uvicorn among the programs; in a group of its own, in which its own processes are ended, too.
+        server = subprocess.Popen(
+            [bin_folder / "mlflow", *words],
+            env=os.environ | {"PATH": f"{bin_folder}{os.pathsep}{os.environ['PATH']}"},
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
+        )
+    return server, port, log
+
+
+def wait_for(server, port, log):
+    until_s = time.monotonic() + START_S
+    while True:
+        try:
+            with urllib.request.urlopen(f"http://{LOOPBACK}:{port}/ping", timeout=5):
+                return
+        except (urllib.error.URLError, OSError):
+            assert server.poll() is None, log.read_text()
+            assert time.monotonic() < until_s, log.read_text()
+            time.sleep(0.1)
+
+
+def invoke(port, given):
+    request = urllib.request.Request(
+        f"http://{LOOPBACK}:{port}/invocations", json.dumps(given).encode(), {"Content-Type": "application/json"}
+    )
+    with urllib.request.urlopen(request, timeout=30) as answer:
+        return np.array(json.loads(answer.read())["predictions"])
+
+
+class Otherwise:
+    """A learner whose policy is not what it acts by."""
+
+    def __init__(self, learner, shift):
+        self._learner, self._shift = learner, shift
+
+    def __getattr__(self, name):
+        return getattr(self._learner, name)
+
+    def act(self, observation, reward):
+        return self._learner.act(observation, reward) * (1 + self._shift)
+
+
+@pytest.fixture
+def regression(phantom):
+    return learner_of("regression", "vector", phantom)
+
+
+def test_model_that_answers_otherwise_than_the_agent_is_not_written(regression, tmp_path):
+    learner, env = regression
+    make_model(learner, env, tmp_path / "model", {"armscan": "0"})
+    before = (tmp_path / "model" / "MLmodel").read_bytes()
+    refusal = r"the model answers otherwise than the agent: up to .* away, but 1e-06 is allowed"
+    with pytest.raises(ExportError, match=refusal):
+        make_model(Otherwise(learner, 1e-4), env, tmp_path / "model", {"armscan": "0"})
+    with pytest.raises(ExportError, match="up to nan away"):
+        make_model(Otherwise(learner, float("nan")), Unmoved(env), tmp_path / "model", {"armscan": "0"})
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+    assert (tmp_path / "model" / "MLmodel").read_bytes() == before
+
+
+class Unmoved:
+    """An environment that shows its first plane, whatever is done."""
+
+    def __init__(self, env):
+        self._env = env
+        self._observation, self._info = env.reset(seed=FIRST_SEED)
+
+    def get_wrapper_attr(self, name):
+        return self._env.get_wrapper_attr(name)
+
+    def reset(self, **_):
+        return self._observation, self._info
+
+    def step(self, _):
+        return self._observation, -0.1, False, False, self._info
+
+
+def test_model_whose_place_cannot_be_written_to_is_named(regression, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(ExportError, match=r"file/in/model: the model cannot be written \(Not a directory\)"):
+        make_model(*regression, tmp_path / "file" / "in" / "model", {"armscan": "0"})
+
+
+@pytest.mark.parametrize(
+    ("shift", "tag"), [(0.0, "kept"), (1e-3, "not kept: the model answers otherwise than the agent")]
+)
+def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path, capsys, shift, tag):
+    learner, env = regression
+    store, experiment_id = open_store(
+        f"sqlite:///{tmp_path}/runs.db", experiment="test", artifacts=str(tmp_path / "artifacts"), wait_s=60.0
+    )
+    folder = tmp_path / "run"
+    folder.mkdir()
+    config = {"projection": "zy", "obs": "cluster", "stack": 1, "memory": 0, "tracking": {"uri": "-"}}
+    config["env"] = {"rotation_bounds_deg": [90.0, 45.0], "translation_bounds_mm": [40.0, 300.0]}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    with TrackedRun.start(store, experiment_id, name="n", config={}, tags={}, folder=folder) as tracked:
+        keep_policy(Otherwise(learner, shift), env, tracked, folder, print)
+    run = store.get_run(tracked.run_id)
+    assert run.info.status == "FINISHED"
+    assert run.data.tags["policy"].startswith(tag)
+    is_kept = tag == "kept"
+    assert (folder / "policy").exists() == is_kept
+    assert ("the policy is not kept as a model: the model answers" in capsys.readouterr().out) != is_kept
+    assert [file.path for file in store.list_artifacts(tracked.run_id)] == (["policy"] if is_kept else [])
+    if is_kept:
+        kept = {file.path for file in store.list_artifacts(tracked.run_id, "policy")}
+        assert {"policy/MLmodel", "policy/policy.onnx", "policy/artifacts"} <= kept
+        said = yaml.safe_load((folder / "policy" / "MLmodel").read_text())["metadata"]
+        assert said["run"] == tracked.run_id
+        assert said["action"] == {"rz": "times 90.0 degrees", "ty": "(a + 1) / 2 times 300.0, in mm"}
+
+
+def test_run_keeps_no_policy_where_its_configuration_says_so(regression, tmp_path):
+    (tmp_path / "config.yaml").write_text("tracking: {policy: false}")
+    # Nothing is asked of the tracked run.
+    keep_policy(*regression, None, tmp_path, print)
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
+
+
+def test_model_takes_memory_that_may_not_be_written_to(made):
+    import mlflow.pyfunc
+
+    folder, arrays, acted = made["sac", "vector"]
+    arrays.flags.writeable = False
+    with torch.inference_mode():
+        answers = mlflow.pyfunc.load_model(str(folder / "model")).predict(arrays)
+    np.testing.assert_allclose(answers, acted, rtol=0, atol=1e-6)

@@ -1,0 +1,196 @@
+"""The command that exports and registers policies, as a person types it, on real tracked runs."""
+
+import json
+
+import mlflow.pyfunc
+import numpy as np
+import pytest
+from mlflow import MlflowClient
+
+from armscan import evaluate, policy
+from armscan.files import BEST_CHECKPOINT
+from armscan.policies.card import MAX_CHARS
+from armscan.tracking import EVALUATED_TAG
+from armscan.training import load_checkpoint, save_checkpoint
+
+from .test_evaluate import GUESSER, IMAGES, tracked
+from .test_run import runs_in
+from .training.test_train import evaluation_of
+
+EXPORT, REGISTER = ("export", "out=new"), ("register", "name=n")
+
+
+@pytest.fixture
+def answer(tmp_path, monkeypatch, capsys):
+    """Runs the command in this process, in an empty folder; returns its exit code and what it printed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlruns.db")
+
+    def command(*words, of=policy):
+        code = of.main(words)
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err.strip()
+
+    return command
+
+
+def store_of(folder):
+    return MlflowClient(f"sqlite:///{folder}/mlruns.db")
+
+
+@pytest.mark.parametrize(
+    "words", [["projection=zy", "agent.judged_by_sampling=true", "compute.precision=bfloat16"], ["obs=slice", *IMAGES]]
+)
+def test_policy_of_an_earlier_run_is_exported_from_its_checkpoint(answer, tmp_path, words):
+    run_id = tracked(tmp_path, *words)
+    assert answer("export", f"run={run_id[:8]}", "out=models/mine") == (
+        0,
+        "exported   models/mine\n"
+        "load it    mlflow.pyfunc.load_model('models/mine').predict(observations)\n"
+        "serve it   mlflow models serve -m models/mine --env-manager local\n",
+        "",
+    )
+    model = mlflow.pyfunc.load_model("models/mine")
+    answers = model.predict(model.input_example)
+    assert answers.shape == (2, 2 if "projection=zy" in words else 1)
+    assert np.abs(answers).max() <= 1
+    said = model.metadata.metadata
+    # As the network itself answers, with all of its bits.
+    assert (said["run"], said["differs_from_agent"]) == (run_id, None)
+    assert (tmp_path / "models" / "mine" / "policy.onnx").stat().st_size > 1000
+    # A model of ours is replaced.
+    assert answer("export", f"run={run_id}", "out=models/mine")[0] == 0
+    assert [path.name for path in (tmp_path / "models").iterdir()] == ["mine"]
+
+
+def test_policy_is_registered_with_the_figures_of_its_run(answer, tmp_path):
+    run_id = tracked(tmp_path)
+    code, printed, errors = answer("register", f"run={run_id}", "name=wrist plane")
+    assert (code, errors) == (0, "")
+    assert printed.splitlines() == [
+        "registered models:/wrist plane/1",
+        f"its store  export MLFLOW_TRACKING_URI=sqlite:///{tmp_path}/mlruns.db",
+        "load it    mlflow.pyfunc.load_model('models:/wrist plane/1').predict(observations)",
+        "serve it   mlflow models serve -m 'models:/wrist plane/1' --env-manager local",
+    ]
+    client = store_of(tmp_path)
+    first = client.get_model_version("wrist plane", "1")
+    assert first.run_id == run_id
+    assert f"`python -m armscan.evaluate run={run_id}" in first.description
+    assert first.tags == {}
+    assert client.get_run(run_id).data.tags["policy"] == "kept"
+    models = [mlflow.pyfunc.load_model(uri) for uri in ("models:/wrist plane/1", f"runs:/{run_id}/policy")]
+    np.testing.assert_array_equal(*(model.predict(model.input_example) for model in models))
+
+    contents = {"test volumes": evaluation_of(2, 4).to_dict()}
+    (tmp_path / "evaluation.json").write_text(json.dumps(contents))
+    client.log_artifact(run_id, str(tmp_path / "evaluation.json"))
+    made_at = client.get_run(run_id).info.end_time
+    assert answer("register", f"run={run_id}", "name=wrist plane")[0] == 0
+    second = client.get_model_version("wrist plane", "2")
+    assert "### at the end of the run\n\n| figures, with 95 % intervals | test volumes |" in second.description
+    assert "| mean steps | 3.00 (2.00–4.00) |" in second.description
+    assert second.tags["test_volumes/mean_steps"] == "3"
+    assert second.source == first.source
+    assert client.get_run(run_id).info.end_time == made_at
+
+    assert answer(f"run={run_id}", "episodes=2", "delta=0.2", of=evaluate)[0] == 0
+    (child,) = [run for run in runs_in(tmp_path)[1] if run.info.run_id != run_id]
+    assert answer("register", f"run={run_id}", "name=wrist plane")[0] == 0
+    third = client.get_model_version("wrist plane", "3")
+    assert f"### by evaluation {child.info.run_id}, on own volumes, delta=0.2\n" in third.description
+    assert "### at the end of the run" in third.description
+    assert len(third.description) <= MAX_CHARS
+    assert {"test_volumes/success_rate", "training_volumes/success_rate"} <= third.tags.keys()
+
+
+def test_bad_words_are_answered_in_one_line_and_change_nothing(answer, tmp_path):
+    run_id = tracked(tmp_path)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.txt").write_text("precious")
+    (tmp_path / "file").write_text("precious")
+    run, out, name = f"run={run_id}", "out=new", "name=n"
+    before = sorted(path.name for path in tmp_path.iterdir())
+    words_and_lines = [
+        ([], "'nothing' cannot be read: give export or register, and run=ID"),
+        (["export", "register", run], f"'export register {run}' cannot be read"),
+        (["delete", run], "'delete run="),
+        (["export", run], "out is not set"),
+        (["export", out], "run is not set"),
+        (["register", run], "name is not set"),
+        (["export", run, out, name], "there is no key 'name', but only run, out or tracking"),
+        (["export", run, "out="], "out is empty"),
+        (["export", "run=nobody", out], "the run is 'nobody', but it must be an id"),
+        (["export", "run=" + "0" * 32, out], f"the run is '{'0' * 32}', but no run of"),
+        (["export", run, out, "tracking=sqlite:///none.db"], "tracking.uri is 'sqlite:///none.db', but there is no"),
+        (["export", run, "out=other"], "out is 'other', but something else is there, and would be lost"),
+        (["export", run, "out=file"], "out is 'file', but something else is there, and would be lost"),
+        (["export", run, "out=file/in/it"], "file/in/it: the model cannot be written (Not a directory)"),
+        *(
+            (["register", run, f"name={bad}"], f"name is '{bad}', but it must be a text")
+            for bad in ("a/b", "a:b", "..", " ")
+        ),
+        (["register", run, f"name={'a' * 257}"], "name is 'aaa"),
+        (["register", "run=" + "0" * 32, name], f"the run is '{'0' * 32}', but no run of"),
+    ]
+    for words, line in words_and_lines:
+        code, _, errors = answer(*words)
+        assert (code, len(errors.splitlines())) == (2, 1), (words, errors)
+        assert errors.startswith(f"error: {line}"), (words, errors)
+    assert answer("--help")[1].startswith("The command `python -m armscan.policy`")
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+    assert store_of(tmp_path).search_registered_models() == []
+    assert "policy" not in {file.path for file in store_of(tmp_path).list_artifacts(run_id)}
+
+
+def test_run_without_a_policy_is_refused(answer, tmp_path):
+    baseline = tracked(tmp_path, agent=GUESSER)
+    evaluation = tracked(tmp_path)
+    store_of(tmp_path).set_tag(evaluation, EVALUATED_TAG, baseline)
+    unfinished = tracked(tmp_path, kept=("config.yaml", "volumes.json"))
+    lines = {
+        baseline: f"run is '{baseline}', but its agent is none that learns: it has no policy",
+        evaluation: f"run is '{evaluation}', but that is an evaluation, of {baseline}",
+        unfinished: f"run {unfinished} has kept no checkpoint",
+    }
+    for words in EXPORT, REGISTER:
+        for run_id, line in lines.items():
+            assert answer(*words, f"run={run_id}")[2].startswith(f"error: {line}")
+    assert not (tmp_path / "new").exists()
+    assert store_of(tmp_path).search_registered_models() == []
+
+
+def test_damaged_checkpoint_is_told_and_changes_nothing(answer, tmp_path):
+    run_id = tracked(tmp_path)
+    file, client = tmp_path / BEST_CHECKPOINT, store_of(tmp_path)
+    weights, facts = load_checkpoint(file)
+    whole = file.read_bytes()
+    damages = {
+        "best.pt: is damaged: its contents are not those that were written": whole[: len(whole) // 2],
+        "best.pt: is empty": b"",
+        "best.pt: is no checkpoint of armscan": b"nonsense",
+    }
+    for line, contents in damages.items():
+        file.write_bytes(contents)
+        client.log_artifact(run_id, str(file))
+        assert answer(*EXPORT, f"run={run_id}")[2].startswith(f"error: run {run_id}: {line}")
+    save_checkpoint(file, {"other": next(iter(weights.values()))}, facts)
+    client.log_artifact(run_id, str(file))
+    assert answer(*REGISTER, f"run={run_id}")[2].startswith(f"error: run {run_id}: the checkpoint is another agent's")
+    assert not (tmp_path / "new").exists()
+    assert client.search_registered_models() == []
+    assert "policy" not in {file.path for file in client.list_artifacts(run_id)}
+
+
+def test_damaged_model_of_a_run_is_not_registered(answer, tmp_path):
+    run_id = tracked(tmp_path)
+    assert answer("export", f"run={run_id}", "out=policy")[0] == 0
+    program = tmp_path / "policy" / "artifacts" / "policy.pt2"
+    program.write_bytes(program.read_bytes()[:1000])
+    client = store_of(tmp_path)
+    client.log_artifacts(run_id, str(tmp_path / "policy"), "policy")
+    code, _, errors = answer("register", f"run={run_id}", "name=n")
+    assert code == 2
+    assert errors.startswith(f"error: run {run_id}: its policy/ is damaged, it does not answer its own example: ")
+    assert len(errors.splitlines()) == 1
+    assert client.search_registered_models() == []
