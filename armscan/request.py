@@ -1,4 +1,4 @@
-"""What `armscan.evaluate` and `armscan.watch` are asked for: their words, read and checked before anything is loaded."""
+"""What `armscan.evaluate` and `armscan.watch` are asked for: their words, read before anything is loaded."""
 
 from __future__ import annotations
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from armscan.files import (
 from armscan.settings import RESUME, TRACKING_URI, plain, usual_tracking
 from armscan.stage import Stage
 from armscan.tracking import TrackedRun, TrackingStore, find_run, jobs_of, open_existing_store, sync
+from armscan.tracking.source import release
 from armscan.training import Fingerprints, check_unchanged, take_up
 
 
@@ -112,7 +112,7 @@ def _folder_of(client: TrackingStore, run: Run) -> Path:
             which = ", ".join(cut_off) if cut_off else "all of them have finished"
             raise ResumeError(f"run {run_id} is the parent of a multirun, whose jobs are resumed one by one: {which}")
         raise ResumeError(f"run {run_id} cannot be resumed: it is none of armscan.run, which notes the folder of a run")
-    if _release(tags["armscan.version"]) > _release(armscan.__version__):
+    if release(tags["armscan.version"]) > release(armscan.__version__):
         raise ResumeError(
             f"run {run_id} was made by armscan {tags['armscan.version']}, but this is {armscan.__version__}: "
             "it goes on with that version or a newer one"
@@ -126,10 +126,6 @@ def _folder_of(client: TrackingStore, run: Run) -> Path:
             f"run {run_id} cannot be resumed: its folder {folder} is not there; it last ran on the host {tags['host']}"
         )
     return folder
-
-
-def _release(version: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
 
 
 def _config_of(run: Run, folder: Path) -> DictConfig:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,3 +29,8 @@ def _git(*arguments: str, folder: Path) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return answer.stdout.strip()
+
+
+def release(version: str) -> tuple[int, ...]:
+    """Returns a version of armscan as numbers, to be compared."""
+    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ MAX_ATTEMPTS = 20
 # Of an MP4, whose pictures all last equally long: a picture of an episode is several of them.
 PICTURE_MS = 100
 QUALITY = 8
-# MLflow's UI, browsers and players show it before they have all of it.
+# A browser shows it before it has all of it.
 PLAYS_AT_ONCE = ("-movflags", "+faststart")
 TITLE_AT = (16, 3)
 
@@ -39,13 +39,16 @@ class Film:
 
     def __init__(self, gif: Path, mp4: Path | None = None) -> None:
         self._gif = gif.open("wb")
-        self._mp4_file, self._mp4 = mp4, None if mp4 is None else _mp4_writer(mp4)
+        self._mp4_file = mp4
+        self._mp4: Generator[None, Picture | None, None] | None = None
         self._before: Image.Image | None = None
 
     def add(self, picture: Picture, duration_ms: int = FRAME_MS) -> None:
         """Adds a picture, shape (height, width, 3), both even; the same for all."""
         self._add_to_gif(Image.fromarray(picture), duration_ms)
-        if self._mp4 is not None:
+        if self._mp4_file is not None:
+            if self._mp4 is None:
+                self._mp4 = _mp4_writer(self._mp4_file, picture)
             for _ in range(duration_ms // PICTURE_MS):
                 self._mp4.send(picture)
 
@@ -99,15 +102,14 @@ class Film:
             self._mp4.close()
 
 
-def _mp4_writer(file: Path) -> Generator[None, Any, None]:
+def _mp4_writer(file: Path, picture: Picture) -> Generator[None, Picture | None, None]:
     # Deferred: a training needs none.
     import imageio_ffmpeg
-    from armscan.envs.rendering import HEIGHT, WIDTH
 
     # H.264 with colours at half the resolution, which every browser plays; it brings its own ffmpeg.
-    writer: Generator[None, Any, None] = imageio_ffmpeg.write_frames(
+    writer: Generator[None, Picture | None, None] = imageio_ffmpeg.write_frames(
         str(file),
-        (WIDTH, HEIGHT),
+        picture.shape[1::-1],
         fps=1000 / PICTURE_MS,
         codec="libx264",
         pix_fmt_out="yuv420p",
