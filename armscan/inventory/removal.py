@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from mlflow.entities import Run
+from mlflow.exceptions import MlflowException
 from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
 
 from armscan.errors import ArmscanError
@@ -21,10 +22,9 @@ from armscan.inventory.plan import (
     folder_left,
     neighbours_now,
 )
-from armscan.inventory.selection import run_of
 from armscan.inventory.sizes import local_artifacts
 from armscan.tracking import TrackingStore
-from armscan.tracking.client import reason_in
+from armscan.tracking.client import NOT_THERE, reason_in
 
 
 class LeftError(ArmscanError):
@@ -53,7 +53,7 @@ def remove(client: TrackingStore, case: Case, what: str) -> str | None:
     try:
         with at_rest(case.run) as held:
             # Somebody may have begun to work at it since it was planned.
-            run = run_of(client, case.run.info.run_id)
+            run = _as_it_is_now(client, case.run)
             near = neighbours_now(client, run, case.near)
             if left := barred_by_store(run, what, near) or barred_by_folder(run, what, near):
                 raise LeftError(left)
@@ -65,6 +65,19 @@ def remove(client: TrackingStore, case: Case, what: str) -> str | None:
             return None if what == CHECKPOINTS else _remove_emptied(ours)
     except BusyError as error:
         raise LeftError(str(error)) from error
+
+
+def _as_it_is_now(client: TrackingStore, run: Run) -> Run:
+    run_id = run.info.run_id
+    try:
+        now: Run = client.get_run(run_id)
+    except MlflowException as error:
+        if error.error_code != NOT_THERE:
+            raise
+        raise LeftError("it is not there any more") from error
+    if now.info.lifecycle_stage != "active":
+        raise LeftError("somebody has deleted it meanwhile")
+    return now
 
 
 def _remove_run(client: TrackingStore, run: Run, ours: OwnFolder | None) -> str | None:

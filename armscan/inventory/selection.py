@@ -13,7 +13,7 @@ from mlflow.entities import Run
 from mlflow.exceptions import MlflowException
 
 from armscan.checks import check_int
-from armscan.errors import InvalidValueError, TrackingError, listed
+from armscan.errors import InvalidValueError, listed
 from armscan.inventory.entries import SORTS
 from armscan.tracking import TrackingStore, find_run
 from armscan.tracking.client import reason_in
@@ -191,18 +191,3 @@ def all_pages(ask: Callable[..., Any]) -> list[Any]:
         found += page
         if not (token := page.token):
             return found
-
-
-def run_of(client: TrackingStore, run_id: str) -> Run:
-    """Returns a run as it stands now.
-
-    Raises:
-        TrackingError: if it is not there any more, or deleted.
-    """
-    try:
-        run: Run = client.get_run(run_id)
-    except MlflowException as error:
-        raise TrackingError(f"run {run_id} is not there any more") from error
-    if run.info.lifecycle_stage != "active":
-        raise TrackingError(f"run {run_id} was deleted meanwhile")
-    return run
