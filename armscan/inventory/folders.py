@@ -182,19 +182,18 @@ def at_rest(run: Run) -> Iterator[OwnFolder | None]:
 
 
 def folder_here(run: Run) -> Path | None:
-    """Returns the folder that was noted for a run, where it is on this machine, whether it is the run's or not."""
-    try:
-        folder = _noted(run.data.tags)
-    except NotOursError:
-        return None
-    return folder if folder.is_dir() else None
+    """Returns the folder that was noted for a run, where one may be on this machine, whether it is the run's or not."""
+    folder, host = Path(run.data.tags.get("folder", "")), run.data.tags.get("host")
+    return folder if folder.is_absolute() and folder.is_dir() and host in (None, socket.gethostname()) else None
 
 
 def _noted(tags: Mapping[str, str]) -> Path:
     if "folder" not in tags:
         raise NotOursError("no folder was noted for it", is_there=False)
-    if (host := tags.get("host")) != socket.gethostname():
-        raise NotOursError(f"its folder {tags['folder']} is on the host {host or 'that was not noted'}")
+    if "host" not in tags:
+        raise NotOursError(f"its folder {tags['folder']} was noted without its host")
+    if tags["host"] != socket.gethostname():
+        raise NotOursError(f"its folder {tags['folder']} is on the host {tags['host']}")
     path = Path(tags["folder"])
     if not path.is_absolute():
         raise NotOursError(f"its folder is {str(path)!r}, and nobody knows where that is")

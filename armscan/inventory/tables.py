@@ -20,6 +20,8 @@ from armscan.inventory.plan import Case
 FORMATS = ("table", "csv", "json")
 UNITS = ("B", "kB", "MB", "GB", "TB")
 MISSING = "-"
+# Of a name, which a multirun's words may be.
+MAX_NAME_CHARS = 80
 
 
 def readable(n_bytes: float) -> str:
@@ -75,7 +77,7 @@ def _table(entries: Sequence[Entry]) -> Table:
         size = readable(entry.size.n_bytes) + ("" if entry.size.in_store is not None else "+?")
         table.add_row(
             entry.run.info.run_id[:ID_CHARS],
-            Text("  " * entry.depth + entry.run.info.run_name),
+            Text("  " * entry.depth + shortened(entry.run.info.run_name)),
             entry.run.info.status.lower(),
             on_day(entry.started),
             lasting(entry.duration_s),
@@ -85,6 +87,11 @@ def _table(entries: Sequence[Entry]) -> Table:
             str(len(entry.below) or ""),
         )
     return table
+
+
+def shortened(name: str) -> str:
+    """Returns a name that is not too long for a line of a list."""
+    return name if len(name) <= MAX_NAME_CHARS else f"{name[: MAX_NAME_CHARS - 1]}…"
 
 
 def narrow_table(*headings: str) -> Table:
@@ -128,7 +135,7 @@ def print_plan(cases: Sequence[Case]) -> None:
         for case in taken:
             info = case.run.info
             started = datetime.fromtimestamp(info.start_time / 1000).astimezone()
-            row = (info.run_id[:ID_CHARS], Text(info.run_name), info.status.lower(), on_day(started))
+            row = (info.run_id[:ID_CHARS], Text(shortened(info.run_name)), info.status.lower(), on_day(started))
             table.add_row(*row, readable(case.n_bytes))
         console.print(table)
     for case in cases:

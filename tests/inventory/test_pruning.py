@@ -106,6 +106,14 @@ def test_what_is_not_delivered_is_left(answer, make_run, tmp_path, what):
     stays(answer, run_id, f"not all of it is delivered: python -m armscan.track sync {folder} does that", what)
 
 
+def test_what_is_not_delivered_is_left_where_no_host_was_noted(answer, make_run, tmp_path):
+    folder = tmp_path / "outputs" / "tiny"
+    run_id, _ = no_host(folder, make_run)
+    with file_of(folder, run_id).open("a") as spool:
+        spool.write('{"tags": {"a": "b"}}\n')
+    stays(answer, run_id, "not all of it is delivered")
+
+
 @WHAT
 def test_damaged_spool_is_left(answer, make_run, tmp_path, what):
     run_id = make_run()
@@ -189,6 +197,13 @@ def another_host(folder, make_run):
     return make_run(tags={"host": "another"}), f"its folder {folder} is on the host another"
 
 
+def no_host(folder, make_run):
+    run_id = make_run()
+    with sqlite3.connect(folder.parent.parent / "mlruns.db") as database:
+        database.execute("delete from tags where key = 'host'")
+    return run_id, f"its folder {folder} was noted without its host"
+
+
 def another_config(folder, make_run):
     run_id = make_run()
     (folder / "config.yaml").write_text("name: changed\n")
@@ -218,7 +233,9 @@ def relative(folder, make_run):
     return make_run(tags={"folder": "outputs/tiny"}), "its folder is 'outputs/tiny', and nobody knows where that is"
 
 
-@pytest.mark.parametrize("change", [another_host, another_config, no_config, a_link_above, anothers_spool, relative])
+@pytest.mark.parametrize(
+    "change", [another_host, no_host, another_config, no_config, a_link_above, anothers_spool, relative]
+)
 @pytest.mark.parametrize("what", ["folders", "runs"])
 def test_folder_that_is_not_certainly_the_runs_is_left_and_said_so(answer, make_run, snapshot, tmp_path, change, what):
     folder = tmp_path / "outputs" / "tiny"

@@ -64,6 +64,11 @@ def resumed(folder, store, run_id, locked):
     return "another process is at work in its folder"
 
 
+def taken_by_another(folder, store, run_id, locked):
+    (folder / "config.yaml").write_text("name: another\n")
+    return resumed(folder, store, run_id, locked)
+
+
 def judged_anew(folder, store, run_id, locked):
     store[0].create_run(store[1], name="evaluation", tags={"mlflow.parentRunId": run_id})
     return "1 of its children stay"
@@ -86,7 +91,7 @@ def removed_by_another(folder, store, run_id, locked):
     return "somebody has deleted it meanwhile"
 
 
-@pytest.mark.parametrize("change", [resumed, judged_anew, registered, added_to, removed_by_another])
+@pytest.mark.parametrize("change", [resumed, taken_by_another, judged_anew, registered, added_to, removed_by_another])
 def test_run_is_left_that_somebody_has_begun_to_use_since_it_was_planned(store, make_run, locked, tmp_path, change):
     client, folder = store[0], tmp_path / "outputs" / "tiny"
     run_id = make_run()
