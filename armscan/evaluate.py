@@ -24,24 +24,24 @@ docs/evaluation.md says what the figures mean.
 from __future__ import annotations
 
 import json
-import os
-import re
 import sys
 from collections.abc import Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from armscan.checks import check_int
 from armscan.errors import InvalidValueError
 from armscan.files import check_writable, write_whole
-from armscan.mistakes import mistake_in_one_line, quieten_libraries
-from armscan.request import Request, parse
-from armscan.settings import PHANTOM, plain, usual_tracking
+from armscan.mistakes import quieten_libraries
+from armscan.request import EVALUATION, Request, parse
+from armscan.settings import plain
 from armscan.words import answered
 
 if TYPE_CHECKING:
-    from armscan.judging import Judgement, Subject, Trial
+    from armscan.applying import Applied
+    from armscan.judging import Judgement
+    from armscan.judging.volumes import Volumes
 
 FOLDER = Path("evaluations")
 # What the JSON of every evaluation holds.
@@ -51,59 +51,38 @@ KEYS_OF_A_REPORT = {"of", "name", "splits", "volumes", "episodes", "tracked_as"}
 def evaluate(request: Request) -> Path:
     """Evaluates what is asked for, prints and tracks it; returns the JSON file."""
     # Deferred: a mistake on the command line should be answered before these are loaded.
-    import torch
     from rich.console import Console
 
     from armscan import judging
+    from armscan.applying import apply
     from armscan.console import print_where_to_look
 
-    torch.set_num_threads(1)
-    if request.folder and not Path(request.folder).is_dir():
-        raise InvalidValueError(
-            f"data is {request.data!r}, but there is no such folder: it must be a folder of volumes, or {PHANTOM}"
-        )
-    store = _store(request)
-    if request.run is not None:
-        subject = judging.subject_of_run(store["uri"], request.run, request.changes)
-    else:
-        subject = judging.subject_of_words(request.config_words, request.folder, request.changes)
-    # Elsewhere, of an agent's own volumes only those matter that its reward is fitted to.
-    parts = ("training",) if request.data else judging.PARTS
-    own = cache(partial(judging.own_split, subject, parts))
-    groups = judging.volume_groups(request.data, request.n_phantoms, own)
-    for label, volumes in groups.items():
-        check_int(
-            f"episodes, of which each of {len(volumes)} {label} is to have one,",
-            request.n_episodes,
-            at_least=len(volumes),
-        )
-    trial = judging.prepare(subject, groups, judging.TrainingVolumes(own))
-    notes = list(trial.notes)
-    if request.data and subject.run:
-        notes += judging.known_volumes(subject, groups)
-    if subject.run and subject.volumes is None and own.cache_info().currsize:
-        notes.append("the run has not kept fingerprints of its volumes: nobody knows whether these are still the same")
-    for note in notes:
-        print(f"note: {note}")
+    applied = apply(request, partial(_check_episodes, request.n_episodes))
     _check_out(request.out)
-    judgement, file = _tracked(request, subject, trial, notes, store)
+    judgement, file = _tracked(request, applied)
     for table in judging.judgement_tables(judgement):
         Console().print(table)
-    print_where_to_look(Path.cwd(), store["uri"], files=(str(file),))
+    print_where_to_look(Path.cwd(), applied.store["uri"], files=(str(file),))
     return file
 
 
-def _tracked(
-    request: Request, subject: Subject, trial: Trial, notes: Sequence[str], store: Mapping[str, Any]
-) -> tuple[Judgement, Path]:
+def _check_episodes(n_episodes: int, groups: Mapping[str, Volumes]) -> None:
+    for label, volumes in groups.items():
+        which = f"episodes, of which each of {len(volumes)} {label} is to have one,"
+        check_int(which, n_episodes, at_least=len(volumes))
+
+
+def _tracked(request: Request, applied: Applied) -> tuple[Judgement, Path]:
     """Plays, and keeps what comes of it: in a JSON file, and in a tracked run, a child of the run that is evaluated."""
+    from armscan.applying import file_name
     from armscan.judging import Judgement, data_name
     from armscan.tracking import EVALUATED_TAG, TrackedRun, deliver_leftovers, open_store
 
+    subject = applied.subject
     if subject.run is not None:
         client, experiment_id = subject.run.client, subject.run.experiment_id
     else:
-        client, experiment_id = open_store(**store)
+        client, experiment_id = open_store(**applied.store)
     deliver_leftovers(client)
     of, data = subject.run.run_id if subject.run else subject.name, data_name(request.data)
     facts = {
@@ -113,7 +92,7 @@ def _tracked(
         "episodes_a_split": request.n_episodes,
         "seed": request.seed,
         "changes": dict(request.changes),
-        "notes": list(notes),
+        "notes": list(applied.notes),
     }
     with TrackedRun.start(
         client,
@@ -124,7 +103,7 @@ def _tracked(
         folder=FOLDER,
         parent_id=subject.run.run_id if subject.run else None,
     ) as tracked:
-        evaluations = trial.played(request.n_episodes, request.seed, tell=partial(print, flush=True))
+        evaluations = applied.trial.played(request.n_episodes, request.seed, tell=partial(print, flush=True))
         # Of an agent's own volumes, those that it was trained on and those that it was not are never put together.
         judgement = Judgement(
             evaluations, has_total=request.data is not None, facts={**facts, "tracked_as": tracked.run_id}
@@ -132,17 +111,11 @@ def _tracked(
         for group, figures in judgement.metrics().items():
             named = {f"{group}/{name}": value for name, value in figures.items()}
             tracked.log_figures(named, n_env_steps=subject.n_env_steps)
-        file = request.out or FOLDER / f"{_file_name(f'{subject.name}-{data}')}-{tracked.run_id[:8]}.json"
+        file = request.out or FOLDER / f"{file_name(f'{subject.name}-{data}')}-{tracked.run_id[:8]}.json"
         text = json.dumps(judgement.to_dict(), indent=1, allow_nan=False)
         write_whole(file, lambda opened: opened.write(text.encode()))
         tracked.log_files(file)
     return judgement, file
-
-
-def _store(request: Request) -> dict[str, Any]:
-    """Returns where runs are tracked: as the configuration says, where the words say nothing else."""
-    said = {"uri": request.tracking, "experiment": request.tracking_experiment}
-    return usual_tracking() | {name: value for name, value in said.items() if value is not None}
 
 
 def _check_out(out: Path | None) -> None:
@@ -168,25 +141,18 @@ def _is_report(file: Path) -> bool:
     return isinstance(contents, dict) and contents.keys() >= KEYS_OF_A_REPORT
 
 
-def _file_name(text: str) -> str:
-    return re.sub(r"[^\w.\-]+", "-", text)
-
-
 def main(words: Sequence[str] | None = None) -> int:
     """Runs what the command line asks for; returns the exit code."""
     return answered(_run, words, usage=__doc__ or "", left="no figures were written")
 
 
 def _run(words: Sequence[str]) -> int:
+    request = parse(words, EVALUATION)
+    # Deferred: a mistake on the command line should be answered before it is loaded.
+    from armscan.applying import answered_in_one_line
+
     quieten_libraries()
-    request = parse(words)
-    try:
-        evaluate(request)
-    except Exception as error:
-        line = mistake_in_one_line(error, request.config_words)
-        if line is None or os.environ.get("ARMSCAN_TRACEBACKS"):
-            raise
-        raise InvalidValueError(line) from error
+    answered_in_one_line(evaluate, request)
     return 0
 
 

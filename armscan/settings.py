@@ -67,6 +67,11 @@ def evaluate_command(run_id: str, tracking_uri: str) -> str:
     return _command("armscan.evaluate", f"run={run_id}", "tracking", tracking_uri)
 
 
+def watch_command(run_id: str, tracking_uri: str) -> str:
+    """Returns what one types to film a run's agent."""
+    return _command("armscan.watch", f"run={run_id}", "tracking", tracking_uri)
+
+
 def report_command(study: str, storage: str) -> str:
     """Returns what one types to see what a study has found."""
     return _command_at("armscan.report", f"study={study}", "storage", storage, usual_storage())

@@ -51,13 +51,20 @@ class Trial:
         return evaluations
 
 
-def prepare(subject: Subject, groups: Mapping[str, Volumes], training: Mapping[str, LabelVolume]) -> Trial:
+def prepare(
+    subject: Subject,
+    groups: Mapping[str, Volumes],
+    training: Mapping[str, LabelVolume],
+    *,
+    render_mode: str | None = None,
+) -> Trial:
     """Makes the agent and its environments on the volumes that it is judged on.
 
     Args:
         subject: the agent's configuration and weights.
         groups: the volumes, by what they are called.
         training: the volumes that the agent was trained on; looked at only where its reward is fitted to them.
+        render_mode: of the environments.
 
     Raises:
         ArmscanError: if the agent cannot be applied to the volumes; the reason is said.
@@ -69,7 +76,7 @@ def prepare(subject: Subject, groups: Mapping[str, Volumes], training: Mapping[s
     for label, volumes in groups.items():
         config = subject.config if trained is None else _seen_as_trained(subject.config, trained, volumes)
         maker = make_maker(config, training)
-        envs[label] = _env(maker, volumes, config.env.clustering)
+        envs[label] = _env(maker, volumes, config.env.clustering, render_mode)
         here = Familiar.of(envs[label])
         if subject.familiar is not None:
             notes += [f"{label}: {difference}" for difference in subject.familiar.differences(here)]
@@ -89,9 +96,9 @@ def _seen_as_trained(config: DictConfig, trained: Familiar, volumes: Volumes) ->
     return with_one_crop(config, trained.slice_px, smallest_slice(volumes.values()))
 
 
-def _env(maker: EnvMaker, volumes: Volumes, clustering: object) -> Env:
+def _env(maker: EnvMaker, volumes: Volumes, clustering: object, render_mode: str | None) -> Env:
     try:
-        return maker.one(volumes)
+        return maker.one(volumes, render_mode=render_mode)
     except OptimalPlaneError as error:
         sizes = {volume.pixel_mm for volume in volumes.values()}
         is_usual = all(

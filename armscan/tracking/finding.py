@@ -158,14 +158,15 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
 def check_version(run: Run) -> None:
     """Raises `TrackingError` where a run was made by a newer version, which may have kept it otherwise."""
     version = run.data.tags.get(VERSION_TAG, armscan.__version__)
-    if _release(version) > _release(armscan.__version__):
+    if release(version) > release(armscan.__version__):
         raise TrackingError(
             f"run {run.info.run_id} was made by armscan {version}, but this is {armscan.__version__}: "
             "it needs that version or a newer one"
         )
 
 
-def _release(version: str) -> tuple[int, ...]:
+def release(version: str) -> tuple[int, ...]:
+    """Returns a version of armscan as numbers, to be compared."""
     return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
 
 

@@ -43,63 +43,29 @@ class Address:
     uri: str
 
 
-class Spool:
-    """The entries of one run, held by one process.
+class SpoolFile:
+    """The entries of one run as they stand in its file, which whoever looks does not change.
 
     Args:
         file: with an `Address` in its first line.
-        timeout_s: how long another process is waited for that holds it.
 
     Raises:
         TrackingError: if the file is damaged.
-        FolderInUseError: if another process holds it.
     """
 
-    def __init__(self, file: Path, *, timeout_s: float = LOCK_TIMEOUT_S) -> None:
+    def __init__(self, file: Path) -> None:
         self.file = file
         self._delivered_file = file.with_suffix(DELIVERED)
-        # Also who is told to leave closes it, in another thread.
-        self._lock = FileLock(file.with_suffix(LOCK), timeout=timeout_s, thread_local=False)
         try:
-            self._lock.acquire()
-        except Timeout as error:
-            raise FolderInUseError(f"{file}: another process tracks this run") from error
-        try:
-            _cut_torn_line(file)
-            self._appending, self._adding = file.open("ab", buffering=0), threading.Lock()
             self.address = Address(**next(self.entries())["address"])
-            self._delivered: dict[Lane, int] = dict.fromkeys(LANES, 0) | self._read_delivered()
         except (StopIteration, TypeError, KeyError) as error:
-            self._lock.release()
             raise TrackingError(f"{file}: does not begin with the run that it is of") from error
-        except BaseException:
-            self._lock.release()
-            raise
-
-    @classmethod
-    def begin(cls, folder: Path, address: Address) -> Self:
-        """Opens the spool of a run in a folder, and makes it where there is none."""
-        file = file_of(folder, address.run_id)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        if not file.exists():
-            first = json.dumps({"address": asdict(address)}).encode() + b"\n"
-            write_whole(file, lambda opened: opened.write(first))
-        return cls(file)
+        self._delivered: dict[Lane, int] = dict.fromkeys(LANES, 0) | self._read_delivered()
 
     @property
     def folder(self) -> Path:
         """Of the run, that the names of its files are relative to."""
         return self.file.parent.parent
-
-    def add(self, **entry: Any) -> None:
-        """Adds an entry; from then on neither the end of this process nor that of the store loses it."""
-        line = json.dumps(entry).encode() + b"\n"
-        with self._adding:
-            size = os.fstat(self._appending.fileno()).st_size
-            if self._appending.write(line) != len(line):
-                # A full disk; half a line would be in the way of the next.
-                os.truncate(self._appending.fileno(), size)
-                raise OSError(f"{self.file}: cannot be written to: no space is left")
 
     def entries(self) -> Iterator[Entry]:
         """All entries, delivered or not.
@@ -132,12 +98,6 @@ class Spool:
                     entries.append(entry)
         return entries, end
 
-    def mark(self, lane: Lane, end: int) -> None:
-        """Notes that a lane is delivered so far."""
-        self._delivered[lane] = end
-        text = json.dumps(self._delivered)
-        write_whole(self._delivered_file, lambda opened: opened.write(text.encode()))
-
     @property
     def is_delivered(self) -> bool:
         """Whether there is nothing to be delivered."""
@@ -148,11 +108,6 @@ class Spool:
         """What the run was last said to be, None where nothing was said yet."""
         said = [entry["status"][0] for entry in self.entries() if "status" in entry]
         return said[-1] if said else None
-
-    def close(self) -> None:
-        """Lets others hold it."""
-        self._appending.close()
-        self._lock.release()
 
     def _read(self, line: bytes) -> Entry:
         try:
@@ -178,6 +133,65 @@ class Spool:
         with self.file.open("rb") as lines:
             lines.seek(end - 1)
             return lines.read(1) == b"\n"
+
+
+class Spool(SpoolFile):
+    """The entries of one run, held by one process.
+
+    Args:
+        file: with an `Address` in its first line.
+        timeout_s: how long another process is waited for that holds it.
+
+    Raises:
+        TrackingError: if the file is damaged.
+        FolderInUseError: if another process holds it.
+    """
+
+    def __init__(self, file: Path, *, timeout_s: float = LOCK_TIMEOUT_S) -> None:
+        # Also who is told to leave closes it, in another thread.
+        self._lock = FileLock(file.with_suffix(LOCK), timeout=timeout_s, thread_local=False)
+        try:
+            self._lock.acquire()
+        except Timeout as error:
+            raise FolderInUseError(f"{file}: another process tracks this run") from error
+        try:
+            _cut_torn_line(file)
+            super().__init__(file)
+            self._appending, self._adding = file.open("ab", buffering=0), threading.Lock()
+        except BaseException:
+            self._lock.release()
+            raise
+
+    @classmethod
+    def begin(cls, folder: Path, address: Address) -> Self:
+        """Opens the spool of a run in a folder, and makes it where there is none."""
+        file = file_of(folder, address.run_id)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if not file.exists():
+            first = json.dumps({"address": asdict(address)}).encode() + b"\n"
+            write_whole(file, lambda opened: opened.write(first))
+        return cls(file)
+
+    def add(self, **entry: Any) -> None:
+        """Adds an entry; from then on neither the end of this process nor that of the store loses it."""
+        line = json.dumps(entry).encode() + b"\n"
+        with self._adding:
+            size = os.fstat(self._appending.fileno()).st_size
+            if self._appending.write(line) != len(line):
+                # A full disk; half a line would be in the way of the next.
+                os.truncate(self._appending.fileno(), size)
+                raise OSError(f"{self.file}: cannot be written to: no space is left")
+
+    def mark(self, lane: Lane, end: int) -> None:
+        """Notes that a lane is delivered so far."""
+        self._delivered[lane] = end
+        text = json.dumps(self._delivered)
+        write_whole(self._delivered_file, lambda opened: opened.write(text.encode()))
+
+    def close(self) -> None:
+        """Lets others hold it."""
+        self._appending.close()
+        self._lock.release()
 
 
 def now_ms() -> int:

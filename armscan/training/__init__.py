@@ -8,7 +8,7 @@ from armscan.training.data import PARTS, Split, mixed_data, nifti_data, phantom_
 from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Evaluation, evaluate
 from armscan.training.familiar import Familiar
 from armscan.training.figures import Figures
-from armscan.training.film import film_episode
+from armscan.training.film import Film, film_episode, outcome
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
 
@@ -26,6 +26,7 @@ __all__ = [
     "Evaluation",
     "Familiar",
     "Figures",
+    "Film",
     "Fingerprints",
     "Origin",
     "SolvedCriterion",
@@ -39,6 +40,7 @@ __all__ = [
     "load_weights",
     "mixed_data",
     "nifti_data",
+    "outcome",
     "phantom_data",
     "save_checkpoint",
     "take_up",

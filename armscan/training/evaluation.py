@@ -131,11 +131,21 @@ def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluatio
     """
     names = list(env.get_wrapper_attr("volumes"))
     count = check_int("episodes", n_episodes, at_least=1)
-    return Evaluation(tuple(_play(agent, env, names[i % len(names)], seed + i) for i in range(count)))
+    return Evaluation(tuple(play(agent, env, names[i % len(names)], seed + i) for i in range(count)))
 
 
-def _play(agent: Agent, env: Env, volume_name: str, seed: int) -> Episode:
+def play(agent: Agent, env: Env, volume_name: str, seed: int, look: Callable[[], object] = lambda: None) -> Episode:
+    """Plays an episode.
+
+    Args:
+        agent: plays it.
+        env: as in `evaluate`.
+        volume_name: of the environment's volumes.
+        seed: of the episode.
+        look: called when it begins, and after every step.
+    """
     observation, info = env.reset(seed=seed, options={"volume": volume_name})
+    look()
     agent.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
     reward, rewards, ended = float(info["reward"]), [], False
     start_s = time.perf_counter()
@@ -144,6 +154,7 @@ def _play(agent: Agent, env: Env, volume_name: str, seed: int) -> Episode:
         reward = float(received)
         rewards.append(reward)
         ended = terminated or truncated
+        look()
     seconds = time.perf_counter() - start_s
     return Episode(
         volume=volume_name,

@@ -1,10 +1,12 @@
 """The film of an episode."""
 
+import weakref
+
 import numpy as np
 from PIL import Image
 
 from armscan.envs import make_armscan_env
-from armscan.training import film_episode
+from armscan.training import Film, film_episode
 
 
 class Still:
@@ -22,3 +24,32 @@ def test_film_has_a_frame_for_the_start_and_for_every_step(phantom, tmp_path):
         # The last two pictures show the same plane, but another step.
         assert film.n_frames == 4
         assert film.size == (860, 512)
+
+
+def test_pictures_are_written_as_they_come_and_not_kept(tmp_path):
+    drawn = np.random.default_rng(0)
+    sizes, pictures = [], []
+    with Film(tmp_path / "a.gif", tmp_path / "a.mp4") as film:
+        for _ in range(12):
+            picture = drawn.integers(255, size=(64, 96, 3), dtype=np.uint8)
+            pictures.append(weakref.ref(picture))
+            film.add(picture)
+            sizes.append((tmp_path / "a.gif").stat().st_size)
+            # The one that is added, and the one before.
+            del picture
+            assert sum(each() is not None for each in pictures) <= 2
+    assert sizes[5] > 0
+    assert sizes[11] > sizes[5]
+    with Image.open(tmp_path / "a.gif") as gif:
+        assert gif.n_frames == 12
+
+
+def test_picture_that_is_the_same_again_is_a_frame_that_lasts(tmp_path):
+    picture = np.full((64, 96, 3), 200, dtype=np.uint8)
+    with Film(tmp_path / "a.gif") as film:
+        film.add(picture, 600)
+        film.add(picture.copy(), 2400)
+    with Image.open(tmp_path / "a.gif") as gif:
+        assert gif.n_frames == 2
+        assert [(gif.seek(number), gif.info["duration"])[1] for number in range(2)] == [600, 2400]
+        assert gif.convert("RGB").getcolors() == [(64 * 96, (200, 200, 200))]

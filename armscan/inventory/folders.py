@@ -1,0 +1,234 @@
+"""The folder of a run on this machine: whether it verifiably is that run's, what in it is the run's, who is at work."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import stat
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+from mlflow.entities import Run
+
+from armscan.errors import ArmscanError, FolderInUseError, TrackingError
+from armscan.files import (
+    BEST_CHECKPOINT,
+    CONFIG_FILE,
+    LAST_CHECKPOINT,
+    LOCK_FILE,
+    SPOOLS,
+    SUM_TAGS,
+    UNFINISHED,
+    VOLUMES_FILE,
+    held,
+    sum_of,
+)
+from armscan.tracking.run import CURVE_FILE, EVALUATION_FILE
+from armscan.tracking.spool import DELIVERED, LOCK, SUFFIX, Spool, SpoolFile, file_of
+
+CHECKPOINTS = (LAST_CHECKPOINT, BEST_CHECKPOINT)
+# What every run leaves; the spool names what it has kept beside these.
+USUAL = (*CHECKPOINTS, VOLUMES_FILE, EVALUATION_FILE, CURVE_FILE, "episode.gif", "run.json")
+HYDRA_FOLDER = ".hydra"
+HYDRA_FILES = tuple(f"{HYDRA_FOLDER}/{name}.yaml" for name in ("config", "hydra", "overrides"))
+
+
+class NotOursError(ArmscanError):
+    """There is no folder on this machine that verifiably is the run's; the message says why.
+
+    Args:
+        message: of one line.
+        is_there: whether there is a folder that stays, because nobody knows that it is the run's.
+    """
+
+    def __init__(self, message: str, *, is_there: bool = True) -> None:
+        super().__init__(message)
+        self.is_there = is_there
+
+
+class BusyError(ArmscanError):
+    """A run's folder must be left as it is for now; the message says why."""
+
+
+@dataclass(frozen=True)
+class OwnFolder:
+    """A folder that verifiably is a run's.
+
+    Args:
+        path: of the folder.
+        run_id: of the run.
+    """
+
+    path: Path
+    run_id: str
+
+    @classmethod
+    def of(cls, run: Run) -> OwnFolder:
+        """Returns the folder of a run.
+
+        Raises:
+            NotOursError: if there is none, or it is not certain that it is the run's.
+        """
+        tags, run_id = run.data.tags, run.info.run_id
+        path = _noted(tags)
+        if path.resolve() != path:
+            raise NotOursError(f"its folder {path} is reached through a link")
+        if not path.is_dir():
+            raise NotOursError(f"its folder {path} is not there any more", is_there=False)
+        config = path / CONFIG_FILE
+        if config.is_symlink() or not config.is_file():
+            raise NotOursError(f"{path} has no {CONFIG_FILE}, so that nobody knows whether it is the run's")
+        try:
+            contents = config.read_bytes()
+        except OSError as error:
+            raise NotOursError(f"{config} cannot be read ({error.strerror})") from error
+        if sum_of(contents) != tags.get(SUM_TAGS[CONFIG_FILE]):
+            raise NotOursError(f"{path} holds another {CONFIG_FILE} than the run was started with")
+        if others := [file.stem for file in (path / SPOOLS).glob(f"*{SUFFIX}") if file.stem != run_id]:
+            raise NotOursError(f"{path} is the folder of run {others[0]}, too")
+        return cls(path, run_id)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files in it that are the run's; last those by which they are known to be, or held."""
+        spool = file_of(self.path, self.run_id)
+        names = [*USUAL, *_named_in(spool), *HYDRA_FILES]
+        last = [CONFIG_FILE, *(f"{SPOOLS}/{self.run_id}{end}" for end in (DELIVERED, SUFFIX, LOCK)), LOCK_FILE]
+        unfinished = [file.name for file in self.path.glob(f".*.{UNFINISHED}")]
+        unique = dict.fromkeys(name for name in (*unfinished, *names) if name not in last)
+        return tuple(self.path / name for name in (*unique, *last) if self._is_file(name))
+
+    @property
+    def checkpoints(self) -> tuple[Path, ...]:
+        """Those of the files that are checkpoints."""
+        return tuple(self.path / name for name in CHECKPOINTS if self._is_file(name))
+
+    @property
+    def n_bytes(self) -> int:
+        """Of the files."""
+        return sum(file.lstat().st_size for file in self.files)
+
+    def remove_emptied(self) -> bool:
+        """Removes the folder where nothing is left in it; returns whether it is gone."""
+        for folder in (self.path / HYDRA_FOLDER, self.path / SPOOLS, self.path):
+            # Somebody's files are in it, or their own feet.
+            with contextlib.suppress(OSError):
+                if not Path.cwd().is_relative_to(folder):
+                    folder.rmdir()
+        return not self.path.exists()
+
+    def _is_file(self, name: str) -> bool:
+        """Whether a name is that of a file in the folder, and nothing that leads out of it."""
+        file = self.path / name
+        try:
+            return stat.S_ISREG(file.lstat().st_mode) and file.parent.resolve().is_relative_to(self.path)
+        except OSError:
+            return False
+
+
+def check_at_rest(run: Run) -> None:
+    """Looks whether a run's folder may be touched, and touches nothing.
+
+    Raises:
+        BusyError: if another process holds it, or something is not delivered.
+    """
+    if (folder := folder_here(run)) is None:
+        return
+    file = file_of(folder, run.info.run_id)
+    try:
+        is_held = any(_is_held(lock) for lock in (folder / LOCK_FILE, file.with_suffix(LOCK)))
+    except OSError as error:
+        raise BusyError(_closed(folder, error)) from error
+    if is_held:
+        raise BusyError(f"another process is at work in its folder {folder}")
+    if file.exists():
+        try:
+            is_delivered = SpoolFile(file).is_delivered
+        except (TrackingError, OSError) as error:
+            raise BusyError(f"what it was to be tracked with cannot be read: {error}") from error
+        if not is_delivered:
+            raise BusyError(_undelivered(folder))
+
+
+@contextlib.contextmanager
+def at_rest(run: Run) -> Iterator[OwnFolder | None]:
+    """Holds a run's folder and its spool, so that nobody begins to work there; gives the folder, None for none.
+
+    Raises:
+        BusyError: as `check_at_rest`.
+    """
+    check_at_rest(run)
+    try:
+        ours = OwnFolder.of(run)
+    except NotOursError:
+        # Somebody else's, where nothing may be left behind, not even a lock; nor can the run be gone on with there.
+        yield None
+        return
+    file = file_of(ours.path, run.info.run_id)
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(held(ours.path))
+            spool = stack.enter_context(contextlib.closing(Spool(file, timeout_s=0.0))) if file.exists() else None
+        except FolderInUseError as error:
+            raise BusyError(f"another process is at work in its folder {ours.path}") from error
+        except OSError as error:
+            raise BusyError(_closed(ours.path, error)) from error
+        if spool is not None and not spool.is_delivered:
+            raise BusyError(_undelivered(ours.path))
+        yield ours
+
+
+def folder_here(run: Run) -> Path | None:
+    """Returns the folder that was noted for a run, where one may be on this machine, whether it is the run's or not."""
+    folder, host = Path(run.data.tags.get("folder", "")), run.data.tags.get("host")
+    return folder if folder.is_absolute() and folder.is_dir() and host in (None, socket.gethostname()) else None
+
+
+def _noted(tags: Mapping[str, str]) -> Path:
+    if "folder" not in tags:
+        raise NotOursError("no folder was noted for it", is_there=False)
+    if "host" not in tags:
+        raise NotOursError(f"its folder {tags['folder']} was noted without its host")
+    if tags["host"] != socket.gethostname():
+        raise NotOursError(f"its folder {tags['folder']} is on the host {tags['host']}")
+    path = Path(tags["folder"])
+    if not path.is_absolute():
+        raise NotOursError(f"its folder is {str(path)!r}, and nobody knows where that is")
+    return path
+
+
+def _named_in(spool: Path) -> list[str]:
+    """Returns the names of the files that a spool has kept."""
+    names = []
+    try:
+        lines = spool.read_bytes().splitlines()
+    except OSError:
+        return []
+    for line in lines:
+        # A damaged one names nothing.
+        with contextlib.suppress(ValueError):
+            entry = json.loads(line)
+            if isinstance(entry, dict) and isinstance(entry.get("file"), str):
+                names.append(entry["file"])
+    return names
+
+
+def _is_held(lock: Path) -> bool:
+    if not lock.exists():
+        return False
+    try:
+        with FileLock(lock, timeout=0):
+            return False
+    except Timeout:
+        return True
+
+
+def _closed(folder: Path, error: OSError) -> str:
+    return f"nobody knows whether another process is at work in its folder {folder} ({error.strerror})"
+
+
+def _undelivered(folder: Path) -> str:
+    return f"not all of it is delivered: python -m armscan.track sync {folder} does that"

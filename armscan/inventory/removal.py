@@ -1,0 +1,138 @@
+"""What a plan would remove is removed, run by run, each looked at once more."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+from mlflow.entities import Run
+from mlflow.exceptions import MlflowException
+from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
+
+from armscan.errors import ArmscanError
+from armscan.inventory.folders import BusyError, OwnFolder, at_rest
+from armscan.inventory.plan import (
+    CHECKPOINTS,
+    RUNS,
+    Case,
+    barred_by_folder,
+    barred_by_store,
+    folder_left,
+    neighbours_now,
+)
+from armscan.inventory.sizes import local_artifacts
+from armscan.tracking import TrackingStore
+from armscan.tracking.client import NOT_THERE, reason_in
+
+
+class LeftError(ArmscanError):
+    """Nothing of a run is removed, because that is not safe any more; the message says why."""
+
+
+class NotRemovedError(ArmscanError):
+    """Something of a run cannot be removed; the message says what and why."""
+
+
+def remove(client: TrackingStore, case: Case, what: str) -> str | None:
+    """Removes what a plan says of a run.
+
+    Args:
+        client: of its store.
+        case: of the plan.
+        what: one of `WHAT`.
+
+    Returns:
+        What is left of it; None for nothing.
+
+    Raises:
+        LeftError: if it must be left now; nothing of it was touched.
+        NotRemovedError: if something cannot be removed.
+    """
+    try:
+        with at_rest(case.run) as held:
+            # Somebody may have begun to work at it since it was planned.
+            run = _as_it_is_now(client, case.run)
+            near = neighbours_now(client, run, case.near)
+            if left := barred_by_store(run, what, near) or barred_by_folder(run, what, near):
+                raise LeftError(left)
+            ours = None if folder_left(run, near) else held
+            if what == RUNS:
+                return _remove_run(client, run, ours) or case.note
+            assert ours is not None
+            _unlink(ours.checkpoints if what == CHECKPOINTS else ours.files)
+            return None if what == CHECKPOINTS else _remove_emptied(ours)
+    except BusyError as error:
+        raise LeftError(str(error)) from error
+
+
+def _as_it_is_now(client: TrackingStore, run: Run) -> Run:
+    run_id = run.info.run_id
+    try:
+        now: Run = client.get_run(run_id)
+    except MlflowException as error:
+        if error.error_code != NOT_THERE:
+            raise
+        raise LeftError("it is not there any more") from error
+    if now.info.lifecycle_stage != "active":
+        raise LeftError("somebody has deleted it meanwhile")
+    return now
+
+
+def _remove_run(client: TrackingStore, run: Run, ours: OwnFolder | None) -> str | None:
+    """Removes a run from its store, with its artifacts and, where it is on this machine, its folder."""
+    run_id = run.info.run_id
+    # From here on nobody finds it any more.
+    client.delete_run(run_id)
+    try:
+        _remove_artifacts(client, run)
+        if ours is not None:
+            _unlink(ours.files)
+    except NotRemovedError:
+        # So that it can be tried again.
+        client.restore_run(run_id)
+        raise
+    left = _remove_emptied(ours) if ours else None
+    return _forget(client, run_id) or left
+
+
+def _remove_artifacts(client: TrackingStore, run: Run) -> None:
+    folder = local_artifacts(run)
+    try:
+        if folder is None:
+            kept = get_artifact_repository(run.info.artifact_uri, tracking_uri=client.mlflow.tracking_uri)
+            kept.delete_artifacts()  # type: ignore[no-untyped-call]
+        elif folder.is_dir():
+            shutil.rmtree(folder)
+            if folder.parent.name == run.info.run_id:
+                with contextlib.suppress(OSError):
+                    folder.parent.rmdir()
+    # Whatever a store of artifacts raises.
+    except Exception as error:
+        raise NotRemovedError(
+            f"its artifacts in {run.info.artifact_uri} cannot be removed: {reason_in(error)}"
+        ) from error
+
+
+def _unlink(files: Iterable[Path]) -> None:
+    for file in files:
+        try:
+            file.unlink(missing_ok=True)
+        except OSError as error:
+            raise NotRemovedError(f"{file} cannot be removed: {error.strerror}") from error
+
+
+def _remove_emptied(ours: OwnFolder) -> str | None:
+    """Removes the folder of a run where nothing is left in it; otherwise returns that it stays."""
+    return None if ours.remove_emptied() else f"{ours.path} stays, with what is not the run's"
+
+
+def _forget(client: TrackingStore, run_id: str) -> str | None:
+    """Removes a deleted run's rows from a database; a server does that itself, and it is returned how."""
+    store = client.mlflow._tracking_client.store
+    # What `mlflow gc` calls; the versions of MLflow that are allowed all have it.
+    if not hasattr(store, "_hard_delete_run"):
+        return "on the server, its figures are those of a deleted run until `mlflow gc` removes them there"
+    store._hard_delete_run(run_id)
+    return None

@@ -1,0 +1,103 @@
+"""Runs that have trained nothing, in a real store, with real folders, spools and artifacts."""
+
+import contextlib
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from armscan.experiment import place_tags
+from armscan.files import CONFIG_FILE, SUM_TAGS, sum_of
+from armscan.tracking import TrackedRun, open_store
+
+HOLDER = """
+import sys
+from filelock import FileLock
+with FileLock(sys.argv[1]):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture(scope="session")
+def empty_database(tmp_path_factory):
+    """A database with MLflow's tables, whose making takes seconds."""
+    folder = tmp_path_factory.mktemp("store")
+    open_store(f"sqlite:///{folder}/mlruns.db", experiment="unused", artifacts=str(folder / "artifacts"), wait_s=60.0)
+    return folder / "mlruns.db"
+
+
+@pytest.fixture
+def store(tmp_path, empty_database):
+    shutil.copy(empty_database, tmp_path / "mlruns.db")
+    artifacts = str(tmp_path / "mlartifacts")
+    return open_store(f"sqlite:///{tmp_path}/mlruns.db", experiment="armscan", artifacts=artifacts, wait_s=60.0)
+
+
+@pytest.fixture
+def make_run(store, tmp_path):
+    """Makes a run that has ended, as `armscan.run` leaves it; returns its id."""
+
+    def make(name="tiny", *, status="FINISHED", tags=None, figures=None, parent_id=None, folder=None, opened=store):
+        client, experiment_id = opened
+        folder = folder or tmp_path / "outputs" / name
+        (folder / ".hydra").mkdir(parents=True, exist_ok=True)
+        contents = {CONFIG_FILE: f"name: {name}\n".encode(), "best.pt": bytes(1000), "last.pt": bytes(2000)}
+        for file, text in contents.items():
+            (folder / file).write_bytes(text)
+        (folder / ".hydra" / "config.yaml").write_text("a: 1\n")
+        tags = {**place_tags(folder), SUM_TAGS[CONFIG_FILE]: sum_of(contents[CONFIG_FILE]), **(tags or {})}
+        config = {"projection": "zy"}
+        with contextlib.ExitStack() as stack:
+            run = TrackedRun.start(
+                client, experiment_id, name=name, config=config, tags=tags, folder=folder, parent_id=parent_id
+            )
+            stack.callback(run.end, status, reason=None if status == "FINISHED" else "no reason")
+            run.log_figures(figures or {}, n_env_steps=7)
+            run.log_files(*(folder / file for file in contents))
+        return run.run_id
+
+    return make
+
+
+@pytest.fixture
+def locked():
+    """Has another process hold a lock until the test ends."""
+    with contextlib.ExitStack() as stack:
+
+        def lock(file):
+            holder = subprocess.Popen(
+                [sys.executable, "-c", HOLDER, str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            )
+            stack.callback(holder.communicate)
+            assert holder.stdout.readline() == b"held\n"
+
+        yield lock
+
+
+@pytest.fixture
+def answer(tmp_path, monkeypatch, capsys):
+    """Runs the command in this process, in the folder of the store; returns its exit code and what it printed."""
+    from armscan import runs
+
+    def command(*words):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("COLUMNS", "80")
+        capsys.readouterr()
+        code = runs.main(words)
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err.strip()
+
+    return command
+
+
+@pytest.fixture
+def snapshot(tmp_path):
+    """Returns every file of the test's folder with its contents, but for the database's own."""
+
+    def look():
+        files = (file for file in tmp_path.rglob("*") if not file.name.startswith("mlruns.db"))
+        return {file: file.read_bytes() if file.is_file() else None for file in files}
+
+    return look
