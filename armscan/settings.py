@@ -27,6 +27,8 @@ SWEEPS, PLAN = "sweeps", "--plan"
 CLUSTER = "cluster"
 # Hydra's options for several runs.
 MULTIRUN = ("-m", "--multirun")
+# What says where and how things are computed and kept, not what, and the seed: two runs of the same thing may differ by it.
+NOT_COMPARED = ("tracking", "device", "compute.device", "seed")
 # The phantoms, where a command asks for volumes.
 PHANTOM = "phantom"
 

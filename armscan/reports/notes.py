@@ -1,0 +1,77 @@
+"""What whoever reads a comparison should know of it."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Sequence
+
+from armscan.reports.groups import Group, differing_rules
+from armscan.reports.trainings import Training
+from armscan.training.seeds import FEWEST_SEEDS
+
+
+def notes_on(groups: Sequence[Group], left_out: Sequence[Training], *, has_other_volumes: bool) -> str:
+    """Returns the notes as a list, nothing where there are none.
+
+    Args:
+        groups: that are compared.
+        left_out: trainings that repeat another one.
+        has_other_volumes: whether some groups were judged on other volumes than others.
+    """
+    notes = [
+        *_on_seeds(groups),
+        *_on_unfinished(groups),
+        *_on_missing(groups),
+        *_on_rules(groups, has_other_volumes=has_other_volumes),
+    ]
+    if left_out:
+        which = ", ".join(f"{training.id} ({training.label})" for training in left_out)
+        notes.append(f"Left out, because another run has the same configuration and seed: {which}.")
+    return f"<ul>{''.join(f'<li>{html.escape(note)}</li>' for note in notes)}</ul>" if notes else ""
+
+
+def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
+    n_seeds = [len(group.trainings) for group in groups]
+    if single := [group.name for group, n in zip(groups, n_seeds, strict=True) if n == 1]:
+        yield (
+            f"One seed says nothing of how others would go, and its intervals are of its own volumes and episodes alone: "
+            f"{_listed(single)}."
+        )
+    if few := [group.name for group, n in zip(groups, n_seeds, strict=True) if 1 < n < FEWEST_SEEDS]:
+        yield (
+            "Of two or three seeds a 95 % interval is only the range from the lowest to the highest, which holds the median "
+            f"of all seeds in 50 % and 75 % of cases, not in 95 %: {_listed(few)}."
+        )
+
+
+def _on_unfinished(groups: Sequence[Group]) -> Iterator[str]:
+    unfinished = [(group, training) for group in groups for training in group.trainings if not training.is_whole]
+    if unfinished:
+        which = [
+            f"{training.id} ({group.label}, {training.label}): {training.status}" for group, training in unfinished
+        ]
+        yield f"Not run to the end, and here with what they have: {_listed(which)}."
+
+
+def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
+    of_files: dict[str, list[str]] = {}
+    for group in groups:
+        for training in group.trainings:
+            for file in training.missing:
+                of_files.setdefault(file, []).append(f"{training.id} ({group.label}, {training.label})")
+    for file, which in of_files.items():
+        yield f"No {file} is among the artifacts of {_listed(which)}."
+
+
+def _on_rules(groups: Sequence[Group], *, has_other_volumes: bool) -> Iterator[str]:
+    if rules := differing_rules(groups):
+        yield f"The groups' episodes have different rules ({', '.join(rules)}): their figures are those of different tasks."
+    if has_other_volumes:
+        yield (
+            "Not all groups were judged on the same test volumes: those that were not are left out where it is asked which "
+            "is better, and their figures differ by the volumes, too."
+        )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return "; ".join(names)
