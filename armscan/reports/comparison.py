@@ -26,24 +26,26 @@ SHOWN = {
     "angle (°)": ("mean_distance_deg", "{:.1f}"),
     "Dice": ("mean_dice", "{:.2f}"),
 }
+# A chart that was drawn where nothing was seen has no width.
+FITTED = "this.querySelectorAll('.js-plotly-plot').forEach((chart) => Plotly.Plots.resize(chart))"
 HOW_CURVES = (
     "On the validation volumes, after each epoch. Thick: the seeds of a group together, their interquartile mean (of "
-    "success rates the mean; of fewer than four seeds both are the mean). Band: its 95 % interval by a bootstrap of the "
-    "seeds. Thin: each seed. A training that has run to its end before others of its group is carried on with its last "
-    "value; where one was cut off or is still running, the curve of its group ends. A group of one seed has no band. "
+    "success rates the mean; of fewer than four seeds both are the mean). Band: its 95 % interval by a bootstrap of "
+    "the seeds; a group of one seed has none. Thin: each seed. A training that ran to its end before others of its "
+    "group is carried on with its last value; where one was cut off or is still running, the curve of its group ends. "
     "Seconds are of training and validation on whatever machine it was, with whatever else it did."
 )
 HOW_FINAL = (
-    "The final evaluation, with the weights of the best epoch, on test volumes that had no part in anything before: means "
-    "over all episodes of all seeds, and 95 % intervals that draw seeds, then volumes, then episodes. Where all episodes "
-    "went alike, as at a success rate of 100 %, an interval has no width; Wilson's, which takes episodes as independent, "
-    "has. Diamonds are these means, dots the seeds."
+    "The final evaluation, with the weights of the best epoch, on test volumes that had no part in anything before: "
+    "means over all episodes of all seeds, and 95 % intervals that draw seeds, then volumes, then episodes. Where all "
+    "episodes went alike, as at a success rate of 100 %, such an interval has no width; Wilson's, which takes episodes "
+    "as independent, stands in its place. In the chart diamonds are these means, dots the seeds."
 )
 HOW_BETTER = (
-    "How likely a training of the row's group is better than one of the column's, with seeds drawn for each: the share of "
-    "pairs of seeds, ties counting half, averaged over the test volumes "
-    '(<a href="https://arxiv.org/abs/2108.13264">Agarwal et al. 2021</a>), with a 95 % interval by a bootstrap of the seeds '
-    "of each volume. 0.5 is no difference; an interval that holds it leaves open which is better."
+    "How likely a training of the row's group is better than one of the column's group: the share of pairs of seeds, "
+    "ties counting half, averaged over the test volumes "
+    '(<a href="https://arxiv.org/abs/2108.13264">Agarwal et al. 2021</a>), with a 95 % interval by a bootstrap of the '
+    "seeds of both groups. 0.5 is no difference; an interval that holds it leaves open which is better."
 )
 
 
@@ -91,7 +93,7 @@ def _figures(groups: Sequence[Group]) -> list[str]:
 
 def _summary(groups: Sequence[Group]) -> str:
     n_trainings = sum(len(group.trainings) for group in groups)
-    rows = [{"group": group.name, "seeds": ", ".join(_seeds(group.trainings))} for group in groups]
+    rows = [{"group": group.title, "seeds": ", ".join(_seeds(group.trainings))} for group in groups]
     counted = f"{n_trainings} runs in {len(groups)} group{'s' if len(groups) > 1 else ''}"
     return f"<p>{counted}: those of a group differ by nothing but the seed.</p>{table(rows)}"
 
@@ -112,7 +114,8 @@ def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
 def _of_the_training(groups: Sequence[Group], curves: Curves, figures: Sequence[str]) -> Iterator[str]:
     if figures:
         drawn = chart(learning_curves(groups, curves, {name: name.partition("/")[2] for name in figures}))
-        yield f"<details><summary>Figures of the training itself: losses, returns, speed</summary>{drawn}</details>"
+        summary = "<summary>Figures of the training itself: losses, returns, speed</summary>"
+        yield f'<details ontoggle="{FITTED}">{summary}{drawn}</details>'
 
 
 def _final(groups: Sequence[Group], reached: Sequence[Figures | None]) -> Iterator[str]:
@@ -130,14 +133,13 @@ def _final_row(group: Group, figures: Figures | None) -> dict[str, Any]:
         "environment steps": _span([training.env_steps for training in group.trainings]),
     }
     if figures is None:
-        return {"group": group.name, "seeds": 0, **cost}
+        return {"group": group.title, **cost}
     shown = {title: _text(figures.estimates[name], form) for title, (name, form) in SHOWN.items()}
-    wilson = figures.estimates["success_rate_wilson"]
-    shown["success rate"] = Markup(
-        f"{shown['success rate']}<br><small>Wilson {wilson.low:.1%} to {wilson.high:.1%}</small>"
-    )
-    counts = {"seeds": len(judged(group)), "volumes": figures.n_volumes, "episodes": figures.n_episodes}
-    return {"group": group.name, **shown, **counts, **cost}
+    success = figures.estimates["success_rate"]
+    if success.low == success.high:
+        shown["success rate"] = _text(figures.estimates["success_rate_wilson"], "{:.1%}")
+    counts = f"{len(judged(group))}, {figures.n_volumes}, {figures.n_episodes}"
+    return {"group": group.title, **shown, "seeds, volumes, episodes": counts, **cost}
 
 
 def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[str]:
@@ -149,8 +151,8 @@ def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Ite
         return
     yield f"<p>{HOW_BETTER}</p>"
     for figure, of_figure in pairs.items():
-        wanted = "higher" if COMPARED_BY[figure] else "lower"
-        yield f"<h3>By {figure.replace('_', ' ').replace(' mm', ' (mm)')}, {wanted} is better</h3>{_matrix(groups, of_figure)}"
+        wanted, name = "higher" if COMPARED_BY[figure] else "lower", figure.replace("_", " ").replace(" mm", " (mm)")
+        yield f"<h3>By {name}, {wanted} is better</h3>{_matrix(groups, of_figure)}"
 
 
 def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
@@ -162,7 +164,7 @@ def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
     numbers = range(len(groups))
     return table(
         [
-            {"": f"{row + 1}. {groups[row].name}"}
+            {"": groups[row].title}
             | {f"than {column + 1}": cells.get((row, column), Markup("–")) for column in numbers}
             for row in numbers
         ]
@@ -182,7 +184,7 @@ def _cell(probability: Estimate | None) -> Markup:
 
 def _text(estimate: Estimate, form: str) -> Markup:
     value, low, high = (form.format(number) for number in estimate)
-    return Markup(f"{value} <small>{low} to {high}</small>")
+    return Markup(f"{value}<br><small>{low} to {high}</small>")
 
 
 def _span(values: Sequence[float]) -> str:
@@ -191,4 +193,5 @@ def _span(values: Sequence[float]) -> str:
     if not known:
         return "–"
     low, high, mean = min(known), max(known), sum(known) / len(known)
-    return f"{mean:,.0f}" if low == high else f"{mean:,.0f} ({low:,.0f} to {high:,.0f})"
+    ends = f"<br><small>{low:,.0f} to {high:,.0f}</small>" if high > low else ""
+    return Markup(f"{mean:,.0f}{ends}")

@@ -12,7 +12,9 @@ from armscan.settings import NOT_COMPARED
 
 LEFT_OUT = (*NOT_COMPARED, "data.cache_dir")
 SEED_IN_NAME = re.compile(r"-seed\d+$")
-MAX_LABEL_CHARS = 48
+MAX_LABEL_CHARS = 72
+# The sections before a key.
+SECTIONS = re.compile(r"[\w.]+\.(?=\w+=)")
 # By these an episode is another task, or judged otherwise.
 RULES = ("projection", "reward", "env.")
 
@@ -22,29 +24,36 @@ class Group:
     """Trainings with the same configuration.
 
     Args:
+        number: from 1.
         name: the keys by which it differs from the other groups.
-        label: the name, short enough for a legend.
+        label: number and name, short enough for a legend.
         trainings: each with another seed.
     """
 
+    number: int
     name: str
     label: str
     trainings: tuple[Training, ...]
+
+    @property
+    def title(self) -> str:
+        """Number and name."""
+        return f"{self.number}. {self.name}"
 
 
 def grouped(trainings: Sequence[Training]) -> tuple[list[Group], list[Training]]:
     """Returns the groups in the order of their first trainings, and the trainings that are left out.
 
-    Of several trainings with the same configuration and seed only one counts, because the others say nothing new: one that
-    has run to its end if there is any, and of these the last.
+    Of several trainings with the same configuration and seed only one counts, because the others say nothing new: one
+    that has run to its end if there is any, and of these the last.
     """
     of_key: dict[tuple[tuple[str, str], ...], list[Training]] = {}
     for training in trainings:
         of_key.setdefault(tuple(sorted(_compared(training.params).items())), []).append(training)
     kept = [_one_for_each_seed(each) for each in of_key.values()]
-    names = _names([each[0] for each in kept])
-    labels = _labels(names)
-    groups = [Group(*each) for each in zip(names, labels, map(tuple, kept), strict=True)]
+    groups = []
+    for number, (name, each) in enumerate(zip(_names([each[0] for each in kept]), kept, strict=True), start=1):
+        groups.append(Group(number, name, f"{number}. {_shortened(name)}", tuple(each)))
     counted = {training.run_id for group in groups for training in group.trainings}
     return groups, [training for training in trainings if training.run_id not in counted]
 
@@ -105,8 +114,10 @@ def _names(firsts: Sequence[Training]) -> list[str]:
     return _distinct(names)
 
 
-def _labels(names: Sequence[str]) -> list[str]:
-    return _distinct([name if len(name) <= MAX_LABEL_CHARS else f"{name[: MAX_LABEL_CHARS - 1]}…" for name in names])
+def _shortened(name: str) -> str:
+    """Returns a name with the last part of each key, cut where it is long."""
+    short = SECTIONS.sub("", name)
+    return short if len(short) <= MAX_LABEL_CHARS else f"{short[: MAX_LABEL_CHARS - 1]}…"
 
 
 def _distinct(names: Sequence[str]) -> list[str]:

@@ -31,16 +31,16 @@ def notes_on(groups: Sequence[Group], left_out: Sequence[Training], *, has_other
 
 
 def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
-    n_seeds = [len(group.trainings) for group in groups]
-    if single := [group.name for group, n in zip(groups, n_seeds, strict=True) if n == 1]:
+    if single := [group.number for group in groups if len(group.trainings) == 1]:
         yield (
-            f"One seed says nothing of how others would go, and its intervals are of its own volumes and episodes alone: "
-            f"{_listed(single)}."
+            "One seed says nothing of how others would go; its intervals are of volumes and episodes alone: "
+            f"{_numbered(single, groups)}."
         )
-    if few := [group.name for group, n in zip(groups, n_seeds, strict=True) if 1 < n < FEWEST_SEEDS]:
+    if few := [group.number for group in groups if 1 < len(group.trainings) < FEWEST_SEEDS]:
         yield (
-            "Of two or three seeds a 95 % interval is only the range from the lowest to the highest, which holds the median "
-            f"of all seeds in 50 % and 75 % of cases, not in 95 %: {_listed(few)}."
+            "Of two or three seeds a 95 % interval of a curve is only the range from the lowest to the highest, which "
+            "holds the median of all seeds in 50 % or 75 % of cases. Other intervals of so few seeds mean as little: "
+            f"{_numbered(few, groups)}."
         )
 
 
@@ -58,19 +58,29 @@ def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
     for group in groups:
         for training in group.trainings:
             for file in training.missing:
-                of_files.setdefault(file, []).append(f"{training.id} ({group.label}, {training.label})")
+                of_files.setdefault(file, []).append(_named(group, training))
     for file, which in of_files.items():
         yield f"No {file} is among the artifacts of {_listed(which)}."
 
 
 def _on_rules(groups: Sequence[Group], *, has_other_volumes: bool) -> Iterator[str]:
     if rules := differing_rules(groups):
-        yield f"The groups' episodes have different rules ({', '.join(rules)}): their figures are those of different tasks."
+        yield f"The groups' episodes have other rules ({', '.join(rules)}): their figures are those of different tasks."
     if has_other_volumes:
         yield (
-            "Not all groups were judged on the same test volumes: those that were not are left out where it is asked which "
-            "is better, and their figures differ by the volumes, too."
+            "Not all groups were judged on the same test volumes: pairs that were not are left out where it is asked "
+            "which is better, and their figures differ by the volumes, too."
         )
+
+
+def _named(group: Group, training: Training) -> str:
+    return f"{training.id} (group {group.number}, {training.label})"
+
+
+def _numbered(numbers: Sequence[int], groups: Sequence[Group]) -> str:
+    if len(numbers) == len(groups):
+        return "all groups" if len(groups) > 1 else "the only group"
+    return f"group{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
 
 
 def _listed(names: Sequence[str]) -> str:
