@@ -5,8 +5,8 @@
 
 study=NAME          of the study
 storage=URI         that it is in; ARMSCAN_STORAGE or optuna.journal where nothing is said
-runs=ID,ID,...      ids of runs, or their beginnings: of trainings, of multiruns or of a study's trials, which stand for all
-                    trainings below them; experiment:NAME for a whole experiment of MLflow
+runs=ID,ID,...      ids of runs, or their beginnings: of trainings, of multiruns or of a study's trials, which stand for
+                    all trainings below them; experiment:NAME for a whole experiment of MLflow
 tracking=URI        that they are in; MLFLOW_TRACKING_URI or sqlite:///mlruns.db where nothing is said
 out=FOLDER          takes the report; one in reports/ where nothing is said
 

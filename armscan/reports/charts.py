@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import wrap
 from typing import Any
 
 from plotly.colors import hex_to_rgb, qualitative
@@ -21,6 +22,7 @@ Curves = Mapping[tuple[str, str, int], Curve]
 # More groups than that would hide each other behind their seeds.
 MANY = 6
 ROW_PX, LEGEND_ROW_PX, GROUP_PX, AROUND_PX, SWITCHES_PX = 250, 20, 34, 110, 45
+LABEL_CHARS = 38
 FINAL = {"success_rate": "success rate", "mean_steps": "mean steps", "mean_distance_mm": "mean distance (mm)"}
 Points = dict[str, list[Any]]
 
@@ -72,6 +74,7 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
         # One line of each group stands in the legend.
         drawn.showlegend = "text" in trace.over[0] and drawn.legendgroup not in named
         named |= {drawn.legendgroup} if drawn.showlegend else set()
+    figure.update_xaxes(rangemode="tozero")
     figure.update_xaxes(title=next(iter(AXES)), row=len(titles), col=1)
     figure.update_layout(
         height=height,
@@ -100,7 +103,7 @@ def final_chart(groups: Sequence[Group], reached: Sequence[Figures | None]) -> F
             seeds = [(each.label, each.evaluation.metrics()[name]) for each in judged(group) if each.evaluation]
             figure.add_scatter(
                 x=[of_seed for _, of_seed in seeds],
-                y=[group.label] * len(seeds),
+                y=[_wrapped(group.label)] * len(seeds),
                 text=[label for label, _ in seeds],
                 hovertemplate="%{text}: %{x}<extra></extra>",
                 marker={"color": colour, "opacity": 0.45, "size": 8},
@@ -108,7 +111,7 @@ def final_chart(groups: Sequence[Group], reached: Sequence[Figures | None]) -> F
             )
             figure.add_scatter(
                 x=[value],
-                y=[group.label],
+                y=[_wrapped(group.label)],
                 hovertemplate=f"%{{x}} ({low:.3g} to {high:.3g})<extra></extra>",
                 error_x={"type": "data", "symmetric": False, "array": [high - value], "arrayminus": [value - low]},
                 marker={"color": colour, "size": 11, "symbol": "diamond"},
@@ -143,8 +146,10 @@ def _points(curve: Curve | None, which: str) -> Points:
 
 
 def _line(curve: Curve | None, label: str) -> Points:
-    places, values = curve.lines[label] if curve and label in curve.lines else ([], [])
-    return {"x": list(places), "y": list(values)}
+    if curve is None or label not in curve.lines:
+        return {"x": [], "y": []}
+    places, values = curve.lines[label]
+    return {"x": places.tolist(), "y": values.tolist()}
 
 
 def _said(curve: Curve | None) -> list[str]:
@@ -152,6 +157,10 @@ def _said(curve: Curve | None) -> list[str]:
     if curve is None or curve.n_seeds == 1:
         return [f"{value:.3g} (one seed)" for value in curve.band.values] if curve else []
     return [f"{value:.3g} ({low:.3g} to {high:.3g})" for value, low, high in zip(*curve.band, strict=True)]
+
+
+def _wrapped(label: str) -> str:
+    return "<br>".join(wrap(label, LABEL_CHARS))
 
 
 def _axis_switch(traces: Sequence[Trace], n_rows: int) -> dict[str, Any]:

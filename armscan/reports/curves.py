@@ -41,7 +41,8 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
     """Returns the curve of a group; None where none of its trainings has measured the figure.
 
     Between two validations a seed's line is straight. A training that has run to its end is carried on with its last
-    value for as long as others of its group go on; where one has not, the curve ends with it. It begins where all are known.
+    value for as long as others of its group go on; where one has not, the curve ends with it. It begins where all are
+    known.
 
     Args:
         group: of trainings.

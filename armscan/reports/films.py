@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from armscan.reports.groups import Group
 from armscan.reports.trainings import Training
 
-# An animated picture starts when it is first shown, and pictures with the same address are one: each start has new ones.
+# An animated picture starts when it is first shown, and is the same wherever its address is: each start has new ones.
 PROGRAM = """
 <script>
 (() => {
@@ -34,8 +34,8 @@ def films(groups: Sequence[Group]) -> str:
     if not chosen:
         return "<h2>Episodes</h2><p>None of these runs has kept a film.</p>"
     return (
-        "<h2>Episodes</h2><p>On the first test volume, of the training in the middle of its group by mean steps on the test "
-        "volumes (of an even number, the better of two). The same seed and volume is the same episode. "
+        "<h2>Episodes</h2><p>On the first test volume, of the training in the middle of its group by mean steps on the "
+        "test volumes (of an even number, the better of two). The same seed and volume is the same episode. "
         '<button id="start">start together</button></p>'
         f'<div class="films">{"".join(_figure(*each) for each in chosen)}</div>{PROGRAM}'
     )
@@ -53,6 +53,6 @@ def _mean_steps(training: Training) -> float:
 
 
 def _figure(group: Group, training: Training) -> str:
-    name = html.escape(f"{group.name}: {training.label}")
+    name = html.escape(f"{group.title}: {training.label}")
     contents = base64.b64encode(training.film or b"").decode()
     return f'<figure><img alt="an episode" data-film="{contents}"><figcaption>{name}</figcaption></figure>'

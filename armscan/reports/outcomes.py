@@ -27,11 +27,13 @@ class Pair:
         ours: number of the one group.
         theirs: number of the other.
         probability: that a training of ours is better than one of theirs; None where they were judged on other volumes.
+        stratified: likewise, with the interval that draws the seeds of each volume by itself.
     """
 
     ours: int
     theirs: int
     probability: Estimate | None
+    stratified: Estimate | None
 
 
 def judged(group: Group) -> list[Training]:
@@ -40,7 +42,7 @@ def judged(group: Group) -> list[Training]:
 
 
 def final_figures(group: Group) -> Figures | None:
-    """Returns what a group has reached, with intervals of seeds, volumes and episodes; None where nothing was judged."""
+    """Returns what a group has reached, with intervals of seeds, volumes and episodes; None where none was judged."""
     played = [(training.run_id, training.evaluation) for training in judged(group) if training.evaluation is not None]
     if not played:
         return None
@@ -63,9 +65,11 @@ def compared(groups: Sequence[Group], figure: str) -> Iterator[Pair]:
         if not (judged(groups[ours]) and judged(groups[theirs])):
             continue
         if _are_same(volumes[ours], volumes[theirs]):
-            yield Pair(ours, theirs, probability_of_improvement(scores[ours], scores[theirs]))
+            both = scores[ours], scores[theirs]
+            stratified = probability_of_improvement(*both, is_stratified=True)
+            yield Pair(ours, theirs, probability_of_improvement(*both), stratified)
         else:
-            yield Pair(ours, theirs, None)
+            yield Pair(ours, theirs, None, None)
 
 
 def opposite(probability: Estimate) -> Estimate:
@@ -88,7 +92,7 @@ def _scores(group: Group, figure: str) -> FloatArray:
 
 
 def _volumes(group: Group) -> Mapping[str, str | None] | None:
-    """Returns the volumes that a group was judged on, with their fingerprints; None where its trainings differ in them."""
+    """Returns the volumes that a group was judged on, with their fingerprints; None where its trainings differ."""
     of_trainings = [
         {name: (training.volumes or {}).get(name) for name in volume_figures(training)} for training in judged(group)
     ]

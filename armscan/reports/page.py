@@ -70,7 +70,9 @@ def table(rows: Sequence[Row]) -> str:
 
 def chart(figure: graph_objects.Figure) -> str:
     """Returns a chart; the page's heading says what its title would."""
-    drawn = figure.update_layout(title=None).to_html(full_html=False, include_plotlyjs=False)
+    drawn = figure.update_layout(title=None).to_html(
+        full_html=False, include_plotlyjs=False, config={"displaylogo": False}
+    )
     return f'<div class="chart">{drawn}</div>'
 
 

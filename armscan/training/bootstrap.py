@@ -2,9 +2,9 @@
 
 Whoever reads a success rate wants to know it for *other* volumes, and episodes on one volume are alike. So volumes are
 drawn with replacement first, and then, in each of them, as many of its episodes as it has, with replacement too. Where
-there is one volume, that leaves a bootstrap of its episodes, which speaks of that volume alone. Whoever wants to know it
-for other *seeds* of a training as well has several of them: these are drawn before the volumes, and all that are drawn
-meet the same drawn volumes, as all have met the same ones.
+there is one volume, that leaves a bootstrap of its episodes, which speaks of that volume alone. Whoever wants to know
+it for other *seeds* of a training as well has several of them: these are drawn before the volumes, and all that are
+drawn meet the same drawn volumes, as all have met the same ones.
 
 With K volumes this is a little too wide where volumes are alike, and too narrow, by about sqrt((K - 1) / K) and more
 for few, where they differ; no resampling can know volumes that it has never seen. Where every episode has the same

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import bootstrap, trim_mean
 
 from armscan.errors import InvalidValueError
@@ -51,7 +51,7 @@ def mean_for(figure: str) -> Mean:
 
 
 def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
-    """Returns the mean over seeds and volumes, with an interval by stratified bootstrap: seeds of each volume by itself.
+    """Returns the mean over seeds and volumes, with an interval that draws the seeds of each volume by itself.
 
     Args:
         scores: shape (seeds, volumes).
@@ -87,15 +87,19 @@ def band_over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Band:
     return Band(values, np.asarray(low), np.asarray(high))
 
 
-def probability_of_improvement(ours: FloatArray, theirs: FloatArray, *, seed: int = 0) -> Estimate:
+def probability_of_improvement(
+    ours: FloatArray, theirs: FloatArray, *, is_stratified: bool = False, seed: int = 0
+) -> Estimate:
     """Returns how likely a training of ours is better than one of theirs on the same volume, averaged over the volumes.
 
-    The share of pairs of seeds in which ours is greater, where ties count half: the statistic of Mann and Whitney. The
-    interval draws the seeds of each volume by itself.
+    The share of pairs of seeds in which ours is greater, where ties count half: the statistic of Mann and Whitney.
 
     Args:
         ours: shape (seeds, volumes), greater is better, all finite.
         theirs: shape (seeds, the same volumes).
+        is_stratified: draw the seeds of each volume by itself, which is right where each volume has had trainings of
+            its own. Where a training was judged on all volumes such an interval is far too narrow, and a seed is drawn
+            with all of them.
         seed: of the resamples.
 
     Returns:
@@ -106,14 +110,22 @@ def probability_of_improvement(ours: FloatArray, theirs: FloatArray, *, seed: in
     """
     if ours.shape[1:] != theirs.shape[1:]:
         raise InvalidValueError(
-            f"scores are of {ours.shape[1]} and of {theirs.shape[1]} volumes, but must be of the same"
+            f"scores are of {ours.shape[1]} and of {theirs.shape[1]} volumes, but they must be of the same ones"
         )
-    samples = (*ours.T, *theirs.T)
-    value = float(_improvement(*samples, axis=-1))
-    if min(len(ours), len(theirs)) < 2:
+    wins = _wins(ours.T, theirs.T).mean(axis=0)
+    value = float(wins.mean())
+    if min(wins.shape) < 2:
         return Estimate(value, np.nan, np.nan)
-    at_once = max(1, MOST_VALUES // (len(ours) * len(theirs)))
-    low, high = _ends(samples, _improvement, seed, vectorized=True, axis=-1, batch=at_once)
+
+    def of_drawn(our_seeds: NDArray[np.intp], their_seeds: NDArray[np.intp], axis: int) -> Any:
+        return wins[our_seeds[..., :, None], their_seeds[..., None, :]].mean(axis=(-2, -1))
+
+    drawn: tuple[NDArray[Any], ...] = tuple(np.arange(n) for n in wins.shape)
+    how: dict[str, Any] = {"vectorized": True, "axis": -1, "batch": max(1, MOST_VALUES // wins.size)}
+    if is_stratified:
+        low, high = _ends((*ours.T, *theirs.T), _improvement, seed, **how)
+    else:
+        low, high = _ends(drawn, of_drawn, seed, **how)
     return Estimate(value, float(low), float(high))
 
 
@@ -121,14 +133,16 @@ def _improvement(*samples: FloatArray, axis: int) -> Any:
     """Returns the probability from the seeds of each volume, ours and then theirs, each of shape (..., seeds)."""
     n_volumes = len(samples) // 2
     pairs = zip(samples[:n_volumes], samples[n_volumes:], strict=True)
-    return sum(_wins(ours[..., :, None], theirs[..., None, :]) for ours, theirs in pairs) / n_volumes
+    return sum(_wins(ours, theirs).mean(axis=(-2, -1)) for ours, theirs in pairs) / n_volumes
 
 
-def _wins(ours: FloatArray, theirs: FloatArray) -> Any:
-    return ((ours > theirs) + 0.5 * (ours == theirs)).mean(axis=(-2, -1))
+def _wins(ours: FloatArray, theirs: FloatArray) -> FloatArray:
+    """Returns 1 where ours is greater, 0.5 where they are equal, of shape (..., our seeds, their seeds)."""
+    ours, theirs = ours[..., :, None], theirs[..., None, :]
+    return np.asarray((ours > theirs) + 0.5 * (ours == theirs))
 
 
-def _ends(samples: tuple[FloatArray, ...], statistic: Mean, seed: int, **how: Any) -> tuple[Any, Any]:
+def _ends(samples: tuple[NDArray[Any], ...], statistic: Mean, seed: int, **how: Any) -> tuple[Any, Any]:
     draw = partial(bootstrap, n_resamples=N_RESAMPLES, confidence_level=LEVEL, method="percentile")
     interval = draw(samples, statistic, rng=np.random.default_rng(seed), **how).confidence_interval
     return interval.low, interval.high
