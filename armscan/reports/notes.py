@@ -33,23 +33,21 @@ def notes_on(groups: Sequence[Group], left_out: Sequence[Training], *, has_other
 def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
     if single := [group.number for group in groups if len(group.trainings) == 1]:
         yield (
-            "One seed says nothing of how others would go; its intervals are of volumes and episodes alone: "
-            f"{_numbered(single, groups)}."
+            f"{_numbered(single, groups)}: one seed says nothing of how others would go; intervals are of volumes and "
+            "episodes alone."
         )
     if few := [group.number for group in groups if 1 < len(group.trainings) < FEWEST_SEEDS]:
         yield (
-            "Of two or three seeds a 95 % interval of a curve is only the range from the lowest to the highest, which "
-            "holds the median of all seeds in 50 % or 75 % of cases. Other intervals of so few seeds mean as little: "
-            f"{_numbered(few, groups)}."
+            f"{_numbered(few, groups)}: of two or three seeds the 95 % interval of a curve is only the range from the "
+            "lowest to the highest, which holds the median of all seeds in 50 % or 75 % of cases. The other intervals of "
+            "so few seeds are as little to be relied on."
         )
 
 
 def _on_unfinished(groups: Sequence[Group]) -> Iterator[str]:
     unfinished = [(group, training) for group in groups for training in group.trainings if not training.is_whole]
     if unfinished:
-        which = [
-            f"{training.id} ({group.label}, {training.label}): {training.status}" for group, training in unfinished
-        ]
+        which = [f"{_named(group, training)}: {training.status}" for group, training in unfinished]
         yield f"Not run to the end, and here with what they have: {_listed(which)}."
 
 
@@ -79,8 +77,8 @@ def _named(group: Group, training: Training) -> str:
 
 def _numbered(numbers: Sequence[int], groups: Sequence[Group]) -> str:
     if len(numbers) == len(groups):
-        return "all groups" if len(groups) > 1 else "the only group"
-    return f"group{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
+        return "All groups"
+    return f"Group{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -21,7 +21,7 @@ table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
 .chart {{ overflow-x: auto; }}
 td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; }}
 td small {{ color: #555; white-space: nowrap; }}
-summary {{ cursor: pointer; }}
+summary {{ cursor: pointer; font-weight: bold; margin: 1.5rem 0; }}
 .films {{ display: flex; flex-wrap: wrap; gap: 1rem; }}
 .films figure {{ margin: 0; flex: 1 1 20rem; max-width: 34rem; }}
 .films img {{ width: 100%; }}
@@ -29,6 +29,8 @@ summary {{ cursor: pointer; }}
 {body}
 </body></html>
 """
+# Without what leads elsewhere: a button would offer to upload a chart.
+CHART_CONFIG = {"displaylogo": False, "showSendToCloud": False, "plotlyServerURL": ""}
 Row = Mapping[str, Any]
 
 
@@ -70,9 +72,7 @@ def table(rows: Sequence[Row]) -> str:
 
 def chart(figure: graph_objects.Figure) -> str:
     """Returns a chart; the page's heading says what its title would."""
-    drawn = figure.update_layout(title=None).to_html(
-        full_html=False, include_plotlyjs=False, config={"displaylogo": False}
-    )
+    drawn = figure.update_layout(title=None).to_html(full_html=False, include_plotlyjs=False, config=CHART_CONFIG)
     return f'<div class="chart">{drawn}</div>'
 
 
