@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import wrap
@@ -19,9 +20,16 @@ from armscan.training import Figures
 # By figure, axis and number of the group.
 Curves = Mapping[tuple[str, str, int], Curve]
 
-# More groups than that would hide each other behind their seeds.
+# More groups than that would hide each other behind their bands and seeds.
 MANY = 6
-ROW_PX, LEGEND_ROW_PX, GROUP_PX, AROUND_PX, SWITCHES_PX = 250, 20, 34, 110, 45
+ROW_PX, LEGEND_ROW_PX, GROUP_PX, AROUND_PX, SWITCHES_PX = 250, 22, 34, 110, 45
+# Of the legend, all of it and one letter; and the line beside a name.
+LEGEND_PX, LETTER_PX, SAMPLE_PX = 950, 7, 50
+# No success rate is above 100 %.
+RATE_AXIS = {"tickformat": ".0%", "autorangeoptions": {"maxallowed": 1.03}}
+BANDS, SEEDS = "band", "seed"
+# What is shown beside the thick lines, by the button.
+SHOWN = {"bands and seeds": (BANDS, SEEDS), "bands": (BANDS,), "neither": ()}
 LABEL_CHARS = 38
 FINAL = {"success_rate": "success rate", "mean_steps": "mean steps", "mean_distance_mm": "mean distance (mm)"}
 Points = dict[str, list[Any]]
@@ -32,14 +40,14 @@ class Trace:
     """A line of a learning curve.
 
     Args:
-        look: of the line, and what it belongs to.
+        kind: one of `BANDS` and `SEEDS`, or nothing where it is of the whole group.
+        look: of the line.
         over: its points over each of `AXES`.
-        is_seed: whether it is of one seed.
     """
 
+    kind: str
     look: Mapping[str, Any]
     over: Sequence[Points]
-    is_seed: bool = False
 
 
 def colours(n: int) -> list[str]:
@@ -56,32 +64,40 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
         curves: of the figures.
         titles: of the figures that are drawn, by name.
     """
-    height = SWITCHES_PX + AROUND_PX + ROW_PX * len(titles) + LEGEND_ROW_PX * len(groups)
-    drawn_px = height - SWITCHES_PX - AROUND_PX - LEGEND_ROW_PX * len(groups)
+    entry_px = SAMPLE_PX + LETTER_PX * max(len(group.label) for group in groups)
+    legend_px = LEGEND_ROW_PX * math.ceil(len(groups) / max(1, LEGEND_PX // entry_px))
+    shown = "bands and seeds" if len(groups) <= MANY else "neither"
     figure = make_subplots(rows=len(titles), cols=1, shared_xaxes=True, vertical_spacing=0.08 / len(titles))
     traces: list[Trace] = []
     for row, (name, title) in enumerate(titles.items(), start=1):
         for number, (group, colour) in enumerate(zip(groups, colours(len(groups)), strict=True)):
             of_axes = [curves.get((name, axis, number)) for axis in AXES]
-            for trace in _traces(of_axes, colour, is_few=len(groups) <= MANY):
+            for trace in _traces(of_axes, colour):
                 figure.add_scatter(
                     **trace.look, **trace.over[0], name=group.label, legendgroup=str(number), row=row, col=1
                 )
                 traces.append(trace)
-        figure.update_yaxes(title=title, row=row, col=1, **({"tickformat": ".0%"} if "success_rate" in name else {}))
+        figure.update_yaxes(title=title, row=row, col=1, **(RATE_AXIS if "success_rate" in name else {}))
     named: set[str] = set()
     for drawn, trace in zip(figure.data, traces, strict=True):
         # One line of each group stands in the legend.
         drawn.showlegend = "text" in trace.over[0] and drawn.legendgroup not in named
         named |= {drawn.legendgroup} if drawn.showlegend else set()
+        drawn.visible = trace.kind in ("", *SHOWN[shown])
     figure.update_xaxes(rangemode="tozero")
     figure.update_xaxes(title=next(iter(AXES)), row=len(titles), col=1)
     figure.update_layout(
-        height=height,
-        margin={"t": SWITCHES_PX, "b": AROUND_PX - 40 + LEGEND_ROW_PX * len(groups), "l": 70, "r": 20},
+        height=SWITCHES_PX + ROW_PX * len(titles) + AROUND_PX + legend_px,
+        margin={"t": SWITCHES_PX, "b": AROUND_PX + legend_px, "l": 70, "r": 20, "autoexpand": False},
         template="plotly_white",
-        legend={"x": 0, "y": -55 / drawn_px, "yanchor": "top"},
-        updatemenus=[_axis_switch(traces, len(titles)), _seed_switch(traces, is_shown=len(groups) <= MANY)],
+        legend={
+            "orientation": "h",
+            "entrywidth": entry_px,
+            "x": 0,
+            "y": -55 / (ROW_PX * len(titles)),
+            "yanchor": "top",
+        },
+        updatemenus=[_axis_switch(traces, len(titles)), _kind_switch(traces, shown)],
     )
     return figure
 
@@ -117,28 +133,30 @@ def final_chart(groups: Sequence[Group], reached: Sequence[Figures | None]) -> F
                 marker={"color": colour, "size": 11, "symbol": "diamond"},
                 **here,
             )
-        figure.update_xaxes(title=title, row=1, col=column, **({"tickformat": ".0%"} if "rate" in name else {}))
+        figure.update_xaxes(title=title, row=1, col=column, **(RATE_AXIS if "success_rate" in name else {}))
     figure.update_yaxes(autorange="reversed", automargin=True)
     height = AROUND_PX + GROUP_PX * len(groups)
     return figure.update_layout(height=height, margin={"t": 20, "b": 50, "l": 10, "r": 20}, template="plotly_white")
 
 
-def _traces(of_axes: Sequence[Curve | None], colour: str, *, is_few: bool) -> Iterator[Trace]:
+def _traces(of_axes: Sequence[Curve | None], colour: str) -> Iterator[Trace]:
     """Yields the band, the lines of the seeds, and the line of all of them together."""
     curve = of_axes[0]
     if curve is None:
         return
     if curve.n_seeds > 1:
         unseen = {"mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
-        faint = "rgba({}, {}, {}, {})".format(*hex_to_rgb(colour), 0.2 if is_few else 0.12)
-        yield Trace(unseen, [_points(each, "lows") for each in of_axes])
-        yield Trace(unseen | {"fill": "tonexty", "fillcolor": faint}, [_points(each, "highs") for each in of_axes])
-        thin = {"mode": "lines", "line": {"color": colour, "width": 1}, "opacity": 0.5, "visible": is_few}
+        faint = "rgba({}, {}, {}, 0.2)".format(*hex_to_rgb(colour))
+        yield Trace(BANDS, unseen, [_points(each, "lows") for each in of_axes])
+        yield Trace(
+            BANDS, unseen | {"fill": "tonexty", "fillcolor": faint}, [_points(each, "highs") for each in of_axes]
+        )
+        thin = {"mode": "lines", "line": {"color": colour, "width": 1}, "opacity": 0.5}
         for label in curve.lines:
             said = {"hovertemplate": f"%{{y:.3g}} ({label})"}
-            yield Trace(thin | said, [_line(each, label) for each in of_axes], is_seed=True)
+            yield Trace(SEEDS, thin | said, [_line(each, label) for each in of_axes])
     thick = {"mode": "lines", "line": {"color": colour, "width": 2.5}, "hovertemplate": "%{text}"}
-    yield Trace(thick, [_points(each, "values") | {"text": _said(each)} for each in of_axes])
+    yield Trace("", thick, [_points(each, "values") | {"text": _said(each)} for each in of_axes])
 
 
 def _points(curve: Curve | None, which: str) -> Points:
@@ -178,14 +196,14 @@ def _axis_switch(traces: Sequence[Trace], n_rows: int) -> dict[str, Any]:
     return _switch(buttons, active=0, x=0.0)
 
 
-def _seed_switch(traces: Sequence[Trace], *, is_shown: bool) -> dict[str, Any]:
-    """Returns buttons that show and hide the lines of single seeds."""
-    seeds = [number for number, trace in enumerate(traces) if trace.is_seed]
-    buttons = [
-        {"label": label, "method": "restyle", "args": [{"visible": visible}, seeds]}
-        for label, visible in (("with each seed", True), ("without", False))
-    ]
-    return _switch(buttons, active=0 if is_shown else 1, x=0.45) | {"visible": bool(seeds)}
+def _kind_switch(traces: Sequence[Trace], shown: str) -> dict[str, Any]:
+    """Returns buttons that show and hide bands and the lines of single seeds."""
+    numbers = [number for number, trace in enumerate(traces) if trace.kind]
+    buttons = []
+    for label, kinds in SHOWN.items():
+        visible = [traces[number].kind in kinds for number in numbers]
+        buttons.append({"label": label, "method": "restyle", "args": [{"visible": visible}, numbers]})
+    return _switch(buttons, active=list(SHOWN).index(shown), x=0.4) | {"visible": bool(numbers)}
 
 
 def _switch(buttons: Sequence[dict[str, Any]], *, active: int, x: float) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from armscan.reports.charts import Curves, final_chart, learning_curves
+from armscan.reports.charts import MANY, Curves, final_chart, learning_curves
 from armscan.reports.curves import AXES, curve_of
 from armscan.reports.films import films
 from armscan.reports.groups import Group
@@ -18,6 +18,7 @@ from armscan.reports.page import Markup, chart, table, write_page
 from armscan.reports.trainings import VALIDATION, Training
 from armscan.training import Figures
 from armscan.training.bootstrap import Estimate
+from armscan.training.seeds import FEWEST_SEEDS
 
 SHOWN = {
     "success rate": ("success_rate", "{:.1%}"),
@@ -45,7 +46,8 @@ HOW_BETTER = (
     "How likely a training of the row's group is better than one of the column's group: the share of pairs of seeds, "
     "ties counting half, averaged over the test volumes "
     '(<a href="https://arxiv.org/abs/2108.13264">Agarwal et al. 2021</a>), with a 95 % interval by a bootstrap of the '
-    "seeds of both groups. 0.5 is no difference; an interval that holds it leaves open which is better."
+    "seeds of both groups (of many groups shown under the pointer). 0.5 is no difference; in bold where the interval "
+    "leaves it out and both groups have four seeds or more. Columns are numbered as the rows."
 )
 
 
@@ -158,28 +160,43 @@ def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Ite
 def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
     """Returns a table of the groups against each other; the columns are numbered as the rows are."""
     cells: dict[tuple[int, int], Markup] = {}
+    is_few = len(groups) <= MANY
     for pair in pairs:
-        cells[pair.ours, pair.theirs] = _cell(pair.probability)
-        cells[pair.theirs, pair.ours] = _cell(opposite(pair.probability) if pair.probability else None)
+        theirs = opposite(pair.probability) if pair.probability else None
+        n_seeds = min(len(judged(groups[number])) for number in (pair.ours, pair.theirs))
+        how = {"is_few": is_few, "is_sure": n_seeds >= FEWEST_SEEDS}
+        cells[pair.ours, pair.theirs] = _cell(pair.probability, **how)
+        cells[pair.theirs, pair.ours] = _cell(theirs, **how)
     numbers = range(len(groups))
-    return table(
-        [
-            {"": groups[row].title}
-            | {f"than {column + 1}": cells.get((row, column), Markup("–")) for column in numbers}
-            for row in numbers
-        ]
-    )
+    rows = [
+        {"": groups[row].label}
+        | {
+            f"{'than ' if is_few else ''}{column + 1}": cells.get((row, column), Markup("<div>–</div>"))
+            for column in numbers
+        }
+        for row in numbers
+    ]
+    return f'<div class="matrix">{table(rows)}</div>'
 
 
-def _cell(probability: Estimate | None) -> Markup:
+def _cell(probability: Estimate | None, *, is_few: bool, is_sure: bool) -> Markup:
+    """Returns a cell of the matrix.
+
+    Args:
+        probability: that the row's group is better, None where the two were judged on other volumes.
+        is_few: whether there is place for the interval.
+        is_sure: whether there are seeds enough to write it in bold where it leaves out 0.5.
+    """
     if probability is None:
-        return Markup("<small>other volumes</small>")
+        return Markup("<div><small>other volumes</small></div>")
     value, low, high = probability
     # From red through white to green.
     strength = abs(value - 0.5)
     shade = f"rgba({'44, 160, 44' if value >= 0.5 else '214, 39, 40'}, {strength:.2f})"
     ends = "one seed" if math.isnan(low) else f"{low:.2f} to {high:.2f}"
-    return Markup(f'<div style="background: {shade}">{value:.2f} <small>{ends}</small></div>')
+    shown = f"<b>{value:.2f}</b>" if is_sure and not low <= 0.5 <= high else f"{value:.2f}"
+    below = f"<br><small>{ends}</small>" if is_few else ""
+    return Markup(f'<div style="background: {shade}" title="{ends}">{shown}{below}</div>')
 
 
 def _text(estimate: Estimate, form: str) -> Markup:

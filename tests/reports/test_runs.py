@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from mlflow.entities import Metric, Param
 
 from tests.browser import chromium, programs
 
@@ -100,20 +101,25 @@ def test_one_training_has_a_report_without_bands(answer, runs, tmp_path):
     assert {row["low"] for row in rows(tmp_path / "one" / "curves.csv")} == {"nan"}
 
 
-def test_runs_of_a_trial_that_was_pruned_are_said_to_be(answer, runs, tmp_path):
+def test_trainings_of_a_pruned_trial_are_cut_off_unless_they_took_all_their_steps(answer, runs, tmp_path):
     study = runs.made("study a")
     trial = runs.made("a-0000", parent=study, pruned="true", trial="0")
-    run_id = runs.ids("sac")[0]
-    runs.client.set_tag(run_id, "mlflow.parentRunId", trial)
-    runs.client.set_tag(run_id, "trial", "0")
-    try:
-        assert answer(f"runs={study}", "out=whole")[0] == 0
-        assert "Not run to the end" not in page(tmp_path / "whole")
-        budget = runs.client.get_run(run_id).data.params["training.env_steps"]
-        assert int(rows(tmp_path / "whole" / "runs.csv")[0]["environment steps"]) >= int(budget)
-    finally:
-        for tag in ("mlflow.parentRunId", "trial"):
-            runs.client.delete_tag(run_id, tag)
+    ids = []
+    for seed, step in enumerate((400, 100)):
+        run_id = runs.made(f"sac-seed{seed}", parent=trial, **{"choice.agent": "sac", "trial": "0"})
+        runs.client.log_batch(run_id, [Metric("validation/mean_steps", 3.0, 0, step)], params_of(seed))
+        runs.client.set_terminated(run_id)
+        ids.append(run_id)
+    for name, words in {"a": study, "b": trial, "c": ",".join(ids)}.items():
+        assert answer(f"runs={words}", f"out={name}")[0] == 0
+        assert [row["status"] for row in rows(tmp_path / name / "runs.csv")] == ["finished", "pruned"]
+        assert f"with what they have: {ids[1][:8]} (group 1, seed 1): pruned." in page(tmp_path / name)
+    for each in (study, trial, *ids):
+        runs.client.delete_run(each)
+
+
+def params_of(seed):
+    return [Param("seed", str(seed)), Param("training.env_steps", "400")]
 
 
 def test_a_run_that_has_not_finished_takes_part_with_what_it_has(answer, runs, tmp_path):
@@ -220,7 +226,7 @@ def test_report_needs_no_server_and_no_network(answer, runs, tmp_path):
         browser.count(".js-plotly-plot:first-of-type .scatterlayer .trace", at_least=2 * 3 * 6)
         lines = "return document.querySelector('.js-plotly-plot').data.map((line) => line.x[line.x.length - 1])"
         steps = browser.driver.execute_script(lines)
-        browser.click(".updatemenu-button", text="by seconds of training")
+        browser.click("body > .chart .updatemenu-button", text="by seconds of training")
         assert browser.driver.execute_script(lines) != steps
         assert min(steps) >= 100
         browser.keep(pictures / "report.png")
