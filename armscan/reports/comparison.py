@@ -151,10 +151,11 @@ def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Ite
     if not any(pairs.values()):
         yield "<p>Fewer than two groups have a final evaluation.</p>"
         return
-    yield f"<p>{HOW_BETTER}</p>"
+    yield f'<p>{HOW_BETTER}</p><div class="matrices">'
     for figure, of_figure in pairs.items():
         wanted, name = "higher" if COMPARED_BY[figure] else "lower", figure.replace("_", " ").replace(" mm", " (mm)")
-        yield f"<h3>By {name}, {wanted} is better</h3>{_matrix(groups, of_figure)}"
+        yield f"<div><h3>By {name}, {wanted} is better</h3>{_matrix(groups, of_figure)}</div>"
+    yield "</div>"
 
 
 def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:

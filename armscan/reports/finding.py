@@ -113,7 +113,7 @@ def _in_experiment(store: TrackingStore, name: str) -> list[Found]:
 
 
 def _checked(store: TrackingStore, training: Found) -> Found:
-    """Returns a training that this version can read, with whether its trial was pruned, whatever it was found by."""
+    """Returns a training with whether its trial was pruned; each that is meant comes by here, however it was named."""
     tags = training.run.data.tags
     if TRIAL_TAG not in tags or training.is_pruned or PARENT_TAG not in tags:
         return training

@@ -22,6 +22,8 @@ table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
 td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; }}
 td small {{ color: #555; white-space: nowrap; }}
 summary {{ cursor: pointer; font-weight: bold; margin: 1.5rem 0; }}
+.matrices {{ display: flex; flex-wrap: wrap; gap: 0 2rem; }}
+.matrices > div {{ max-width: 100%; }}
 .matrix td {{ padding: 0; }}
 .matrix td:first-child, .matrix td > div {{ padding: .2rem .35rem; }}
 .films {{ display: flex; flex-wrap: wrap; gap: 1rem; }}
