@@ -15,6 +15,8 @@ SEED_IN_NAME = re.compile(r"-seed\d+$")
 MAX_LABEL_CHARS = 72
 # The sections before a key.
 SECTIONS = re.compile(r"[\w.]+\.(?=\w+=)")
+# A number with more digits than a label has place for.
+LONG_NUMBER = re.compile(r"(?<==)\d+\.\d{5,}(e[-+]?\d+)?")
 # By these an episode is another task, or judged otherwise.
 RULES = ("projection", "reward", "env.")
 
@@ -115,8 +117,8 @@ def _names(firsts: Sequence[Training]) -> list[str]:
 
 
 def _shortened(name: str) -> str:
-    """Returns a name with the last part of each key, cut where it is long."""
-    short = SECTIONS.sub("", name)
+    """Returns a name with the last part of each key and four digits of long numbers, cut where it is still long."""
+    short = LONG_NUMBER.sub(lambda number: f"{float(number[0]):.4g}", SECTIONS.sub("", name))
     return short if len(short) <= MAX_LABEL_CHARS else f"{short[: MAX_LABEL_CHARS - 1]}…"
 
 

@@ -24,6 +24,13 @@ def test_groups_differ_by_more_than_the_seed_and_what_has_no_effect(make_trainin
     assert left_out == []
 
 
+def test_labels_are_short(make_training):
+    values = ("0.0011781448719376517", "1.1781448719376517e-07", "0.5")
+    groups, _ = grouped([make_training(params={"agent.lr": value}) for value in values])
+    assert [group.label for group in groups] == ["1. lr=0.001178", "2. lr=1.178e-07", "3. lr=0.5"]
+    assert groups[0].title == "1. agent.lr=0.0011781448719376517"
+
+
 def test_one_group_is_called_after_its_runs(make_training):
     assert names(make_training(0), make_training(1)) == ["sac"]
 
