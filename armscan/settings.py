@@ -28,6 +28,8 @@ SWEEPS, PLAN = "sweeps", "--plan"
 CLUSTER = "cluster"
 # Hydra's options for several runs.
 MULTIRUN = ("-m", "--multirun")
+# What says where and how things are computed and kept, not what; and the seed, by which runs of the same thing differ.
+NOT_COMPARED = ("tracking", "device", "compute.device", "seed")
 # The phantoms, where a command asks for volumes.
 PHANTOM = "phantom"
 

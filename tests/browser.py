@@ -29,7 +29,7 @@ WAIT_S = 60.0
 # MLflow opens its assistant's panel by itself, once.
 BEFORE_EACH_PAGE = "localStorage.setItem('mlflow.assistant.fab.autoOpenedOnFirstLoad_v1', 'true')"
 FIND = """
-    const isRead = (each, text) => (each.innerText ?? "").trim().replace(/\\s+/g, " ") === text;
+    const isRead = (each, text) => (each.innerText ?? each.textContent).trim().replace(/\\s+/g, " ") === text;
     const seen = [...document.querySelectorAll(arguments[0])].filter((each) => each.getClientRects().length > 0);
     return seen.findLast((each) => arguments[1] === null || isRead(each, arguments[1])) ?? null;
 """

@@ -19,6 +19,7 @@ from optuna.visualization import (
 )
 from plotly import graph_objects
 
+from armscan.reports.page import chart
 from armscan.sweeps.judging import best_trials
 
 MIN_TRIALS_FOR_IMPORTANCE = 4
@@ -56,7 +57,7 @@ def charts(study: optuna.Study, objectives: Sequence[str], shares: Sequence[Mapp
     if not _finished(study):
         return ["<p>No trial has run to its end yet.</p>"]
     drawn = _charts(study, objectives, shares)
-    return [f'<h2>{heading}</h2><div class="chart">{_html(chart)}</div>' for heading, chart in drawn]
+    return [f"<h2>{heading}</h2>{chart(figure)}" for heading, figure in drawn]
 
 
 def _charts(
@@ -83,11 +84,6 @@ def _finished(study: optuna.Study) -> list[FrozenTrial]:
 
 def _value(number: int, sign: float = 1.0) -> Callable[[FrozenTrial], float]:
     return lambda trial: sign * trial.values[number]
-
-
-def _html(chart: graph_objects.Figure) -> str:
-    # The heading says what its title would.
-    return str(chart.update_layout(title=None).to_html(full_html=False, include_plotlyjs=False))
 
 
 def _bars(rows: Sequence[Mapping[str, Any]]) -> graph_objects.Figure:

@@ -1,4 +1,4 @@
-"""The figures of trials: those that a task has returned, and their mean."""
+"""The figures of trials: those that a task has returned, checked."""
 
 from __future__ import annotations
 
@@ -6,19 +6,8 @@ from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any
 
-from numpy.typing import ArrayLike
-from scipy.stats import trim_mean
-
 from armscan.checks import check_float
 from armscan.errors import InvalidValueError, listed
-
-# What is cut from each end of the sorted values in an interquartile mean.
-QUARTER = 0.25
-
-
-def interquartile_mean(values: ArrayLike) -> float:
-    """Returns the mean, whatever their shape, without the lowest and the highest quarter; of fewer than four of all."""
-    return float(trim_mean(values, QUARTER, axis=None))
 
 
 def checked_figures(figures: Any, objectives: Sequence[str]) -> dict[str, float]:

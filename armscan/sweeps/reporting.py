@@ -2,36 +2,21 @@
 
 from __future__ import annotations
 
-import base64
-import csv
 import html
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import optuna
 from optuna.trial import FrozenTrial, TrialState
-from plotly.offline import get_plotlyjs
 
+from armscan.reports.page import film_address, table, write_page
 from armscan.sweeps.attempt import FOLDER, RUN
 from armscan.sweeps.charts import charts, importances
 from armscan.sweeps.judging import best_trials
 from armscan.sweeps.tally import ENV_STEPS, FAILURE, FIGURES, JUDGED, RETRIED, RETRY_OF, Tally
 from armscan.sweeps.values import overrides_of
 from armscan.sweeps.verdict import Verdict, shown_of, verdicts
-
-PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
-<style>
-body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2rem auto; padding: 0 1rem; }}
-table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
-.chart {{ overflow-x: auto; }}
-td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; }}
-</style><script>{plotly}</script></head><body><h1>{title}</h1>
-{body}
-</body></html>
-"""
-Row = Mapping[str, Any]
 
 
 def write_report(study: optuna.Study, judged: Sequence[FrozenTrial], folder: Path) -> Path:
@@ -45,7 +30,6 @@ def write_report(study: optuna.Study, judged: Sequence[FrozenTrial], folder: Pat
     Returns:
         The HTML file.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     objectives = list(study.user_attrs["objectives"])
     trials, found = study.get_trials(deepcopy=False), verdicts(judged)
     tables = {
@@ -60,25 +44,19 @@ def write_report(study: optuna.Study, judged: Sequence[FrozenTrial], folder: Pat
         "result": [row for verdict in found for row in _verdict_rows(verdict)],
         "importances": importances(study, objectives),
     }
-    for name, rows in tables.items():
-        _write_csv(folder / f"{name}.csv", rows)
     parts = [
         _summary(study, trials, objectives),
         "<h2>Result</h2><p>The best settings with seeds that chose nothing, on the test volumes: "
         "interquartile means over seeds and volumes, of success rates means, and 95 % intervals.</p>",
-        _table(_result_rows(found, trials)) if found else "<p>Nothing has been judged yet.</p>",
+        table(_result_rows(found, trials)) if found else "<p>Nothing has been judged yet.</p>",
         _films(judged),
         *charts(study, objectives, tables["importances"]),
         "<h2>How trials have ended</h2>",
-        _table(tables["endings"]) if trials else "<p>No trial has been begun.</p>",
+        table(tables["endings"]) if trials else "<p>No trial has been begun.</p>",
         "<h2>Failures</h2>",
-        _table(tables["failures"]) if tables["failures"] else "<p>No trial has failed.</p>",
-        "<h2>Numbers</h2><ul>" + "".join(f'<li><a href="{each}.csv">{each}.csv</a></li>' for each in tables) + "</ul>",
+        table(tables["failures"]) if tables["failures"] else "<p>No trial has failed.</p>",
     ]
-    file = folder / "report.html"
-    page = PAGE.format(title=html.escape(f"Study {study.study_name}"), plotly=get_plotlyjs(), body="\n".join(parts))
-    file.write_text(page)
-    return file
+    return write_page(folder, f"Study {study.study_name}", parts, tables)
 
 
 def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
@@ -103,8 +81,8 @@ def _films(judged: Sequence[FrozenTrial]) -> str:
     for trial in judged:
         files = sorted(Path(trial.user_attrs.get(FOLDER, "nowhere")).glob("seed_*/episode.gif"))
         if files and trial.user_attrs[JUDGED] not in films:
-            contents = base64.b64encode(files[0].read_bytes()).decode()
-            films[trial.user_attrs[JUDGED]] = f'<img alt="an episode" src="data:image/gif;base64,{contents}">'
+            address = film_address(files[0].read_bytes())
+            films[trial.user_attrs[JUDGED]] = f'<img alt="an episode" src="{address}">'
     return "".join(f"<h3>Trial {number}: an episode on a test volume</h3>{film}" for number, film in films.items())
 
 
@@ -173,18 +151,3 @@ def _result_rows(found: Sequence[Verdict], trials: Sequence[FrozenTrial]) -> lis
         }
         for verdict in found
     ]
-
-
-def _table(rows: Sequence[Row]) -> str:
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    head = "".join(f"<th>{html.escape(key)}</th>" for key in keys)
-    lines = ("".join(f"<td>{html.escape(str(row.get(key, '')))}</td>" for key in keys) for row in rows)
-    return f"<table><tr>{head}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
-
-
-def _write_csv(file: Path, rows: Sequence[Row]) -> None:
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    with file.open("w", newline="") as opened:
-        writer = csv.DictWriter(opened, keys)
-        writer.writeheader()
-        writer.writerows(rows)

@@ -9,6 +9,7 @@ import optuna
 from optuna.study import StudyDirection
 
 from armscan.errors import StudyError
+from armscan.settings import NOT_COMPARED
 from armscan.sweeps.parts import make_pruner
 from armscan.sweeps.settings import StudySettings
 from armscan.sweeps.storage import Storage, existing_storage
@@ -16,8 +17,6 @@ from armscan.tracking import flattened
 
 # User attributes of a study.
 SPACE, FIXED, STUDY_RUN, DASHBOARD_OBJECTIVES = "space", "fixed_config", "mlflow_run", "objectives"
-# Sections that say where and how things are computed and kept, not what.
-NOT_COMPARED = ("tracking", "device", "compute.device", "seed")
 N_SHOWN = 5
 
 

@@ -25,12 +25,12 @@ from armscan.provenance import place_tags, start_tracking, volume_tags
 from armscan.settings import plain
 from armscan.stage import Stage
 from armscan.sweeps.attempt import Attempt
-from armscan.sweeps.figures import interquartile_mean
 from armscan.sweeps.tally import ENV_STEPS
 from armscan.sweeps.tasks import VolumesInMemory
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
 from armscan.tracking.run import CURVE_FILE, EVALUATION_FILE
 from armscan.training import TEST, EpochReport, Evaluation, film_episode, take_up
+from armscan.training.seeds import interquartile_mean
 
 # Of each training, beside the figures of its best validation.
 TRAINING_FIGURES = (ENV_STEPS, "training_s", "solved")
@@ -108,7 +108,7 @@ class Training:
             if seed not in attempt.seeds_done:
                 attempt.keep_seed(seed, trained(attempt, seed))
         of_seeds = [attempt.seeds_done[seed] for seed in attempt.seeds]
-        return {name: interquartile_mean([figures[name] for figures in of_seeds]) for name in of_seeds[0]}
+        return {name: float(interquartile_mean([figures[name] for figures in of_seeds])) for name in of_seeds[0]}
 
     def judge(self, attempt: Attempt) -> dict[str, float]:
         """Trains, plays the final evaluations, films an episode, keeps the policy; returns the test's figures."""

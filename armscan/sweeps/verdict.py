@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
-from scipy.stats import bootstrap
 
-from armscan.sweeps.figures import interquartile_mean
 from armscan.sweeps.tally import FIGURES, JUDGED
+from armscan.training.bootstrap import Estimate
+from armscan.training.seeds import mean_for, over_seeds
 
-N_RESAMPLES = 2000
 OF_VOLUME = re.compile(r"test/volume/(.+)/(\w+)")
 SHOWN = ("test/success_rate", "test/mean_steps", "test/mean_distance_mm", "test/mean_distance_deg")
 
@@ -26,12 +25,12 @@ class Verdict:
     Args:
         number: of the trial that it was found by.
         n_seeds: trainings that it was judged by.
-        means: by figure: its mean over the seeds, lower and upper end of the mean's 95 % interval.
+        means: by figure: its mean over the seeds, with its interval.
     """
 
     number: int
     n_seeds: int
-    means: Mapping[str, tuple[float, float, float]]
+    means: Mapping[str, Estimate]
 
     def text(self, name: str) -> str:
         """Returns a figure with its interval, such as `1.52 (1.4 to 1.7)`."""
@@ -65,7 +64,8 @@ def _verdict(number: int, of_seeds: Sequence[Mapping[str, float]], seed: int) ->
     common = set.intersection(*map(set, of_seeds))
     of_seeds = [{name: figure for name, figure in figures.items() if name in common} for figures in of_seeds]
     names = [name for name in of_seeds[0] if name.startswith("test/") and not OF_VOLUME.fullmatch(name)]
-    return Verdict(number, len(of_seeds), {name: _interval(name, _scores(name, of_seeds), seed) for name in names})
+    means = {name: over_seeds(_scores(name, of_seeds), mean_for(name), seed=seed) for name in names}
+    return Verdict(number, len(of_seeds), means)
 
 
 def _scores(name: str, of_seeds: Sequence[Mapping[str, float]]) -> NDArray[np.float64]:
@@ -73,21 +73,3 @@ def _scores(name: str, of_seeds: Sequence[Mapping[str, float]]) -> NDArray[np.fl
     figure = name.removeprefix("test/")
     volumes = [key for key in of_seeds[0] if (found := OF_VOLUME.fullmatch(key)) and found[2] == figure]
     return np.array([[figures[key] for key in volumes or [name]] for figures in of_seeds])
-
-
-def _interval(name: str, scores: NDArray[np.float64], seed: int) -> tuple[float, float, float]:
-    mean = np.mean if "success_rate" in name else interquartile_mean
-    value = float(mean(scores))
-    if len(scores) < 2 or np.isnan(scores).any():
-        return value, float("nan"), float("nan")
-    # The seeds are drawn of each volume by itself.
-    resampled = bootstrap(
-        tuple(scores.T),
-        lambda *of_volumes: mean(np.array(of_volumes)),
-        n_resamples=N_RESAMPLES,
-        method="percentile",
-        vectorized=False,
-        rng=np.random.default_rng(seed),
-    )
-    low, high = resampled.confidence_interval
-    return value, float(low), float(high)

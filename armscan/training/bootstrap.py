@@ -2,7 +2,9 @@
 
 Whoever reads a success rate wants to know it for *other* volumes, and episodes on one volume are alike. So volumes are
 drawn with replacement first, and then, in each of them, as many of its episodes as it has, with replacement too. Where
-there is one volume, that leaves a bootstrap of its episodes, which speaks of that volume alone.
+there is one volume, that leaves a bootstrap of its episodes, which speaks of that volume alone. Whoever wants to know
+it for other *seeds* of a training as well has several of them: these are drawn before the volumes, and all that are
+drawn meet the same drawn volumes, as all have met the same ones.
 
 With K volumes this is a little too wide where volumes are alike, and too narrow, by about sqrt((K - 1) / K) and more
 for few, where they differ; no resampling can know volumes that it has never seen. Where every episode has the same
@@ -62,23 +64,30 @@ def quantile(share: float) -> Statistic:
 
 
 def estimates(
-    columns: Mapping[str, tuple[Statistic, Sequence[float]]], volumes: Sequence[Hashable], *, seed: int = 0
+    columns: Mapping[str, tuple[Statistic, Sequence[float]]],
+    volumes: Sequence[Hashable],
+    *,
+    trainings: Sequence[Hashable] | None = None,
+    seed: int = 0,
 ) -> dict[str, Estimate]:
     """Returns figures with their intervals, by name; all of them from the same resamples.
 
     Args:
         columns: by the name of the figure, its statistic and the value of each episode, NaN for those left out.
         volumes: which volume each episode is on.
+        trainings: which training each episode is of; None where all are of one.
         seed: of the resampling; the same one gives the same intervals.
 
     Raises:
         InvalidValueError: if a column has another length than `volumes`, or there is no episode.
     """
-    if not volumes or any(len(values) != len(volumes) for _, values in columns.values()):
+    trainings = [None] * len(volumes) if trainings is None else trainings
+    lengths = {len(trainings), *(len(values) for _, values in columns.values())}
+    if not volumes or lengths != {len(volumes)}:
         raise InvalidValueError("every figure must have one value for each episode, and there must be an episode")
     arrays = {name: np.asarray(values, dtype=float) for name, (_, values) in columns.items()}
     resampled: dict[str, list[FloatArray]] = {name: [] for name in columns}
-    for places in _resamples(volumes, np.random.default_rng(seed)):
+    for places in _resamples(trainings, volumes, np.random.default_rng(seed)):
         for name, (statistic, _) in columns.items():
             # The place after the last, which is also that before the first, holds what is nobody's.
             resampled[name].append(statistic(np.append(arrays[name], np.nan)[places]))
@@ -106,20 +115,31 @@ def _estimate(value: float, resampled: FloatArray) -> Estimate:
     return Estimate(value, float(low), float(high))
 
 
-def _resamples(volumes: Sequence[Hashable], rng: np.random.Generator) -> Iterator[NDArray[np.intp]]:
+def _resamples(
+    trainings: Sequence[Hashable], volumes: Sequence[Hashable], rng: np.random.Generator
+) -> Iterator[NDArray[np.intp]]:
     """Yields the places of the episodes of all resamples, shape (n_resamples, n_places), -1 for nobody's."""
-    places: dict[Hashable, list[int]] = {}
-    for place, volume in enumerate(volumes):
-        places.setdefault(volume, []).append(place)
-    sizes = np.array([len(each) for each in places.values()])
-    members = np.full((len(sizes), sizes.max()), -1)
-    for row, each in zip(members, places.values(), strict=True):
-        row[: len(each)] = each
+    of_training, of_volume = _numbered(trainings), _numbered(volumes)
+    shape = int(of_training.max()) + 1, int(of_volume.max()) + 1
+    sizes = np.zeros(shape, dtype=np.intp)
+    np.add.at(sizes, (of_training, of_volume), 1)
+    members = np.full((*shape, sizes.max()), -1)
+    filled = np.zeros(shape, dtype=np.intp)
+    for place, cell in enumerate(zip(of_training, of_volume, strict=True)):
+        members[(*cell, filled[cell])] = place
+        filled[cell] += 1
     at_once = max(1, MOST_VALUES // members.size)
     for first in range(0, N_RESAMPLES, at_once):
         n_resamples = min(at_once, N_RESAMPLES - first)
-        drawn = rng.integers(len(sizes), size=(n_resamples, len(sizes), 1))
+        drawn_trainings = rng.integers(shape[0], size=(n_resamples, shape[0], 1, 1))
+        drawn = drawn_trainings, rng.integers(shape[1], size=(n_resamples, 1, shape[1], 1))
         within = (rng.random((n_resamples, *members.shape)) * sizes[drawn]).astype(np.intp)
-        # A volume with fewer episodes than another leaves the rest of its row empty.
-        chosen = np.where(np.arange(members.shape[1]) < sizes[drawn], members[drawn, within], -1)
+        # What has fewer episodes than another leaves the rest of its row empty.
+        chosen = np.where(np.arange(members.shape[-1]) < sizes[drawn], members[(*drawn, within)], -1)
         yield chosen.reshape(n_resamples, -1)
+
+
+def _numbered(labels: Sequence[Hashable]) -> NDArray[np.intp]:
+    """Returns the number of each label, in the order in which they come."""
+    numbers: dict[Hashable, int] = {}
+    return np.array([numbers.setdefault(label, len(numbers)) for label in labels], dtype=np.intp)

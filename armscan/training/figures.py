@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 
 from armscan.training.bootstrap import Estimate, Statistic, estimates, mean, quantile, wilson
@@ -51,8 +51,13 @@ class Figures:
     estimates: dict[str, Estimate]
 
     @classmethod
-    def of(cls, evaluation: Evaluation) -> Figures:
-        """Computes them; the same episodes give the same intervals."""
+    def of(cls, evaluation: Evaluation, trainings: Sequence[Hashable] | None = None) -> Figures:
+        """Computes them; the same episodes give the same intervals.
+
+        Args:
+            evaluation: the episodes.
+            trainings: which training each episode is of; None where all are of one.
+        """
         episodes = evaluation.episodes
         volumes = [episode.volume for episode in episodes]
         columns: dict[str, tuple[Statistic, list[float]]] = {}
@@ -67,7 +72,7 @@ class Figures:
             n_volumes=len(set(volumes)),
             n_episodes=len(episodes),
             n_started_solved=len(episodes) - len(others),
-            estimates=estimates(columns, volumes)
+            estimates=estimates(columns, volumes, trainings=trainings)
             | {
                 f"success_rate_wilson{suffix}": wilson(sum(episode.is_success for episode in some), len(some))
                 for suffix, some in (("", episodes), (NOT_STARTED_SOLVED, others))

@@ -126,15 +126,16 @@ def test_report_needs_only_to_read_the_storage(answer, tmp_path):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ([], "error: study is not set, but it must be"),
+        ([], "error: neither study nor runs is set, but a report is of one of them: give study=NAME or runs="),
         (["study=a", "storage=nowhere"], "error: storage is 'nowhere', but nothing is there: give the one that it is"),
         (["study=a", "storage=sqlite:///nowhere.db"], "error: storage is 'sqlite:///nowhere.db', but nothing is there"),
         (["study=a", "storage=list.journal"], "error: storage is '/"),
         (["study=b"], "error: study is 'b', but there is only a or foreign in '/"),
+        (["study=a", "tracking=x"], "error: tracking is given, but it is for runs=, and this report is of study="),
         (["study=../a"], "error: study is '../a', but it must begin with a letter, a digit or _"),
         (["study=foreign"], "error: study is 'foreign', but that one in '/"),
-        (["study=a", "out=/dev/null/a"], "error: /dev/null/a: Not a directory"),
-        (["study=a", "foo=1"], "error: there is no key 'foo', but only study, storage or out"),
+        (["study=a", "out=/dev/null/a"], "error: out is '/dev/null/a', but /dev/null is no folder"),
+        (["study=a", "foo=1"], "error: there is no key 'foo', but only study, storage, runs, tracking or out"),
     ],
     ids=str,
 )

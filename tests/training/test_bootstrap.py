@@ -5,6 +5,8 @@ import warnings
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
 
 from armscan.errors import InvalidValueError
@@ -91,3 +93,43 @@ def test_wilson_is_that_of_scipy_and_has_a_width_at_the_ends():
 def test_estimates_refuse_columns_that_do_not_fit(volumes):
     with pytest.raises(InvalidValueError, match="one value for each episode"):
         estimates({"m": (mean, [1.0, 2.0])}, volumes)
+
+
+@pytest.mark.parametrize("trainings", [None, ["a"] * 40])
+def test_one_training_leaves_intervals_as_they_are(trainings):
+    values, volumes = np.random.default_rng(0).normal(size=40), ["a", "b", "c", "d"] * 10
+    assert estimates({"m": (mean, values)}, volumes, trainings=trainings) == estimates({"m": (mean, values)}, volumes)
+
+
+def test_interval_of_trainings_that_differ_is_wider_than_one_of_their_episodes():
+    values, volumes = [0.0] * 40 + [1.0] * 40 + [0.0] * 40 + [1.0] * 40, ["a", "b"] * 80
+    by_training = estimates({"m": (mean, values)}, volumes, trainings=[place // 40 for place in range(160)])["m"]
+    as_one = estimates({"m": (mean, values)}, volumes)["m"]
+    assert (by_training.value, by_training.low, by_training.high) == (0.5, 0.0, 1.0)
+    assert as_one.low > 0.4
+
+
+def test_all_trainings_meet_the_same_drawn_volumes():
+    # One volume of two is failed by all: it is drawn by all of them twice, once or not at all.
+    volumes, trainings = ["a", "b"] * 30, [place // 6 for place in range(60)]
+    ours = estimates({"m": (mean, [0.0, 1.0] * 30)}, volumes, trainings=trainings)["m"]
+    assert ours == (0.5, 0.0, 1.0)
+
+
+def test_volumes_that_a_training_has_not_met_are_left_out():
+    ours = estimates({"m": (mean, [1.0] * 4 + [3.0] * 4)}, list("aaaabbbb"), trainings=list("xxxxyyyy"))["m"]
+    assert ours == (2.0, 1.0, 3.0)
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3), st.floats(-5, 5)), min_size=1, max_size=30))
+@settings(max_examples=40)
+def test_intervals_lie_within_what_was_measured(episodes):
+    trainings, volumes, values = zip(*episodes, strict=True)
+    ours = estimates({"m": (mean, values)}, volumes, trainings=trainings)["m"]
+    assert min(values) - 1e-9 <= ours.low <= ours.high <= max(values) + 1e-9
+    assert ours.value == pytest.approx(np.mean(values), abs=1e-9)
+
+
+def test_trainings_must_be_as_many_as_episodes():
+    with pytest.raises(InvalidValueError, match="one value for each episode"):
+        estimates({"m": (mean, [1.0, 2.0])}, ["a", "a"], trainings=["a"])

@@ -1,0 +1,211 @@
+"""The charts of a comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from textwrap import wrap
+from typing import Any
+
+from plotly.colors import hex_to_rgb, qualitative
+from plotly.graph_objects import Figure
+from plotly.subplots import make_subplots
+
+from armscan.reports.curves import AXES, Curve
+from armscan.reports.groups import Group
+from armscan.reports.outcomes import judged
+from armscan.training import Figures
+
+# By figure, axis and number of the group.
+Curves = Mapping[tuple[str, str, int], Curve]
+
+# More groups than that would hide each other behind their bands and seeds.
+MANY = 6
+ROW_PX, LEGEND_ROW_PX, GROUP_PX, AROUND_PX, SWITCHES_PX = 250, 22, 34, 110, 45
+# Of the legend, all of it and one letter; and the line beside a name.
+LEGEND_PX, LETTER_PX, SAMPLE_PX = 950, 7, 50
+# No success rate is above 100 %.
+RATE_AXIS = {"tickformat": ".0%", "autorangeoptions": {"maxallowed": 1.03}}
+BANDS, SEEDS = "band", "seed"
+# What is shown beside the thick lines, by the button.
+SHOWN = {"bands and seeds": (BANDS, SEEDS), "bands": (BANDS,), "neither": ()}
+LABEL_CHARS = 38
+FINAL = {"success_rate": "success rate", "mean_steps": "mean steps", "mean_distance_mm": "mean distance (mm)"}
+Points = dict[str, list[Any]]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A line of a learning curve.
+
+    Args:
+        kind: one of `BANDS` and `SEEDS`, or nothing where it is of the whole group.
+        look: of the line.
+        over: its points over each of `AXES`.
+    """
+
+    kind: str
+    look: Mapping[str, Any]
+    over: Sequence[Points]
+
+
+def colours(n: int) -> list[str]:
+    """Returns a colour for each of some groups."""
+    palette = qualitative.D3 if n <= len(qualitative.D3) else qualitative.Dark24
+    return [str(palette[number % len(palette)]) for number in range(n)]
+
+
+def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str, str]) -> Figure:
+    """Returns figures below each other, with switches for the axis and for the lines of single seeds.
+
+    Args:
+        groups: in their order.
+        curves: of the figures.
+        titles: of the figures that are drawn, by name.
+    """
+    entry_px = SAMPLE_PX + LETTER_PX * max(len(group.label) for group in groups)
+    legend_px = LEGEND_ROW_PX * math.ceil(len(groups) / max(1, LEGEND_PX // entry_px))
+    shown = "bands and seeds" if len(groups) <= MANY else "neither"
+    figure = make_subplots(rows=len(titles), cols=1, shared_xaxes=True, vertical_spacing=0.08 / len(titles))
+    traces: list[Trace] = []
+    for row, (name, title) in enumerate(titles.items(), start=1):
+        for number, (group, colour) in enumerate(zip(groups, colours(len(groups)), strict=True)):
+            of_axes = [curves.get((name, axis, number)) for axis in AXES]
+            for trace in _traces(of_axes, colour):
+                figure.add_scatter(
+                    **trace.look, **trace.over[0], name=group.label, legendgroup=str(number), row=row, col=1
+                )
+                traces.append(trace)
+        figure.update_yaxes(title=title, row=row, col=1, **(RATE_AXIS if "success_rate" in name else {}))
+    named: set[str] = set()
+    for drawn, trace in zip(figure.data, traces, strict=True):
+        # One line of each group stands in the legend.
+        drawn.showlegend = "text" in trace.over[0] and drawn.legendgroup not in named
+        named |= {drawn.legendgroup} if drawn.showlegend else set()
+        drawn.visible = trace.kind in ("", *SHOWN[shown])
+    figure.update_xaxes(rangemode="tozero")
+    figure.update_xaxes(title=next(iter(AXES)), row=len(titles), col=1)
+    figure.update_layout(
+        height=SWITCHES_PX + ROW_PX * len(titles) + AROUND_PX + legend_px,
+        margin={"t": SWITCHES_PX, "b": AROUND_PX + legend_px, "l": 70, "r": 20, "autoexpand": False},
+        template="plotly_white",
+        legend={
+            "orientation": "h",
+            "entrywidth": entry_px,
+            "x": 0,
+            "y": -55 / (ROW_PX * len(titles)),
+            "yanchor": "top",
+        },
+        updatemenus=[_axis_switch(traces, len(titles)), _kind_switch(traces, shown)],
+    )
+    return figure
+
+
+def final_chart(groups: Sequence[Group], reached: Sequence[Figures | None]) -> Figure:
+    """Returns the final figures of all groups with their intervals, and beside them those of single seeds.
+
+    Args:
+        groups: in their order.
+        reached: by each of them.
+    """
+    figure = make_subplots(rows=1, cols=len(FINAL), shared_yaxes=True, horizontal_spacing=0.04)
+    for column, (name, title) in enumerate(FINAL.items(), start=1):
+        here = {"mode": "markers", "showlegend": False, "row": 1, "col": column}
+        for group, colour, figures in zip(groups, colours(len(groups)), reached, strict=True):
+            if figures is None:
+                continue
+            value, low, high = figures.estimates[name]
+            seeds = [(each.label, each.evaluation.metrics()[name]) for each in judged(group) if each.evaluation]
+            figure.add_scatter(
+                x=[of_seed for _, of_seed in seeds],
+                y=[_wrapped(group.label)] * len(seeds),
+                text=[label for label, _ in seeds],
+                hovertemplate="%{text}: %{x}<extra></extra>",
+                marker={"color": colour, "opacity": 0.45, "size": 8},
+                **here,
+            )
+            figure.add_scatter(
+                x=[value],
+                y=[_wrapped(group.label)],
+                hovertemplate=f"%{{x}} ({low:.3g} to {high:.3g})<extra></extra>",
+                error_x={"type": "data", "symmetric": False, "array": [high - value], "arrayminus": [value - low]},
+                marker={"color": colour, "size": 11, "symbol": "diamond"},
+                **here,
+            )
+        figure.update_xaxes(title=title, row=1, col=column, **(RATE_AXIS if "success_rate" in name else {}))
+    figure.update_yaxes(autorange="reversed", automargin=True)
+    height = AROUND_PX + GROUP_PX * len(groups)
+    return figure.update_layout(height=height, margin={"t": 20, "b": 50, "l": 10, "r": 20}, template="plotly_white")
+
+
+def _traces(of_axes: Sequence[Curve | None], colour: str) -> Iterator[Trace]:
+    """Yields the band, the lines of the seeds, and the line of all of them together."""
+    curve = of_axes[0]
+    if curve is None:
+        return
+    if curve.n_seeds > 1:
+        unseen = {"mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
+        faint = "rgba({}, {}, {}, 0.2)".format(*hex_to_rgb(colour))
+        yield Trace(BANDS, unseen, [_points(each, "lows") for each in of_axes])
+        yield Trace(
+            BANDS, unseen | {"fill": "tonexty", "fillcolor": faint}, [_points(each, "highs") for each in of_axes]
+        )
+        thin = {"mode": "lines", "line": {"color": colour, "width": 1}, "opacity": 0.5}
+        for label in curve.lines:
+            said = {"hovertemplate": f"%{{y:.3g}} ({label})"}
+            yield Trace(SEEDS, thin | said, [_line(each, label) for each in of_axes])
+    thick = {"mode": "lines", "line": {"color": colour, "width": 2.5}, "hovertemplate": "%{text}"}
+    yield Trace("", thick, [_points(each, "values") | {"text": _said(each)} for each in of_axes])
+
+
+def _points(curve: Curve | None, which: str) -> Points:
+    return {"x": curve.places.tolist(), "y": getattr(curve.band, which).tolist()} if curve else {"x": [], "y": []}
+
+
+def _line(curve: Curve | None, label: str) -> Points:
+    if curve is None or label not in curve.lines:
+        return {"x": [], "y": []}
+    places, values = curve.lines[label]
+    return {"x": places.tolist(), "y": values.tolist()}
+
+
+def _said(curve: Curve | None) -> list[str]:
+    """Returns what is said of each place of a curve."""
+    if curve is None or curve.n_seeds == 1:
+        return [f"{value:.3g} (one seed)" for value in curve.band.values] if curve else []
+    return [f"{value:.3g} ({low:.3g} to {high:.3g})" for value, low, high in zip(*curve.band, strict=True)]
+
+
+def _wrapped(label: str) -> str:
+    return "<br>".join(wrap(label, LABEL_CHARS))
+
+
+def _axis_switch(traces: Sequence[Trace], n_rows: int) -> dict[str, Any]:
+    """Returns buttons that draw the same lines over another axis."""
+    last = f"xaxis{n_rows if n_rows > 1 else ''}"
+    buttons = []
+    for number, axis in enumerate(AXES):
+        points: dict[str, list[Any]] = {
+            key: [trace.over[number].get(key) for trace in traces] for key in ("x", "y", "text")
+        }
+        scale = {f"xaxis{row if row > 1 else ''}.autorange": True for row in range(1, n_rows + 1)}
+        buttons.append(
+            {"label": f"by {axis}", "method": "update", "args": [points, scale | {f"{last}.title.text": axis}]}
+        )
+    return _switch(buttons, active=0, x=0.0)
+
+
+def _kind_switch(traces: Sequence[Trace], shown: str) -> dict[str, Any]:
+    """Returns buttons that show and hide bands and the lines of single seeds."""
+    numbers = [number for number, trace in enumerate(traces) if trace.kind]
+    buttons = []
+    for label, kinds in SHOWN.items():
+        visible = [traces[number].kind in kinds for number in numbers]
+        buttons.append({"label": label, "method": "restyle", "args": [{"visible": visible}, numbers]})
+    return _switch(buttons, active=list(SHOWN).index(shown), x=0.4) | {"visible": bool(numbers)}
+
+
+def _switch(buttons: Sequence[dict[str, Any]], *, active: int, x: float) -> dict[str, Any]:
+    where = {"x": x, "xanchor": "left", "y": 1.0, "yanchor": "bottom", "pad": {"b": 8}}
+    return {"type": "buttons", "direction": "right", "active": active, "buttons": list(buttons), **where}

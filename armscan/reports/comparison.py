@@ -1,0 +1,215 @@
+"""The comparison of any runs: learning curves, final figures, which is likely to be better, and films side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from armscan.reports.charts import MANY, Curves, final_chart, learning_curves
+from armscan.reports.curves import AXES, curve_of
+from armscan.reports.films import films
+from armscan.reports.groups import Group
+from armscan.reports.notes import notes_on
+from armscan.reports.numbers import all_numbers, run_rows
+from armscan.reports.outcomes import COMPARED_BY, Pair, compared, final_figures, judged, opposite
+from armscan.reports.page import Markup, chart, table, write_page
+from armscan.reports.trainings import VALIDATION, Training
+from armscan.training import Figures
+from armscan.training.bootstrap import Estimate
+from armscan.training.seeds import FEWEST_SEEDS
+
+SHOWN = {
+    "success rate": ("success_rate", "{:.1%}"),
+    "mean steps": ("mean_steps", "{:.2f}"),
+    "distance (mm)": ("mean_distance_mm", "{:.1f}"),
+    "angle (°)": ("mean_distance_deg", "{:.1f}"),
+    "Dice": ("mean_dice", "{:.2f}"),
+}
+# A chart that was drawn where nothing was seen has no width.
+FITTED = "this.querySelectorAll('.js-plotly-plot').forEach((chart) => Plotly.Plots.resize(chart))"
+HOW_CURVES = (
+    "On the validation volumes, after each epoch. Thick: the seeds of a group together, their interquartile mean (of "
+    "success rates the mean; of fewer than four seeds both are the mean). Band: its 95 % interval by a bootstrap of "
+    "the seeds; a group of one seed has none. Thin: each seed. A training that ran to its end before others of its "
+    "group is carried on with its last value; where one was cut off or is still running, the curve of its group ends. "
+    "Seconds are of training and validation on whatever machine it was, with whatever else it did."
+)
+HOW_FINAL = (
+    "The final evaluation, with the weights of the best epoch, on test volumes that had no part in anything before: "
+    "means over all episodes of all seeds, and 95 % intervals that draw seeds, then volumes, then episodes. Where all "
+    "episodes went alike, as at a success rate of 100 %, such an interval has no width; Wilson's, which takes episodes "
+    "as independent, stands in its place. In the chart diamonds are these means, dots the seeds."
+)
+HOW_BETTER = (
+    "How likely a training of the row's group is better than one of the column's group: the share of pairs of seeds, "
+    "ties counting half, averaged over the test volumes "
+    '(<a href="https://arxiv.org/abs/2108.13264">Agarwal et al. 2021</a>), with a 95 % interval by a bootstrap of the '
+    "seeds of both groups (of many groups shown under the pointer). 0.5 is no difference; in bold where the interval "
+    "leaves it out and both groups have four seeds or more. Columns are numbered as the rows."
+)
+
+
+def write_comparison(groups: Sequence[Group], left_out: Sequence[Training], title: str, folder: Path) -> Path:
+    """Writes the report.
+
+    Args:
+        groups: that are compared.
+        left_out: trainings that repeat another one.
+        title: of the page.
+        folder: takes `report.html` and the CSV files.
+
+    Returns:
+        The HTML file.
+    """
+    figures = _figures(groups)
+    curves = {
+        (figure, axis, number): curve
+        for figure in figures
+        for axis in AXES
+        for number, group in enumerate(groups)
+        if (curve := curve_of(group, figure, axis))
+    }
+    reached = [final_figures(group) for group in groups]
+    pairs = {figure: list(compared(groups, figure)) for figure in COMPARED_BY}
+    parts = [
+        _summary(groups),
+        notes_on(groups, left_out, has_other_volumes=any(each.probability is None for each in pairs["mean_steps"])),
+        *_learning(groups, curves),
+        *_final(groups, reached),
+        *_better(groups, pairs),
+        films(groups),
+        *_of_the_training(groups, curves, [figure for figure in figures if figure not in VALIDATION]),
+        "<h2>Runs</h2>",
+        table(run_rows(groups)),
+    ]
+    return write_page(folder, title, parts, all_numbers(groups, curves, reached, pairs))
+
+
+def _figures(groups: Sequence[Group]) -> list[str]:
+    """Returns the names of what can be drawn: figures of the validation first."""
+    names = {name for group in groups for training in group.trainings for name in training.series}
+    return [*(name for name in VALIDATION if name in names), *sorted(names - VALIDATION.keys())]
+
+
+def _summary(groups: Sequence[Group]) -> str:
+    n_trainings = sum(len(group.trainings) for group in groups)
+    rows = [{"group": group.title, "seeds": ", ".join(_seeds(group.trainings))} for group in groups]
+    counted = f"{n_trainings} runs in {len(groups)} group{'s' if len(groups) > 1 else ''}"
+    return f"<p>{counted}: those of a group differ by nothing but the seed.</p>{table(rows)}"
+
+
+def _seeds(trainings: Sequence[Training]) -> list[str]:
+    return [training.seed if training.seed is not None else training.label for training in trainings]
+
+
+def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
+    yield "<h2>Learning curves</h2>"
+    titles = {name: title for name, title in VALIDATION.items() if any(figure == name for figure, *_ in curves)}
+    if titles:
+        yield f"<p>{HOW_CURVES}</p>{chart(learning_curves(groups, curves, titles))}"
+    else:
+        yield "<p>None of these runs has been validated: nothing was to be learned, or nothing has been yet.</p>"
+
+
+def _of_the_training(groups: Sequence[Group], curves: Curves, figures: Sequence[str]) -> Iterator[str]:
+    if figures:
+        drawn = chart(learning_curves(groups, curves, {name: name.partition("/")[2] for name in figures}))
+        summary = "<summary>Figures of the training itself: losses, returns, speed</summary>"
+        yield f'<details ontoggle="{FITTED}">{summary}{drawn}</details>'
+
+
+def _final(groups: Sequence[Group], reached: Sequence[Figures | None]) -> Iterator[str]:
+    yield "<h2>On the test volumes</h2>"
+    if not any(reached):
+        yield "<p>None of these runs has kept a final evaluation.</p>"
+        return
+    rows = [_final_row(group, figures) for group, figures in zip(groups, reached, strict=True)]
+    yield f"<p>{HOW_FINAL}</p>{table(rows)}{chart(final_chart(groups, reached))}"
+
+
+def _final_row(group: Group, figures: Figures | None) -> dict[str, Any]:
+    cost = {
+        "training, s": _span([training.wall_s for training in group.trainings]),
+        "environment steps": _span([training.env_steps for training in group.trainings]),
+    }
+    if figures is None:
+        return {"group": group.title, **cost}
+    shown = {title: _text(figures.estimates[name], form) for title, (name, form) in SHOWN.items()}
+    success = figures.estimates["success_rate"]
+    if success.low == success.high:
+        shown["success rate"] = _text(figures.estimates["success_rate_wilson"], "{:.1%}")
+    counts = f"{len(judged(group))}, {figures.n_volumes}, {figures.n_episodes}"
+    return {"group": group.title, **shown, "seeds, volumes, episodes": counts, **cost}
+
+
+def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[str]:
+    if len(groups) < 2:
+        return
+    yield "<h2>Which is likely to be better</h2>"
+    if not any(pairs.values()):
+        yield "<p>Fewer than two groups have a final evaluation.</p>"
+        return
+    yield f'<p>{HOW_BETTER}</p><div class="matrices">'
+    for figure, of_figure in pairs.items():
+        wanted, name = "higher" if COMPARED_BY[figure] else "lower", figure.replace("_", " ").replace(" mm", " (mm)")
+        yield f"<div><h3>By {name}, {wanted} is better</h3>{_matrix(groups, of_figure)}</div>"
+    yield "</div>"
+
+
+def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
+    """Returns a table of the groups against each other; the columns are numbered as the rows are."""
+    cells: dict[tuple[int, int], Markup] = {}
+    is_few = len(groups) <= MANY
+    for pair in pairs:
+        theirs = opposite(pair.probability) if pair.probability else None
+        n_seeds = min(len(judged(groups[number])) for number in (pair.ours, pair.theirs))
+        how = {"is_few": is_few, "is_sure": n_seeds >= FEWEST_SEEDS}
+        cells[pair.ours, pair.theirs] = _cell(pair.probability, **how)
+        cells[pair.theirs, pair.ours] = _cell(theirs, **how)
+    numbers = range(len(groups))
+    rows = [
+        {"": groups[row].label}
+        | {
+            f"{'than ' if is_few else ''}{column + 1}": cells.get((row, column), Markup("<div>–</div>"))
+            for column in numbers
+        }
+        for row in numbers
+    ]
+    return f'<div class="matrix">{table(rows)}</div>'
+
+
+def _cell(probability: Estimate | None, *, is_few: bool, is_sure: bool) -> Markup:
+    """Returns a cell of the matrix.
+
+    Args:
+        probability: that the row's group is better, None where the two were judged on other volumes.
+        is_few: whether there is place for the interval.
+        is_sure: whether there are seeds enough to write it in bold where it leaves out 0.5.
+    """
+    if probability is None:
+        return Markup("<div><small>other volumes</small></div>")
+    value, low, high = probability
+    # From red through white to green.
+    strength = abs(value - 0.5)
+    shade = f"rgba({'44, 160, 44' if value >= 0.5 else '214, 39, 40'}, {strength:.2f})"
+    ends = "one seed" if math.isnan(low) else f"{low:.2f} to {high:.2f}"
+    shown = f"<b>{value:.2f}</b>" if is_sure and not low <= 0.5 <= high else f"{value:.2f}"
+    below = f"<br><small>{ends}</small>" if is_few else ""
+    return Markup(f'<div style="background: {shade}" title="{ends}">{shown}{below}</div>')
+
+
+def _text(estimate: Estimate, form: str) -> Markup:
+    value, low, high = (form.format(number) for number in estimate)
+    return Markup(f"{value}<br><small>{low} to {high}</small>")
+
+
+def _span(values: Sequence[float]) -> str:
+    """Returns the mean of what is known, with the lowest and the highest where they differ."""
+    known = [value for value in values if not math.isnan(value)]
+    if not known:
+        return "–"
+    low, high, mean = min(known), max(known), sum(known) / len(known)
+    ends = f"<br><small>{low:,.0f} to {high:,.0f}</small>" if high > low else ""
+    return Markup(f"{mean:,.0f}{ends}")

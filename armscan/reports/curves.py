@@ -1,0 +1,75 @@
+"""Learning curves of a group: its seeds side by side, and what they say together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.reports.groups import Group
+from armscan.reports.trainings import Series, Training
+from armscan.training.seeds import Band, band_over_seeds, mean_for
+from armscan.volumes.plane import FloatArray
+
+# What curves are drawn over, and how a series says it.
+AXES: dict[str, Callable[[Series], FloatArray]] = {
+    "environment steps": lambda series: series.env_steps,
+    "seconds of training": lambda series: series.wall_s,
+}
+MAX_POINTS = 200
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A figure of a group over an axis.
+
+    Args:
+        places: on the axis, ascending.
+        band: over the seeds at these places.
+        n_seeds: that it is of.
+        lines: of each seed, by its label: places and values, as they were measured.
+    """
+
+    places: FloatArray
+    band: Band
+    n_seeds: int
+    lines: dict[str, tuple[FloatArray, FloatArray]]
+
+
+def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
+    """Returns the curve of a group; None where none of its trainings has measured the figure.
+
+    Between two validations a seed's line is straight. A training that has run to its end is carried on with its last
+    value for as long as others of its group go on; where one has not, the curve ends with it. It begins where all are
+    known.
+
+    Args:
+        group: of trainings.
+        figure: its name.
+        axis: one of `AXES`.
+    """
+    trainings = [training for training in group.trainings if figure in training.series]
+    lines = [_line(training.series[figure], axis) for training in trainings]
+    known = [(training, line) for training, line in zip(trainings, lines, strict=True) if len(line[0])]
+    if not known:
+        return None
+    places = _places(known)
+    scores = np.array([np.interp(places, *line) for _, line in known])
+    band = band_over_seeds(scores, mean_for(figure))
+    return Curve(places, band, len(known), {training.label: line for training, line in known})
+
+
+def _line(series: Series, axis: str) -> tuple[FloatArray, FloatArray]:
+    places = AXES[axis](series)
+    is_known = np.isfinite(places) & np.isfinite(series.values)
+    return places[is_known], series.values[is_known]
+
+
+def _places(known: Sequence[tuple[Training, tuple[FloatArray, FloatArray]]]) -> FloatArray:
+    first = max(line[0][0] for _, line in known)
+    last = max(line[0][-1] for _, line in known)
+    last = min([last, *(line[0][-1] for training, line in known if not training.is_whole)])
+    places = np.unique(np.concatenate([line[0] for _, line in known]))
+    places = places[(places >= first) & (places <= last)]
+    return places if len(places) <= MAX_POINTS else np.linspace(places[0], places[-1], MAX_POINTS)

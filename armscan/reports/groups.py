@@ -1,0 +1,131 @@
+"""Trainings that differ by nothing but the seed, and what such a group is called."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from armscan.reports.trainings import Training
+from armscan.settings import NOT_COMPARED
+
+LEFT_OUT = (*NOT_COMPARED, "data.cache_dir")
+SEED_IN_NAME = re.compile(r"-seed\d+$")
+MAX_LABEL_CHARS = 72
+# The sections before a key.
+SECTIONS = re.compile(r"[\w.]+\.(?=\w+=)")
+# A number with more digits than a label has place for.
+LONG_NUMBER = re.compile(r"(?<==)\d+\.\d{5,}(e[-+]?\d+)?")
+# By these an episode is another task, or judged otherwise.
+RULES = ("projection", "reward", "env.")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Trainings with the same configuration.
+
+    Args:
+        number: from 1.
+        name: the keys by which it differs from the other groups.
+        label: number and name, short enough for a legend.
+        trainings: each with another seed.
+    """
+
+    number: int
+    name: str
+    label: str
+    trainings: tuple[Training, ...]
+
+    @property
+    def title(self) -> str:
+        """Number and name."""
+        return f"{self.number}. {self.name}"
+
+
+def grouped(trainings: Sequence[Training]) -> tuple[list[Group], list[Training]]:
+    """Returns the groups in the order of their first trainings, and the trainings that are left out.
+
+    Of several trainings with the same configuration and seed only one counts, because the others say nothing new: one
+    that has run to its end if there is any, and of these the last.
+    """
+    of_key: dict[tuple[tuple[str, str], ...], list[Training]] = {}
+    for training in trainings:
+        of_key.setdefault(tuple(sorted(_compared(training.params).items())), []).append(training)
+    kept = [_one_for_each_seed(each) for each in of_key.values()]
+    groups = []
+    for number, (name, each) in enumerate(zip(_names([each[0] for each in kept]), kept, strict=True), start=1):
+        groups.append(Group(number, name, f"{number}. {_shortened(name)}", tuple(each)))
+    counted = {training.run_id for group in groups for training in group.trainings}
+    return groups, [training for training in trainings if training.run_id not in counted]
+
+
+def differing_rules(groups: Sequence[Group]) -> list[str]:
+    """Returns the keys by which the groups' episodes differ, whoever plays them."""
+    keys = _differing([_compared(group.trainings[0].params) for group in groups])
+    return [key for key in keys if key.startswith(RULES)]
+
+
+def _one_for_each_seed(trainings: Iterable[Training]) -> list[Training]:
+    of_seed: dict[str, Training] = {}
+    for training in sorted(trainings, key=lambda each: (each.is_whole, each.started_ms)):
+        of_seed[training.label] = training
+    return sorted(of_seed.values(), key=lambda each: (len(each.label), each.label))
+
+
+def _compared(params: Mapping[str, str]) -> dict[str, str]:
+    return {key: value for key, value in params.items() if not _is_under(key, LEFT_OUT)}
+
+
+def _is_under(key: str, sections: Iterable[str]) -> bool:
+    return any(key == each or key.startswith(f"{each}.") for each in sections)
+
+
+def _differing(of_groups: Sequence[Mapping[str, str]]) -> list[str]:
+    """Returns the keys whose values differ; of several that say the same, because one refers to another, the first."""
+    keys = sorted({key for each in of_groups for key in each}, key=lambda key: (key.count("."), key))
+    first: dict[tuple[str, tuple[str | None, ...]], str] = {}
+    for key in keys:
+        values = tuple(each.get(key) for each in of_groups)
+        if len(set(values)) > 1:
+            first.setdefault((key.rpartition(".")[2], values), key)
+    return list(first.values())
+
+
+def _names(firsts: Sequence[Training]) -> list[str]:
+    """Returns the names of groups, by the first training of each."""
+    if len(firsts) == 1:
+        return [SEED_IN_NAME.sub("", firsts[0].name)]
+    params = [_compared(training.params) for training in firsts]
+    keys = _differing(params)
+    chosen = [each for each in firsts[0].choices if len({training.choices.get(each) for training in firsts}) > 1]
+    names = []
+    for number, training in enumerate(firsts):
+        words = [f"{each}={training.choices.get(each, '?')}" for each in chosen]
+        for key in keys:
+            section = key.partition(".")[0]
+            # What a choice brings with it is said by its name, but for what its own groups differ by.
+            alike = [
+                params[other].get(key)
+                for other, each in enumerate(firsts)
+                if section not in chosen or each.choices.get(section) == training.choices.get(section)
+            ]
+            if key in params[number] and len(set(alike)) > 1:
+                words.append(f"{key}={params[number][key]}")
+        names.append(", ".join(words) or SEED_IN_NAME.sub("", training.name))
+    return _distinct(names)
+
+
+def _shortened(name: str) -> str:
+    """Returns a name with the last part of each key and four digits of long numbers, cut where it is still long."""
+    short = LONG_NUMBER.sub(lambda number: f"{float(number[0]):.4g}", SECTIONS.sub("", name))
+    return short if len(short) <= MAX_LABEL_CHARS else f"{short[: MAX_LABEL_CHARS - 1]}…"
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Returns names of which those that occur several times have a number."""
+    counts, seen, distinct = Counter(names), Counter[str](), []
+    for name in names:
+        seen[name] += 1
+        distinct.append(f"{name} ({seen[name]})" if counts[name] > 1 else name)
+    return distinct

@@ -1,0 +1,86 @@
+"""What whoever reads a comparison should know of it."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Sequence
+
+from armscan.reports.groups import Group, differing_rules
+from armscan.reports.trainings import Training
+from armscan.training.seeds import FEWEST_SEEDS
+
+
+def notes_on(groups: Sequence[Group], left_out: Sequence[Training], *, has_other_volumes: bool) -> str:
+    """Returns the notes as a list, nothing where there are none.
+
+    Args:
+        groups: that are compared.
+        left_out: trainings that repeat another one.
+        has_other_volumes: whether some groups were judged on other volumes than others.
+    """
+    notes = [
+        *_on_seeds(groups),
+        *_on_unfinished(groups),
+        *_on_missing(groups),
+        *_on_rules(groups, has_other_volumes=has_other_volumes),
+    ]
+    if left_out:
+        which = ", ".join(f"{training.id} ({training.label})" for training in left_out)
+        notes.append(f"Left out, because another run has the same configuration and seed: {which}.")
+    return f"<ul>{''.join(f'<li>{html.escape(note)}</li>' for note in notes)}</ul>" if notes else ""
+
+
+def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
+    if single := [group.number for group in groups if len(group.trainings) == 1]:
+        yield (
+            f"{_numbered(single, groups)}: one seed says nothing of how others would go; intervals are of volumes and "
+            "episodes alone."
+        )
+    if few := [group.number for group in groups if 1 < len(group.trainings) < FEWEST_SEEDS]:
+        yield (
+            f"{_numbered(few, groups)}: of two or three seeds the 95 % interval of a curve is only the range from the "
+            "lowest to the highest, which holds the median of all seeds in 50 % or 75 % of cases. The other intervals "
+            "of so few seeds are as little to be relied on."
+        )
+
+
+def _on_unfinished(groups: Sequence[Group]) -> Iterator[str]:
+    unfinished = [(group, training) for group in groups for training in group.trainings if not training.is_whole]
+    if unfinished:
+        which = [f"{_named(group, training)}: {training.status}" for group, training in unfinished]
+        yield f"Not run to the end, and here with what they have: {_listed(which)}."
+
+
+def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
+    of_files: dict[str, list[str]] = {}
+    for group in groups:
+        for training in group.trainings:
+            # Of others it is said that they have not run to their end.
+            for file in training.missing if training.is_whole else ():
+                of_files.setdefault(file, []).append(_named(group, training))
+    for file, which in of_files.items():
+        yield f"No {file} is among the artifacts of {_listed(which)}."
+
+
+def _on_rules(groups: Sequence[Group], *, has_other_volumes: bool) -> Iterator[str]:
+    if rules := differing_rules(groups):
+        yield f"The groups' episodes have other rules ({', '.join(rules)}): their figures are those of different tasks."
+    if has_other_volumes:
+        yield (
+            "Not all groups were judged on the same test volumes: pairs that were not are left out where it is asked "
+            "which is better, and their figures differ by the volumes, too."
+        )
+
+
+def _named(group: Group, training: Training) -> str:
+    return f"{training.id} (group {group.number}, {training.label})"
+
+
+def _numbered(numbers: Sequence[int], groups: Sequence[Group]) -> str:
+    if len(numbers) == len(groups):
+        return "All groups"
+    return f"Group{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return "; ".join(names)

@@ -1,0 +1,53 @@
+"""Runs by their ids, compared."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from armscan.reports.comparison import write_comparison
+from armscan.reports.finding import find_trainings, label_of, read_runs
+from armscan.reports.groups import grouped
+from armscan.reports.trainings import read_training
+from armscan.tracking import TrackingStore, open_existing_store
+
+REPORTS = Path("reports")
+# A folder of more runs than fit is named by a sum of them.
+MAX_NAME_CHARS, SUM_CHARS = 60, 12
+
+
+def compare_runs(text: str, uri: str, out: str | None) -> Path:
+    """Writes the report of runs.
+
+    Args:
+        text: what names them; see `read_runs`.
+        uri: of the store that they are in.
+        out: takes the report; None for a folder in `reports` that is named after the runs.
+
+    Returns:
+        The HTML file.
+
+    Raises:
+        InvalidValueError: if one of the names is empty.
+        TrackingError: if one of them is not found, is none to be compared, or has kept something damaged.
+    """
+    named = read_runs(text)
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    store = open_existing_store(uri)
+    found = find_trainings(store, named)
+    print(f"reading   {len(found)} run{'s' if len(found) > 1 else ''}", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        trainings = [read_training(store, each, Path(folder) / each.run.info.run_id) for each in found]
+    groups, left_out = grouped(trainings)
+    title = f"Runs {', '.join(named)}" if len(", ".join(named)) <= MAX_NAME_CHARS else f"{len(trainings)} runs"
+    return write_comparison(groups, left_out, title, Path(out) if out else REPORTS / _folder_name(store, named))
+
+
+def _folder_name(store: TrackingStore, named: Sequence[str]) -> str:
+    labels = [label_of(store, name) for name in named]
+    name = re.sub(r"[^\w.\-]+", "-", "-".join(["runs", *labels]))
+    return name if len(name) <= MAX_NAME_CHARS else f"runs-{hashlib.sha256(name.encode()).hexdigest()[:SUM_CHARS]}"

@@ -1,0 +1,109 @@
+"""Real tracked runs of two agents with three seeds each, made once, and trainings that nobody has run."""
+
+import sys
+
+import numpy as np
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from mlflow import MlflowClient
+
+from armscan import report, run
+from armscan.reports.trainings import Series, Training
+from armscan.training import Episode, Evaluation
+
+SMALL = [
+    *("data.n_training=1", "data.n_validation=1", "data.n_test=2", "training.env_steps=400", "env.max_steps=6"),
+    *("training.epoch_env_steps=100", "training.validation_episodes=2", "evaluation.episodes=6"),
+    *("agent.num_envs=4", "agent.batch_size=16", "network=mlp", "network.hidden_sizes=[8]"),
+]
+AGENTS = {"sac": ["agent.random_env_steps=60"], "ppo": ["agent.env_steps_per_collection=100"]}
+
+
+class Runs:
+    """A store with runs in it."""
+
+    def __init__(self, folder):
+        self.folder, self.uri = folder, f"sqlite:///{folder}/mlruns.db"
+        self.client = MlflowClient(self.uri)
+        self.all = self.client.search_runs(["1"], order_by=["attributes.start_time ASC"])
+
+    def ids(self, agent):
+        return [each.info.run_id for each in self.all if each.data.tags["choice.agent"] == agent]
+
+    def made(self, name="made", parent=None, **tags):
+        """Makes a run of nothing but tags."""
+        made = self.client.create_run(
+            "1", run_name=name, tags=tags | ({"mlflow.parentRunId": parent} if parent else {})
+        )
+        return made.info.run_id
+
+
+@pytest.fixture(scope="session")
+def runs(tmp_path_factory):
+    """Six runs of armscan.run, as people make them; whoever changes one puts it back."""
+    folder = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("HYDRA_FULL_ERROR", "0")
+        for agent, words in AGENTS.items():
+            for seed in range(3):
+                patch.setattr(sys, "argv", ["armscan.run", f"agent={agent}", f"seed={seed}", *words, *SMALL])
+                GlobalHydra.instance().clear()
+                assert run.main() == 0
+    return Runs(folder)
+
+
+@pytest.fixture
+def answer(runs, tmp_path, monkeypatch, capsys):
+    """Runs the command in an empty folder; returns its exit code and what it printed."""
+
+    def command(*words):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", runs.uri)
+        code = report.main(words)
+        return code, *capsys.readouterr()
+
+    return command
+
+
+@pytest.fixture
+def make_training():
+    """Makes a training that nobody has run."""
+
+    def make(seed=0, *, params=None, choices=None, steps=(100, 200), values=(0.0, 1.0), mean_steps=3, **changes):
+        series = Series(np.array(steps, float), np.array(steps, float) / 50, np.array(values, float))
+        facts = {
+            "run_id": f"{seed:032x}",
+            "name": f"sac-seed{seed}",
+            "status": "finished",
+            "started_ms": seed,
+            "is_whole": True,
+            "params": {"seed": str(seed)} | (params or {}),
+            "choices": choices or {"agent": "sac"},
+            "series": {"validation/success_rate": series, "validation/mean_steps": series} if len(steps) else {},
+            "evaluation": Evaluation(tuple(make_episode(f"v{i % 2}", mean_steps) for i in range(4))),
+            "volumes": {"v0": "a", "v1": "b"},
+            "film": b"GIF89a",
+        }
+        return Training(**facts | changes)
+
+    return make
+
+
+def make_episode(volume, n_steps):
+    return Episode(
+        volume=volume,
+        seed=0,
+        n_steps=n_steps,
+        is_success=True,
+        starts_solved=False,
+        episode_return=-1.0,
+        final_reward=0.0,
+        best_reward=0.0,
+        distance_mm=float(n_steps),
+        distance_deg=0.0,
+        dice_bones=1.0,
+        dice_tendons=1.0,
+        dice_artery=1.0,
+        seconds_per_plane=0.1,
+    )

@@ -1,0 +1,93 @@
+"""What a comparison says of groups that nobody has trained: how many, of what, judged on which volumes."""
+
+import csv
+
+import pytest
+
+from armscan.reports.comparison import write_comparison
+from armscan.reports.groups import grouped
+from armscan.reports.outcomes import compared, final_figures
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Writes the report of trainings; returns the page, and a file's rows by its name."""
+
+    def write(*trainings):
+        file = write_comparison(*grouped(trainings), "runs", tmp_path)
+
+        def rows(name):
+            with (tmp_path / f"{name}.csv").open() as opened:
+                return list(csv.DictReader(opened))
+
+        return file.read_text(), rows
+
+    return write
+
+
+def test_twenty_groups_have_a_report(written, make_training):
+    page, rows = written(
+        *(make_training(seed, params={"agent.lr": str(lr)}, mean_steps=lr) for lr in range(1, 21) for seed in range(2))
+    )
+    assert "40 runs in 20 groups" in page
+    assert len(rows("improvement")) == 3 * 20 * 19 / 2
+    assert page.count("data-film") == 20
+    steps = {row["group"]: float(row["value"]) for row in rows("final") if row["figure"] == "mean_steps"}
+    assert steps == {f"agent.lr={lr}": lr for lr in range(1, 21)}
+
+
+def test_fewer_steps_are_better_and_equal_ones_are_no_difference(make_training):
+    trainings = [
+        make_training(seed, params={"agent.lr": str(lr)}, mean_steps=steps)
+        for lr, steps in ((1, 2), (2, 5), (3, 2))
+        for seed in range(3)
+    ]
+    pairs = {(pair.ours, pair.theirs): pair.probability for pair in compared(grouped(trainings)[0], "mean_steps")}
+    assert pairs == {(0, 1): (1.0, 1.0, 1.0), (0, 2): (0.5, 0.5, 0.5), (1, 2): (0.0, 0.0, 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("volumes", "is_compared"),
+    [({"v0": "a", "v1": "b"}, True), ({"v0": "a", "v1": "c"}, False), (None, True)],
+    ids=["same", "other", "unknown"],
+)
+def test_groups_judged_on_other_volumes_are_not_compared(written, make_training, volumes, is_compared):
+    ours = [make_training(seed, params={"agent.lr": "1"}) for seed in range(2)]
+    page, rows = written(*ours, *(make_training(seed, params={"agent.lr": "2"}, volumes=volumes) for seed in range(2)))
+    assert len(rows("improvement")) == (3 if is_compared else 0)
+    assert ("Not all groups were judged on the same test volumes" in page) == (not is_compared)
+    assert ("<small>other volumes</small>" in page) == (not is_compared)
+
+
+def test_final_figures_are_of_all_seeds_volumes_and_episodes(make_training):
+    (group,), _ = grouped([make_training(seed, mean_steps=steps) for seed, steps in enumerate((2, 4, 9))])
+    figures = final_figures(group)
+    assert (figures.n_volumes, figures.n_episodes) == (2, 12)
+    assert figures.estimates["mean_steps"] == (5.0, 2.0, 9.0)
+
+
+def test_success_without_a_failure_has_the_interval_of_wilson(written, make_training):
+    page, _ = written(make_training(0), make_training(1))
+    assert "100.0%<br><small>67.6% to 100.0%</small>" in page
+
+
+def test_the_film_is_of_the_median_training(written, make_training):
+    trainings = [make_training(seed, mean_steps=steps) for seed, steps in enumerate((9, 5, 2))]
+    page, _ = written(*trainings, make_training(3, evaluation=None), make_training(4, film=None, mean_steps=1))
+    assert "<figcaption>1. sac: seed 1</figcaption>" in page
+
+
+def test_what_is_shown_is_no_markup(written, make_training):
+    page, _ = written(*(make_training(params={"data.path": f"<b>{name}</b>"}) for name in "ab"))
+    assert "<b>a</b>" not in page
+    assert "1. data.path=&lt;b&gt;a&lt;/b&gt;" in page
+
+
+def test_runs_that_were_left_out_and_rules_that_differ_are_said(written, make_training):
+    page, _ = written(
+        make_training(0, params={"env.delta": "0.05"}, run_id="a" * 32),
+        make_training(0, params={"env.delta": "0.05"}, run_id="b" * 32, started_ms=9),
+        make_training(0, params={"env.delta": "0.01"}),
+    )
+    assert "another run has the same configuration and seed: aaaaaaaa (seed 0)." in page
+    assert "have other rules (env.delta)" in page

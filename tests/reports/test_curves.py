@@ -1,0 +1,55 @@
+"""Curves of several seeds that stop at different steps."""
+
+import numpy as np
+
+from armscan.reports.curves import MAX_POINTS, curve_of
+from armscan.reports.groups import grouped
+
+FIGURE, STEPS, SECONDS = "validation/mean_steps", "environment steps", "seconds of training"
+
+
+def curve(*trainings, axis=STEPS):
+    (group,), _ = grouped(trainings)
+    return curve_of(group, FIGURE, axis)
+
+
+def test_a_training_that_has_finished_is_carried_on_with_its_last_value(make_training):
+    early = make_training(0, steps=(100, 200), values=(10.0, 2.0))
+    late = make_training(1, steps=(100, 200, 300, 400), values=(10.0, 8.0, 6.0, 4.0))
+    ours = curve(early, late)
+    assert ours.places.tolist() == [100, 200, 300, 400]
+    assert ours.band.values.tolist() == [10.0, 5.0, 4.0, 3.0]
+    assert ours.band.lows.tolist() == [10.0, 2.0, 2.0, 2.0]
+    assert [len(places) for places, _ in ours.lines.values()] == [2, 4]
+
+
+def test_the_curve_ends_with_a_training_that_has_not_run_to_its_end(make_training):
+    cut = make_training(0, steps=(100, 200), values=(10.0, 2.0), is_whole=False)
+    late = make_training(1, steps=(100, 200, 300), values=(10.0, 8.0, 6.0))
+    assert curve(cut, late).places.tolist() == [100, 200]
+
+
+def test_the_curve_begins_where_all_are_known_and_is_straight_between_validations(make_training):
+    ours = curve(
+        make_training(0, steps=(100, 300), values=(0.0, 2.0)), make_training(1, steps=(200, 300), values=(5.0, 5.0))
+    )
+    assert ours.places.tolist() == [200, 300]
+    assert ours.band.values.tolist() == [3.0, 3.5]
+
+
+def test_curves_over_seconds_are_of_the_same_values(make_training):
+    ours = curve(make_training(0), make_training(1), axis=SECONDS)
+    assert ours.places.tolist() == [2.0, 4.0]
+    assert ours.band.values.tolist() == [0.0, 1.0]
+
+
+def test_trainings_without_validation_have_no_curve(make_training):
+    assert curve(make_training(0, steps=(), values=())) is None
+    assert curve(make_training(0, steps=(), values=()), make_training(1)).n_seeds == 1
+
+
+def test_long_curves_are_drawn_by_fewer_points(make_training):
+    steps = tuple(range(1, 1001))
+    ours = curve(make_training(0, steps=steps, values=steps), make_training(1, steps=steps, values=steps))
+    assert len(ours.places) == MAX_POINTS
+    assert np.allclose(ours.band.values, ours.places)
