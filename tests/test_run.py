@@ -175,7 +175,8 @@ def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_pat
         assert child.info.run_name == f"{child.data.tags['choice.agent']}-cluster-zy-phantom-seed0"
         assert {"training_volumes/success_rate", "test_volumes/mean_distance_deg"} <= child.data.metrics.keys()
         artifacts = {file.path for file in client.list_artifacts(child.info.run_id)}
-        assert artifacts == {"config.yaml", "volumes.json", "episode.gif", "evaluation.json"}
+        kept = {"config.yaml", "volumes.json", "environment.json", "episode.gif", "evaluation.json"}
+        assert artifacts - {"code.diff"} == kept
 
 
 def test_run_on_labelmap_files(tmp_path, data_folder):

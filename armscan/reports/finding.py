@@ -9,7 +9,7 @@ from typing import Any
 from mlflow.entities import Run
 
 from armscan.errors import InvalidValueError, TrackingError, listed
-from armscan.tracking import EVALUATED_TAG, TrackingStore, find_run
+from armscan.tracking import EVALUATED_TAG, TrackingStore, check_version, find_run
 from armscan.tracking.store import usable_store
 
 # How a whole experiment of MLflow is named, instead of runs.
@@ -114,6 +114,7 @@ def _in_experiment(store: TrackingStore, name: str) -> list[Found]:
 
 def _checked(store: TrackingStore, training: Found) -> Found:
     """Returns a training with whether its trial was pruned; each that is meant comes by here, however it was named."""
+    check_version(training.run)
     tags = training.run.data.tags
     if TRIAL_TAG not in tags or training.is_pruned or PARENT_TAG not in tags:
         return training

@@ -197,8 +197,8 @@ def check_artifacts(location: str | None) -> None:
         return
     folder = Path(url2pathname(urlsplit(location).path))
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        check_writable(folder / "any")
+        # Nothing is made: whoever has made another mistake finds nothing left.
+        check_writable(next(each for each in (folder, *folder.parents) if each.exists()) / "any")
     except OSError as error:
         raise TrackingError(
             f"the artifacts of runs lie in {folder}, as their experiment or tracking.artifacts says, but no file can "

@@ -199,7 +199,6 @@ def test_figures_are_kept_where_files_cannot_be_because_the_disk_is_full(tmp_pat
     """Something in the way of the folder stands for the disk: what is raised is an `OSError` in both cases."""
     uri, artifacts = f"sqlite:///{tmp_path}/runs.db", tmp_path / "artifacts"
     store, experiment_id = open_store(uri, experiment="test", artifacts=str(artifacts), wait_s=1.0)
-    artifacts.rmdir()
     artifacts.write_text("in the way")
     tracked = begun((store, experiment_id), tmp_path / "run")
     (tmp_path / "run" / "best.pt").write_text("weights")

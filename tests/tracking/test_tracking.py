@@ -182,7 +182,6 @@ def test_store_whose_artifacts_cannot_be_written_is_refused_before_anything_is_m
     client, _ = open_store(uri, experiment="other", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
     assert {each.name for each in client.search_experiments()} == {"Default", "other"}
     # Where the experiment is there already, it says where its artifacts lie.
-    (tmp_path / "artifacts").rmdir()
     (tmp_path / "artifacts").write_text("no folder")
     with pytest.raises(TrackingError, match=r"the artifacts of runs lie in .*artifacts, as their experiment"):
         open_store(uri, experiment="other", artifacts="elsewhere", wait_s=60.0)
