@@ -210,7 +210,7 @@ def test_whatever_a_library_refuses_is_one_line_but_an_interrupt_stays_one(regre
         raise SystemError("compiled code") from KeyboardInterrupt()
 
     monkeypatch.setattr("mlflow.pyfunc.load_model", refuse)
-    with pytest.raises(ExportError, match="^the model cannot be written or asked: no such flavour$"):
+    with pytest.raises(ExportError, match=r"^the model cannot be written or asked: no such flavour$"):
         make_model(*regression, tmp_path / "model", {"armscan": "0"})
     monkeypatch.setattr("mlflow.pyfunc.load_model", interrupt)
     with pytest.raises(SystemError):
