@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from armscan.agents.policy import Batch, Policy
-from armscan.errors import ExportError
+from armscan.errors import ExportError, is_interruption
 
 if TYPE_CHECKING:
     from torch.export import ExportedProgram
@@ -80,5 +80,7 @@ def _quietly(what: str) -> Iterator[None]:
             yield
     # Whatever they raise: a network may be anybody's, and do what cannot be written down.
     except Exception as error:
+        if is_interruption(error):
+            raise
         reason = shorten(str(error) or repr(error), MAX_REASON_CHARS)
         raise ExportError(f"{what} cannot take the agent's network: {reason}") from error

@@ -18,10 +18,11 @@ from armscan.agents import Learner
 from armscan.agents.export import OBSERVATION
 from armscan.agents.policy import Policy, batch_of
 from armscan.envs.task import Observed
-from armscan.errors import ExportError
+from armscan.errors import ExportError, is_interruption
 from armscan.files import CONFIG_FILE
 from armscan.policies.model import ONNX_FILE, Arrays, arrays_of, write_model
 from armscan.tracking import TrackedRun
+from armscan.tracking.client import reason_in
 from armscan.training.evaluation import Env
 from armscan.volumes.plane import FloatArray
 
@@ -88,6 +89,11 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
             made.replace(folder)
     except OSError as error:
         raise ExportError(f"{folder}: the model cannot be written ({error.strerror or error})") from error
+    # Whatever MLflow or onnxruntime raise: a run is not to fail for its model.
+    except Exception as error:
+        if isinstance(error, ExportError) or is_interruption(error):
+            raise
+        raise ExportError(f"the model cannot be written or asked: {reason_in(error)}") from error
 
 
 def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]:

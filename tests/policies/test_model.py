@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from mlflow.exceptions import MlflowException
 
 from armscan.agents.policy import batch_of
 from armscan.errors import ExportError
@@ -199,6 +200,22 @@ def test_model_whose_place_cannot_be_written_to_is_named(regression, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(ExportError, match=r"file/in/model: the model cannot be written \(Not a directory\)"):
         make_model(*regression, tmp_path / "file" / "in" / "model", {"armscan": "0"})
+
+
+def test_whatever_a_library_refuses_is_one_line_but_an_interrupt_stays_one(regression, tmp_path, monkeypatch):
+    def refuse(_):
+        raise MlflowException("no\nsuch flavour")
+
+    def interrupt(_):
+        raise SystemError("compiled code") from KeyboardInterrupt()
+
+    monkeypatch.setattr("mlflow.pyfunc.load_model", refuse)
+    with pytest.raises(ExportError, match=r"^the model cannot be written or asked: no such flavour$"):
+        make_model(*regression, tmp_path / "model", {"armscan": "0"})
+    monkeypatch.setattr("mlflow.pyfunc.load_model", interrupt)
+    with pytest.raises(SystemError):
+        make_model(*regression, tmp_path / "model", {"armscan": "0"})
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import armscan
-from armscan.errors import TrackingError
+from armscan.errors import InvalidValueError, TrackingError
 from armscan.tracking import (
     VERSION_TAG,
     TrackedRun,
@@ -274,3 +274,9 @@ def test_learning_curve_is_a_picture(tmp_path):
     with Image.open(tmp_path / "curve.png") as picture:
         assert picture.size[0] > 600
         assert len(picture.convert("RGB").getcolors(100_000)) > 20
+
+
+def test_store_is_not_opened_where_the_policy_is_neither_kept_nor_not(tmp_path):
+    with pytest.raises(InvalidValueError, match=r"tracking\.policy is 'maybe'"):
+        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="a", artifacts="b", wait_s=1.0, policy="maybe")
+    assert not list(tmp_path.iterdir())
