@@ -9,7 +9,7 @@ from functools import partial
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.agents import Agent, AgentSetup
+from armscan.agents import Agent, AgentSetup, Learner
 from armscan.checks import check_int, check_seed
 from armscan.envs import EnvMaker
 from armscan.errors import InvalidValueError, listed
@@ -122,6 +122,12 @@ def make_agent(
             f"agent is {algorithm!r}, but it must have the method of Algorithm, agent: give agent._target_ such a class"
         )
     agent: Agent = algorithm.agent(setup)
+    if hasattr(agent, "learn") and not isinstance(agent, Learner):
+        missing = [name for name in dir(Learner) if not name.startswith("_") and not hasattr(agent, name)]
+        raise InvalidValueError(
+            f"agent is {type(agent).__name__}, which learns, but it must have all methods of Learner: it has no "
+            f"{listed(missing)}"
+        )
     return agent
 
 

@@ -76,11 +76,12 @@ def _tracked(request: Request, applied: Applied) -> tuple[Judgement, Path]:
     """Plays, and keeps what comes of it: in a JSON file, and in a tracked run, a child of the run that is evaluated."""
     from armscan.applying import file_name
     from armscan.judging import Judgement, data_name
-    from armscan.tracking import EVALUATED_TAG, TrackedRun, deliver_leftovers, open_store
+    from armscan.tracking import EVALUATED_TAG, TrackedRun, check_artifacts, deliver_leftovers, open_store
 
     subject = applied.subject
     if subject.run is not None:
         client, experiment_id = subject.run.client, subject.run.experiment_id
+        check_artifacts(client, experiment_id)
     else:
         client, experiment_id = open_store(**applied.store)
     deliver_leftovers(client)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +18,7 @@ from armscan.invocation import Invocation
 from armscan.judging.subject import from_its_folder
 from armscan.multirun import remove_if_untracked
 from armscan.provenance import CHOICES_IN_TAGS, start_tracking
+from armscan.settings import reproduce_command
 from armscan.stage import Stage
 from armscan.tracking import EVALUATED_TAG, FoundRun, environment_tags, found_run, source_tags
 from armscan.tracking.comparing import Comparison, compared
@@ -135,8 +135,8 @@ def reproduced(original: Original, folder: Path, differing: Sequence[str]) -> Co
         raise InvalidValueError(f"out is {str(folder)!r}, but that is there already, and no empty folder: name another")
     folder.mkdir(parents=True, exist_ok=True)
     choices = {group: run.tags.get(f"choice.{group}", "unknown") for group in CHOICES_IN_TAGS}
-    command = shlex.join(["python", "-m", "armscan.reproduce", run.run_id])
-    invocation = Invocation(folder, run.tags.get("overrides", "").split(), command, choices, None)
+    overrides = run.tags.get("overrides", "").split()
+    invocation = Invocation(folder, overrides, reproduce_command(run.run_id), choices, None)
     uri = original.config.tracking.uri
     try:
         with held(folder):

@@ -56,41 +56,43 @@ def usual_storage() -> str:
 
 def run_command(words: Iterable[str]) -> str:
     """Returns what one types to run what words describe."""
-    return shlex.join(["python", "-m", "armscan.run", *words])
+    return _command("armscan.run", *words)
 
 
 def resume_command(run_id: str, tracking_uri: str) -> str:
     """Returns what one types to go on with a run that was cut off."""
-    return _command("armscan.run", f"{RESUME}={run_id}", TRACKING_URI, tracking_uri)
+    return _command("armscan.run", f"{RESUME}={run_id}", tracking=tracking_uri, key=TRACKING_URI)
 
 
 def evaluate_command(run_id: str, tracking_uri: str) -> str:
     """Returns what one types to judge a run's agent."""
-    return _command("armscan.evaluate", f"run={run_id}", "tracking", tracking_uri)
+    return _command("armscan.evaluate", f"run={run_id}", tracking=tracking_uri)
 
 
 def watch_command(run_id: str, tracking_uri: str) -> str:
     """Returns what one types to film a run's agent."""
-    return _command("armscan.watch", f"run={run_id}", "tracking", tracking_uri)
+    return _command("armscan.watch", f"run={run_id}", tracking=tracking_uri)
+
+
+def reproduce_command(run_id: str) -> str:
+    """Returns what one types to make a run again."""
+    return _command("armscan.reproduce", run_id)
 
 
 def report_command(study: str, storage: str) -> str:
     """Returns what one types to see what a study has found."""
-    return _command_at("armscan.report", f"study={study}", "storage", storage, usual_storage())
+    return _command("armscan.report", f"study={study}", storage=storage)
 
 
 def ui_command(*, tracking: str | None = None, storage: str | None = None) -> str:
     """Returns what one types to look at runs and studies in the browser; what is None is where it usually is."""
-    usual = {"storage": usual_storage(), "tracking": usual_tracking()["uri"]}
-    given = {"storage": storage, "tracking": tracking}
-    words = [f"{key}={uri}" for key, uri in given.items() if uri not in (None, usual[key])]
-    return shlex.join(["python", "-m", "armscan.ui", *words])
+    return _command("armscan.ui", tracking=tracking, storage=storage)
 
 
-def _command(module: str, of_run: str, key_of_store: str, tracking_uri: str) -> str:
-    return _command_at(module, of_run, key_of_store, tracking_uri, usual_tracking()["uri"])
-
-
-def _command_at(module: str, of_what: str, key_of_place: str, place: str, usual_place: str) -> str:
-    where = [] if place == usual_place else [f"{key_of_place}={place}"]
-    return shlex.join(["python", "-m", module, of_what, *where])
+def _command(
+    module: str, *words: str, tracking: str | None = None, storage: str | None = None, key: str = "tracking"
+) -> str:
+    """Returns a command; places stand in it only where they are not the usual ones."""
+    where = [f"storage={storage}"] if storage is not None and storage != usual_storage() else []
+    where += [f"{key}={tracking}"] if tracking is not None and tracking != usual_tracking()["uri"] else []
+    return shlex.join(["python", "-m", module, *words, *where])

@@ -59,3 +59,26 @@ def test_stage_refuses_volumes_that_an_observation_is_of_another_shape_on(phanto
     config = config_of_sizes(phantom, monkeypatch, own)
     with pytest.raises(InvalidValueError, match=r"part 'slice' has the shape \(360, 80\), but .* \(336, 80\)"):
         Stage.built(config)
+
+
+class Unfinished:
+    """An algorithm of one's own, and its agent, which learns but gives no policy."""
+
+    def agent(self, setup):
+        return self
+
+    def begin(self, *, seed, bounds):
+        pass
+
+    def act(self, observation, reward):
+        return [0.0]
+
+    def learn(self, n_env_steps):
+        return {}
+
+
+def test_build_refuses_an_agent_that_learns_but_lacks_what_training_needs(phantom, monkeypatch):
+    config = config_of_sizes(phantom, monkeypatch)
+    config.agent = {"_target_": "tests.test_building.Unfinished"}
+    with pytest.raises(InvalidValueError, match=r"agent is Unfinished, which learns, .* it has no .*policy.* or weights"):
+        build(config)

@@ -108,6 +108,16 @@ def written(folder, pattern="*"):
     return json.loads(file.read_text())
 
 
+def test_evaluate_makes_nothing_where_artifacts_are_read_only(answer, tmp_path, made_read_only):
+    run_id = tracked(tmp_path)
+    with made_read_only(tmp_path / "artifacts"):
+        code, _, errors = answer(f"run={run_id}", "episodes=3")
+    assert code == 2
+    assert errors.startswith(f"error: the artifacts of runs lie in {tmp_path}/artifacts")
+    assert len(runs_in(tmp_path)[1]) == 1
+    assert not list(tmp_path.glob("evaluations/*"))
+
+
 @pytest.mark.slow
 def test_evaluate_judges_a_run_as_it_was_trained(tmp_path, data_folder):
     assert armscan_run(*SMALL, cwd=tmp_path).returncode == 0

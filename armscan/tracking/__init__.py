@@ -17,7 +17,7 @@ from armscan.tracking.pictures import draw_learning_curve
 from armscan.tracking.run import TrackedRun
 from armscan.tracking.source import source, source_tags
 from armscan.tracking.spool import take_over
-from armscan.tracking.store import open_existing_store, open_store
+from armscan.tracking.store import check_artifacts, open_existing_store, open_store
 from armscan.tracking.sync import abandon, deliver_leftovers, note_end, sync
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "TrackedRun",
     "TrackingStore",
     "abandon",
+    "check_artifacts",
     "check_version",
     "deliver_leftovers",
     "draw_learning_curve",

@@ -176,7 +176,7 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
     location = Path(artifacts).absolute().as_uri() if artifacts else None
     found = store.get_experiment_by_name(name)
     if found is None:
-        check_artifacts(location)
+        _check_writable(location)
         try:
             return str(store.create_experiment(name, artifact_location=location))
         except MlflowException as error:
@@ -186,11 +186,16 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
             found = store.get_experiment_by_name(name)
     if found.lifecycle_stage != "active":
         raise TrackingError(f"tracking.experiment is {name!r}, but it was deleted; restore it, or name another")
-    check_artifacts(found.artifact_location)
+    _check_writable(found.artifact_location)
     return str(found.experiment_id)
 
 
-def check_artifacts(location: str | None) -> None:
+def check_artifacts(store: TrackingStore, experiment_id: str) -> None:
+    """Raises `TrackingError` where the artifacts of an experiment cannot be written."""
+    _check_writable(store.get_experiment(experiment_id).artifact_location)
+
+
+def _check_writable(location: str | None) -> None:
     """Raises `TrackingError` where the artifacts are files of this machine, and cannot be written."""
     # A server is asked when it is given the first file; what it does not take stays in the folder of the run.
     if location is None or not location.startswith("file:"):
