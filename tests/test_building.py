@@ -80,5 +80,5 @@ class Unfinished:
 def test_build_refuses_an_agent_that_learns_but_lacks_what_training_needs(phantom, monkeypatch):
     config = config_of_sizes(phantom, monkeypatch)
     config.agent = {"_target_": "tests.test_building.Unfinished"}
-    with pytest.raises(InvalidValueError, match=r"agent is Unfinished, which learns, .* it has no .*policy.* or weights"):
+    with pytest.raises(InvalidValueError, match=r"agent is Unfinished, which learns, .* has no .*policy.* or weights"):
         build(config)

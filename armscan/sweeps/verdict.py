@@ -47,7 +47,8 @@ def verdicts(judged: Sequence[FrozenTrial], *, seed: int = 0) -> list[Verdict]:
     """Returns what the trainings that judge say of each configuration.
 
     The interquartile mean over seeds and test volumes (of success rates the mean, where every failure counts), with an
-    interval by stratified bootstrap of the seeds, as Agarwal et al. 2021 (arXiv:2108.13264) recommend.
+    interval by a bootstrap of the seeds: Agarwal et al. 2021 (arXiv:2108.13264), but that each seed is drawn with all
+    its volumes, because one training was judged on all of them.
 
     Args:
         judged: trials of the study that judges; those that have not finished are left out.

@@ -50,12 +50,13 @@ def mean_for(figure: str) -> Mean:
     return np.mean if "success_rate" in figure else interquartile_mean
 
 
-def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
-    """Returns the mean over seeds and volumes, with an interval that draws the seeds of each volume by itself.
+def over_seeds(scores: FloatArray, mean: Mean, *, is_stratified: bool = False, seed: int = 0) -> Estimate:
+    """Returns the mean over seeds and volumes, with an interval that draws seeds, each with all its volumes.
 
     Args:
         scores: shape (seeds, volumes).
         mean: see `mean_for`.
+        is_stratified: draw the seeds of each volume by itself; see `probability_of_improvement` for when that is right.
         seed: of the resamples.
 
     Returns:
@@ -64,7 +65,10 @@ def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
     value = float(mean(scores))
     if len(scores) < 2 or np.isnan(scores).any():
         return Estimate(value, np.nan, np.nan)
-    ends = _ends(tuple(scores.T), lambda *of_volumes: mean(np.array(of_volumes)), seed, vectorized=False)
+    if is_stratified:
+        ends = _ends(tuple(scores.T), lambda *of_volumes: mean(np.array(of_volumes)), seed, vectorized=False)
+    else:
+        ends = _ends((np.arange(len(scores)),), lambda drawn: mean(scores[drawn]), seed, vectorized=False)
     return Estimate(value, float(ends[0]), float(ends[1]))
 
 

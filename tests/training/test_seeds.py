@@ -60,6 +60,27 @@ def test_interval_of_improvement_holds_the_truth_only_if_seeds_are_drawn_with_al
     assert n_stratified <= 45
 
 
+@pytest.mark.parametrize(("n_volumes", "is_stratified"), [(1, False), (1, True), (8, True)])
+def test_intervals_over_seeds_are_those_of_rliable(n_volumes, is_stratified):
+    values = np.random.default_rng(0).gamma(2.0, 2.0, (5, n_volumes))
+    estimate = over_seeds(values, interquartile_mean, is_stratified=is_stratified)
+    _, ends = get_interval_estimates({"it": values}, lambda each: np.array([aggregate_iqm(each)]), reps=10_000)
+    assert estimate[1:] == pytest.approx(ends["it"][:, 0], rel=0.05)
+
+
+def test_interval_over_seeds_holds_the_truth_only_if_they_are_drawn_with_all_their_volumes():
+    rng = np.random.default_rng(0)
+    n_whole = n_stratified = 0
+    for _ in range(40):
+        # Each training is good or bad on all of eight volumes; the mean of all trainings is 0.
+        values = rng.normal(size=(8, 1)) + 0.3 * rng.normal(size=(8, 8))
+        whole, stratified = (over_seeds(values, np.mean, is_stratified=each) for each in (False, True))
+        n_whole += whole.low <= 0 <= whole.high
+        n_stratified += stratified.low <= 0 <= stratified.high
+    assert n_whole >= 32
+    assert n_stratified <= 26
+
+
 @given(arrays(float, st.tuples(st.integers(2, 7), st.integers(1, 5)), elements=st.floats(-10, 10, width=32)))
 @settings(max_examples=40)
 def test_band_lies_within_the_seeds_and_is_the_same_each_time(values):
