@@ -37,7 +37,7 @@ from armscan.words import read_words
 from tests.mlflow_server import MlflowServer, mlflow_server
 
 KEYS = ("rounds", "env_steps", "every")
-THREADS = ("courier", "system metrics")
+THREADS = ("courier", "leftovers", "system metrics")
 LOOK_S = 0.05
 
 
