@@ -56,8 +56,11 @@ def evaluate(request: Request) -> Path:
     from armscan import judging
     from armscan.applying import apply
     from armscan.console import print_where_to_look
+    from armscan.tracking import check_artifacts
 
     applied = apply(request, partial(_check_episodes, request.n_episodes))
+    if applied.subject.run is not None:
+        check_artifacts(applied.subject.run.client, applied.subject.run.experiment_id)
     _check_out(request.out)
     judgement, file = _tracked(request, applied)
     for table in judging.judgement_tables(judgement):
@@ -76,12 +79,11 @@ def _tracked(request: Request, applied: Applied) -> tuple[Judgement, Path]:
     """Plays, and keeps what comes of it: in a JSON file, and in a tracked run, a child of the run that is evaluated."""
     from armscan.applying import file_name
     from armscan.judging import Judgement, data_name
-    from armscan.tracking import EVALUATED_TAG, TrackedRun, check_artifacts, deliver_leftovers, open_store
+    from armscan.tracking import EVALUATED_TAG, TrackedRun, deliver_leftovers, open_store
 
     subject = applied.subject
     if subject.run is not None:
         client, experiment_id = subject.run.client, subject.run.experiment_id
-        check_artifacts(client, experiment_id)
     else:
         client, experiment_id = open_store(**applied.store)
     deliver_leftovers(client)

@@ -21,7 +21,7 @@ from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, SPOOLS, write
 from armscan.launchers import LAUNCHER, check_launcher
 from armscan.mistakes import mistake_in_one_line
 from armscan.passwords import check_written
-from armscan.settings import TRACKING_URI, plain, resume_command
+from armscan.settings import TRACKING_URI, compare_command, plain, resume_command
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -198,6 +198,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
         if runs:
             print_where_to_look(Multirun.folder, word["tracking"]["uri"])
+            print(f"compare   {compare_command(word['run_id'], word['tracking']['uri'])}")
     for number, outcome in failed.items():
         print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
         print(f"  again alone: python -m armscan.run {outcome.overrides}", file=sys.stderr)

@@ -94,7 +94,7 @@ def started_with(config: dict[str, Any], stage: Stage) -> dict[str, bytes]:
         CONFIG_FILE: yaml.safe_dump(config, sort_keys=False).encode(),
         VOLUMES_FILE: json.dumps(stage.fingerprints, indent=1).encode(),
         ENVIRONMENT_FILE: environment_file(),
-        **({} if diff is None else {DIFF_FILE: diff}),
+        **({DIFF_FILE: diff} if diff else {}),
     }
 
 

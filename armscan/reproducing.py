@@ -11,7 +11,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, TrackingError
 from armscan.experiment import carry_out
 from armscan.files import DIFF_FILE, ENVIRONMENT_FILE, held
 from armscan.invocation import Invocation
@@ -71,7 +71,18 @@ def original_of(tracking: str, run_id: str) -> Original:
     stage = Stage.built(config)
     if volumes is not None:
         check_unchanged(volumes, stage.fingerprints, f"run {run.run_id} was started with")
-    return Original(run, config, stage, None if text is None else json.loads(text))
+    return Original(run, config, stage, None if text is None else _environment(text, run))
+
+
+def _environment(text: str, run: FoundRun) -> Mapping[str, Any]:
+    """Returns what a run has kept of its environment."""
+    try:
+        kept = json.loads(text)
+    except ValueError:
+        kept = None
+    if not isinstance(kept, dict) or not isinstance(kept.get("packages"), dict):
+        raise TrackingError(f"run {run.run_id}: its {ENVIRONMENT_FILE} is damaged, or another file")
+    return kept
 
 
 def differences(original: Original) -> list[str]:
@@ -133,18 +144,20 @@ def reproduced(original: Original, folder: Path, differing: Sequence[str]) -> Co
     run = original.run
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InvalidValueError(f"out is {str(folder)!r}, but that is there already, and no empty folder: name another")
+    is_ours = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     choices = {group: run.tags.get(f"choice.{group}", "unknown") for group in CHOICES_IN_TAGS}
     overrides = run.tags.get("overrides", "").split()
-    invocation = Invocation(folder, overrides, reproduce_command(run.run_id), choices, None)
     uri = original.config.tracking.uri
+    invocation = Invocation(folder, overrides, reproduce_command(run.run_id, uri), choices, None)
     try:
         with held(folder):
             tracked = start_tracking(original.config, invocation, original.stage)
             tracked.set_tags({OF_TAG: run.run_id})
             carry_out(original.stage, tracked, folder, uri)
     except BaseException as error:
-        remove_if_untracked(folder, error)
+        if is_ours:
+            remove_if_untracked(folder, error)
         raise
     comparison = compared(run.client, run.run_id, tracked.run_id)
     facts = {"of": run.run_id, "run": tracked.run_id, "differences": list(differing), **comparison.to_dict()}

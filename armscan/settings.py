@@ -74,14 +74,19 @@ def watch_command(run_id: str, tracking_uri: str) -> str:
     return _command("armscan.watch", f"run={run_id}", tracking=tracking_uri)
 
 
-def reproduce_command(run_id: str) -> str:
+def reproduce_command(run_id: str, tracking_uri: str) -> str:
     """Returns what one types to make a run again."""
-    return _command("armscan.reproduce", run_id)
+    return _command("armscan.reproduce", run_id, tracking=tracking_uri)
 
 
 def report_command(study: str, storage: str) -> str:
     """Returns what one types to see what a study has found."""
     return _command("armscan.report", f"study={study}", storage=storage)
+
+
+def compare_command(run_id: str, tracking_uri: str) -> str:
+    """Returns what one types to compare the trainings below a run."""
+    return _command("armscan.report", f"runs={run_id}", tracking=tracking_uri)
 
 
 def ui_command(*, tracking: str | None = None, storage: str | None = None) -> str:

@@ -170,6 +170,14 @@ def test_reproduce_refuses_what_is_no_run_to_make_again(made, answer):
         client.set_terminated(run_id)
 
 
+@pytest.mark.parametrize("contents", [b"", b"no JSON", b"[]", b"{}", b'{"packages": null}', b"\xff\xfe\x00"])
+def test_reproduce_refuses_a_damaged_record_of_the_environment(made, answer, contents):
+    _, _, run = made
+    with written_otherwise(Path(urlsplit(run.info.artifact_uri).path) / "environment.json", contents):
+        code, _, errors = answer(run.info.run_id, "run=false")
+    assert (code, errors) == (2, f"error: run {run.info.run_id}: its environment.json is damaged, or another file")
+
+
 def test_reproduce_leaves_nothing_where_artifacts_are_read_only(made, answer, made_read_only):
     folder, _, run = made
     with made_read_only(folder / "mlartifacts"):

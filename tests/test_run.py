@@ -138,6 +138,7 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     assert "all runs  python -m armscan.ui\n" in ended.stdout
     tracked = runs_in(tmp_path)[1]
     (parent,) = [each for each in tracked if each.info.run_name.startswith("multirun")]
+    assert f"compare   python -m armscan.report runs={parent.info.run_id}\n" in ended.stdout
     children = [each for each in tracked if each is not parent]
     assert parent.info.status == "FAILED"
     assert parent.data.tags["failure.1"].startswith("obs=cluster env.delta=7: delta is 7")

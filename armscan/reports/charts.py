@@ -16,6 +16,7 @@ from armscan.reports.curves import AXES, Curve
 from armscan.reports.groups import Group
 from armscan.reports.outcomes import judged
 from armscan.training import Figures
+from armscan.volumes.plane import FloatArray
 
 # By figure, axis and number of the group.
 Curves = Mapping[tuple[str, str, int], Curve]
@@ -151,12 +152,17 @@ def _traces(of_axes: Sequence[Curve | None], colour: str) -> Iterator[Trace]:
         yield Trace(
             BANDS, unseen | {"fill": "tonexty", "fillcolor": faint}, [_points(each, "highs") for each in of_axes]
         )
-        thin = {"mode": "lines", "line": {"color": colour, "width": 1}, "opacity": 0.5}
+        thin = {"line": {"color": colour, "width": 1}, "opacity": 0.5}
         for label in curve.lines:
-            said = {"hovertemplate": f"%{{y:.3g}} ({label})"}
+            said = {"mode": _mode(*curve.lines[label][:1]), "hovertemplate": f"%{{y:.3g}} ({label})"}
             yield Trace(SEEDS, thin | said, [_line(each, label) for each in of_axes])
-    thick = {"mode": "lines", "line": {"color": colour, "width": 2.5}, "hovertemplate": "%{text}"}
+    thick = {"mode": _mode(curve.places), "line": {"color": colour, "width": 2.5}, "hovertemplate": "%{text}"}
     yield Trace("", thick, [_points(each, "values") | {"text": _said(each)} for each in of_axes])
+
+
+def _mode(places: FloatArray) -> str:
+    """Returns how a curve is drawn: a line through a single point would be nowhere to be seen."""
+    return "lines" if len(places) > 1 else "lines+markers"
 
 
 def _points(curve: Curve | None, which: str) -> Points:

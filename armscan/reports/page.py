@@ -12,9 +12,11 @@ from typing import Any
 from plotly import graph_objects
 from plotly.offline import get_plotlyjs
 
+from armscan.errors import InvalidValueError
+
 REPORT_FILE = "report.html"
 PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
+<html lang="en"><head><meta charset="utf-8"><meta name="generator" content="armscan"><title>{title}</title>
 <style>
 body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2rem auto; padding: 0 1rem; }}
 table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
@@ -33,6 +35,8 @@ summary {{ cursor: pointer; font-weight: bold; margin: 1.5rem 0; }}
 {body}
 </body></html>
 """
+# By which a report is known.
+MARK, N_MARK_CHARS = '<meta name="generator" content="armscan">', 200
 # Without what leads elsewhere: a button would offer to upload a chart.
 CHART_CONFIG = {"displaylogo": False, "showSendToCloud": False, "plotlyServerURL": ""}
 Row = Mapping[str, Any]
@@ -55,7 +59,11 @@ def write_page(folder: Path, title: str, parts: Sequence[str], tables: Mapping[s
 
     Returns:
         The HTML file.
+
+    Raises:
+        InvalidValueError: if it would replace what is no report's.
     """
+    _check_replaceable(folder, [REPORT_FILE, *(f"{name}.csv" for name in tables)])
     folder.mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():
         _write_csv(folder / f"{name}.csv", rows)
@@ -64,6 +72,25 @@ def write_page(folder: Path, title: str, parts: Sequence[str], tables: Mapping[s
     file = folder / REPORT_FILE
     file.write_text(PAGE.format(title=html.escape(title), plotly=get_plotlyjs(), body=body))
     return file
+
+
+def _check_replaceable(folder: Path, names: Sequence[str]) -> None:
+    """Raises `InvalidValueError` where files of these names are there that are no report's."""
+    if _is_report(folder / REPORT_FILE):
+        return
+    for name in names:
+        if (folder / name).exists():
+            raise InvalidValueError(
+                f"the report would replace {folder / name}, but that is no report's: name another folder by out=FOLDER"
+            )
+
+
+def _is_report(file: Path) -> bool:
+    try:
+        with file.open(errors="replace") as opened:
+            return MARK in opened.read(N_MARK_CHARS)
+    except OSError:
+        return False
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -86,7 +86,7 @@ class FoundRun:
 
     def text(self, file: str, folder: Path) -> str | None:
         """Returns what an artifact says, fetched into `folder`; None where the run has none of this name."""
-        return self._fetched(file, folder).read_text() if file in self.files else None
+        return self._fetched(file, folder).read_text(errors="replace") if file in self.files else None
 
     def _started_with(self, file: str, folder: Path) -> bytes:
         if file not in self.files:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from armscan.files import cache_folder
+from armscan.files import cache_folder, write_whole
 from armscan.tracking.spool import Spool
 
 FOLDER = "undelivered"
@@ -18,7 +19,7 @@ def note(spool: Spool) -> None:
     with contextlib.suppress(OSError):
         file = _note_of(spool)
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(str(spool.file.absolute()))
+        write_whole(file, lambda opened: opened.write(os.fsencode(spool.file.absolute())))
 
 
 def forget(spool: Spool) -> None:
@@ -29,9 +30,9 @@ def forget(spool: Spool) -> None:
 
 def noted() -> Iterator[tuple[Path, Path]]:
     """All notes, with the spools that they are of."""
-    for file in sorted((cache_folder() / FOLDER).glob("*")):
+    for file in sorted((cache_folder() / FOLDER).glob("[!.]*")):
         with contextlib.suppress(OSError):
-            yield file, Path(file.read_text())
+            yield file, Path(os.fsdecode(file.read_bytes()))
 
 
 def _note_of(spool: Spool) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import posixpath
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -41,7 +42,7 @@ def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def name_of(key: str) -> str:
     """Returns a key as MLflow takes it for a name; one that is changed ends with a sum, so that no two become one."""
-    name = REFUSED.sub("_", key).strip(REFUSED_ENDS).replace("//", "/_").replace("..", "._")
+    name = posixpath.normpath(REFUSED.sub("_", key).strip(REFUSED_ENDS).replace("..", "._") or "_")
     if name == key and len(key) <= MAX_KEY_CHARS:
         return key
     return f"{name[: MAX_KEY_CHARS - N_SUM_CHARS - 1]}-{hashlib.sha256(key.encode()).hexdigest()[:N_SUM_CHARS]}"
@@ -51,5 +52,7 @@ def shortened(text: str, at_most: int, whole_in: str) -> str:
     """Returns a text of at most so many characters; one that is cut ends with the file that has all of it."""
     if len(text) <= at_most:
         return text
-    note = f" ... cut: {whole_in} has all {len(text)} characters"
+    # Of two that begin alike, the sums differ.
+    summed = hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()[:N_SUM_CHARS]
+    note = f" ... cut: {whole_in} has all {len(text)} characters ({summed})"
     return text[: at_most - len(note)] + note

@@ -119,7 +119,7 @@ class TrackedRun:
         tracked._add(untagged=FAILURE_TAG)
         tracked.set_tags(dict(tags) | changed | {"resumed": str(n_resumed)})
         tracked.log_config(config)
-        if (diff := source().diff) is not None and f"resumed.{DIFF_SUM}" in changed:
+        if (diff := source().diff) and f"resumed.{DIFF_SUM}" in changed:
             tracked.keep(f"resumed_{n_resumed}_{DIFF_FILE}", diff)
         return tracked
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import functools
+import os
+import shutil
 import subprocess
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +14,12 @@ from pathlib import Path
 from armscan.files import sum_of
 
 UNKNOWN = "unknown"
-# What git says of files that nobody has added is kept up to this size each: code, and not a volume beside it.
+# Files that nobody has added to git are kept up to this size each: code, and not a volume beside it.
 MAX_UNTRACKED_BYTES = 2**20
 COMMIT, DIRTY, DIFF_SUM = "git.commit", "git.dirty", "git.diff.sha256"
+# Whatever a person has configured for their own eyes would be in the way of `git apply`.
+PLAIN = ("--no-ext-diff", "--no-textconv", "--no-color", "--binary", "--src-prefix=a/", "--dst-prefix=b/")
+TIMEOUT_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -22,7 +28,7 @@ class Source:
 
     Args:
         commit: of git, `unknown` where the code is under no git.
-        diff: what was changed since, as `git apply` takes it; None where nothing was, or the code is under no git.
+        diff: what was changed since, as `git apply` takes it, empty where nothing was; None where nobody knows.
     """
 
     commit: str
@@ -31,10 +37,10 @@ class Source:
     @property
     def tags(self) -> dict[str, str]:
         """What is tracked of it."""
-        if self.commit == UNKNOWN:
-            return {COMMIT: UNKNOWN, DIRTY: UNKNOWN}
-        tags = {COMMIT: self.commit, "mlflow.source.git.commit": self.commit, DIRTY: str(self.diff is not None).lower()}
-        return tags if self.diff is None else tags | {DIFF_SUM: sum_of(self.diff)}
+        known = {} if self.commit == UNKNOWN else {"mlflow.source.git.commit": self.commit}
+        dirty = UNKNOWN if self.diff is None else str(bool(self.diff)).lower()
+        summed = {DIFF_SUM: sum_of(self.diff)} if self.diff else {}
+        return {COMMIT: self.commit, **known, DIRTY: dirty, **summed}
 
 
 @functools.cache
@@ -49,36 +55,48 @@ def source_tags() -> Mapping[str, str]:
 
 
 def source_in(folder: Path) -> Source:
-    """Returns the state of the working tree that a folder is in."""
-    commit, top = (_git(folder, "rev-parse", *what) for what in (("HEAD",), ("--show-toplevel",)))
-    if commit is None or top is None:
-        return Source(UNKNOWN, None)
-    tree = Path(top.decode().strip())
-    # Whatever a person has configured for their own eyes would be in the way of `git apply`.
-    plain = ("--no-ext-diff", "--no-textconv", "--no-color", "--binary", "--src-prefix=a/", "--dst-prefix=b/")
-    diff = _git(tree, "diff", *plain, "HEAD") or b""
-    for name in (_git(tree, "ls-files", "--others", "--exclude-standard", "-z") or b"").split(b"\0"):
-        if name:
-            diff += _added(tree, name.decode(errors="surrogateescape"), plain)
-    return Source(commit.decode().strip(), diff or None)
-
-
-def _added(tree: Path, name: str, plain: tuple[str, ...]) -> bytes:
-    """Returns the diff of a file that nobody has added to git."""
-    file = tree / name
+    """Returns the state of the working tree that a folder with code is in."""
     try:
-        size = file.stat().st_size
-    except OSError:
-        return b""
-    if size > MAX_UNTRACKED_BYTES:
-        return f"# not kept, with {size} bytes: {name!r}\n".encode()
-    # That two files differ is an exit code of 1.
-    return _git(tree, "diff", "--no-index", *plain, "--", "/dev/null", name, allowed=(0, 1)) or b""
-
-
-def _git(folder: Path, *arguments: str, allowed: tuple[int, ...] = (0,)) -> bytes | None:
-    try:
-        answer = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, timeout=30, check=False)
+        # Packages that are installed somewhere in the tree of another project are none of that project's code.
+        if not _git(folder, "ls-files", "--", "."):
+            return Source(UNKNOWN, None)
+        commit = _git(folder, "rev-parse", "HEAD").decode().strip()
     except (OSError, subprocess.SubprocessError):
-        return None
-    return answer.stdout if answer.returncode in allowed else None
+        return Source(UNKNOWN, None)
+    try:
+        return Source(commit, _diff(Path(os.fsdecode(_git(folder, "rev-parse", "--show-toplevel")).rstrip("\n"))))
+    except (OSError, subprocess.SubprocessError):
+        return Source(commit, None)
+
+
+def _diff(tree: Path) -> bytes:
+    """Returns all that differs from the commit in a working tree, new files included; changes nothing."""
+    new = [name for name in _git(tree, "ls-files", "--others", "--exclude-standard", "-z").split(b"\0") if name]
+    kept = [name for name in new if (tree / os.fsdecode(name)).lstat().st_size <= MAX_UNTRACKED_BYTES]
+    told = "".join(f"# not kept, for its size: {os.fsdecode(name)!r}\n" for name in new if name not in kept).encode()
+    with tempfile.TemporaryDirectory() as beside:
+        # New files are in a diff where they are about to be added: in an index of its own, a copy.
+        index = Path(beside, "index")
+        shutil.copyfile(tree / os.fsdecode(_git(tree, "rev-parse", "--git-path", "index")).rstrip("\n"), index)
+        if kept:
+            words = ("add", "--intent-to-add", "--force", "--pathspec-from-file=-", "--pathspec-file-nul")
+            _git(tree, "--literal-pathspecs", *words, index=index, given=b"\0".join(kept))
+        return told + _git(tree, "diff", *PLAIN, "HEAD", index=index)
+
+
+def _git(folder: Path, *arguments: str, index: Path | None = None, given: bytes = b"") -> bytes:
+    """Returns what git answers, given something to read.
+
+    Raises:
+        OSError: if there is no git.
+        SubprocessError: if it fails.
+    """
+    # A hook of another repository would have its say here.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    if index is not None:
+        environment["GIT_INDEX_FILE"] = str(index)
+    words = ["git", *arguments]
+    answer = subprocess.run(
+        words, cwd=folder, input=given, capture_output=True, timeout=TIMEOUT_S, check=True, env=environment
+    )
+    return answer.stdout

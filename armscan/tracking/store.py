@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import sqlite3
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -32,6 +33,8 @@ from armscan.tracking.client import TrackingStore, reason_in
 
 EXAMPLES = {"uri": "sqlite:///mlruns.db", "experiment": "armscan", "artifacts": "mlartifacts"}
 LOCK_TIMEOUT_S = 120
+# What MLflow takes of the name of an experiment, and of its place of artifacts.
+MAX_TEXT_CHARS, N_SHOWN_CHARS = 500, 40
 # Where there is no configuration that says it.
 USUAL_WAIT_S = 120.0
 # A server that is away should be said to be away within seconds, not after minutes of retries.
@@ -107,12 +110,29 @@ def open_existing_store(uri: str) -> TrackingStore:
     if uri.startswith(SQLITE_PREFIX):
         database = sqlite_file(uri)
         if not database.is_file():
-            raise TrackingError(f"tracking.uri is {uri!r}, but there is no {database}; give the one that the run is in")
+            raise TrackingError(
+                f"tracking.uri is {uri!r}, but there is no {database}; nothing is tracked there yet; name another store, or start a run"
+            )
+        _check_is_store(uri, database)
         uri = f"{SQLITE_PREFIX}{database}"
     with usable_store(uri):
         store = _store(uri, wait_s=USUAL_WAIT_S, system_metrics_s=None, patience_s=None)
         store.search_experiments(max_results=1)
         return store
+
+
+def _check_is_store(uri: str, database: Path) -> None:
+    """Raises `TrackingError` where a database holds something else, into which MLflow would write its own tables."""
+    wanted = "SELECT count(*) FROM sqlite_master WHERE name IN ('alembic_version', 'experiments', 'runs')"
+    try:
+        with contextlib.closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as connection:
+            (n_found,) = connection.execute(wanted).fetchone()
+    except sqlite3.Error as error:
+        raise TrackingError(f"tracking.uri is {uri!r}, but this store cannot be used: {error}") from error
+    if n_found < 3:
+        raise TrackingError(
+            f"tracking.uri is {uri!r}, but {database} is no store of MLflow: give the one with the runs"
+        )
 
 
 def _store(uri: str, *, wait_s: float, system_metrics_s: float | None, patience_s: float | None) -> TrackingStore:
@@ -136,6 +156,11 @@ def _check_texts(**values: object) -> None:
     for name, value in values.items():
         if not isinstance(value, str) or not value.strip() or value == SQLITE_PREFIX:
             raise TrackingError(f"tracking.{name} is {value!r}, but it must be a text such as {EXAMPLES[name]!r}")
+        if len(value) > MAX_TEXT_CHARS:
+            raise TrackingError(
+                f"tracking.{name} begins with {value[:N_SHOWN_CHARS]!r} and has {len(value)} characters, but it must "
+                f"have at most {MAX_TEXT_CHARS}"
+            )
 
 
 def _check_address(uri: str) -> None:
@@ -147,7 +172,7 @@ def _check_address(uri: str) -> None:
         raise TrackingError(f"tracking.uri is {without_password(uri)!r}, but that is no address of a server")
 
 
-@contextmanager
+@contextlib.contextmanager
 def usable_store(uri: str) -> Iterator[None]:
     """What a store is used in: it answers in time and quietly, and what goes wrong is a `TrackingError` of one line."""
     for name, value in DEFAULTS.items():

@@ -112,8 +112,8 @@ def _deliver_leftovers(store: TrackingStore) -> None:
         except FolderInUseError:
             # Its run goes on, and delivers for itself.
             continue
-        except (OSError, TrackingError):
-            # Removed with its folder, or damaged, which `armscan.track sync` tells whoever asks.
+        except (OSError, ValueError, TrackingError):
+            # Removed with its folder, or damaged, the note or the spool, which `armscan.track sync` tells whoever asks.
             note.unlink(missing_ok=True)
             continue
         with contextlib.closing(spool):

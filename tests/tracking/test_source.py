@@ -1,6 +1,7 @@
 """The state of the code, in real git repositories."""
 
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -22,6 +23,7 @@ def repository(tmp_path):
     folder.mkdir()
     git(folder, "init", "--quiet")
     (folder / "inner").mkdir()
+    (folder / "inner" / "code.py").write_text("inner\n")
     for name in NAMES:
         (folder / name).write_bytes(b"one\ntwo\n" if name.endswith("py") else bytes(range(256)))
     (folder / ".gitignore").write_text("ignored\n")
@@ -37,7 +39,7 @@ def contents(folder):
 
 def test_source_of_a_clean_tree_is_its_commit_alone(repository):
     found = source_in(repository / "inner")
-    assert found.diff is None
+    assert found.diff == b""
     commit = git(repository, "rev-parse", "HEAD")
     assert found.tags == {"git.commit": commit, "mlflow.source.git.commit": commit, "git.dirty": "false"}
 
@@ -68,13 +70,54 @@ def test_source_keeps_every_change_so_that_it_can_be_applied_again(repository, t
 def test_source_names_new_files_that_are_too_large_and_leaves_ignored_ones_out(repository, tmp_path):
     (repository / "volume.nii").write_bytes(b"x" * (MAX_UNTRACKED_BYTES + 1))
     (repository / "ignored").write_text("nothing\n")
-    diff = source_in(repository).diff
-    assert diff == f"# not kept, with {MAX_UNTRACKED_BYTES + 1} bytes: 'volume.nii'\n".encode()
+    assert source_in(repository).diff == b"# not kept, for its size: 'volume.nii'\n"
 
 
-def test_source_without_git_is_unknown(tmp_path, monkeypatch):
+def test_source_keeps_new_files_of_odd_names_and_links(repository, tmp_path):
+    for name in ("-", "a b", "*", ":(top)x", "\n", "ü"):
+        (repository / name).write_text("new\n")
+    (repository / "broken").symlink_to("nowhere")
+    (repository / "to_folder").symlink_to("inner")
+    found = source_in(repository)
+    clone = tmp_path / "clone"
+    git(tmp_path, "clone", "--quiet", str(repository), str(clone))
+    (tmp_path / "code.diff").write_bytes(found.diff)
+    git(clone, "apply", str(tmp_path / "code.diff"))
+    assert contents(clone) == contents(repository)
+    assert [(clone / name).readlink() for name in ("broken", "to_folder")] == [Path("nowhere"), Path("inner")]
+
+
+@pytest.mark.parametrize("damaged", ["index", "objects"])
+def test_source_that_git_cannot_compare_is_not_taken_for_clean(repository, damaged):
+    commit = git(repository, "rev-parse", "HEAD")
+    if damaged == "index":
+        (repository / ".git" / "index").write_bytes(b"nonsense")
+        assert source_in(repository).tags["git.dirty"] == "unknown"
+        return
+    tree = git(repository, "rev-parse", "HEAD^{tree}")
+    (repository / ".git" / "objects" / tree[:2] / tree[2:]).unlink()
+    assert source_in(repository).tags == {
+        "git.commit": commit,
+        "mlflow.source.git.commit": commit,
+        "git.dirty": "unknown",
+    }
+
+
+def test_source_is_that_of_its_own_repository_whatever_the_environment_names(repository, tmp_path, monkeypatch):
+    (other := tmp_path / "other").mkdir()
+    git(other, "init", "--quiet")
+    commit = git(repository, "rev-parse", "HEAD")
+    monkeypatch.setenv("GIT_DIR", str(other / ".git"))
+    assert source_in(repository).commit == commit
+
+
+def test_source_without_git_is_unknown(repository, tmp_path, monkeypatch):
     (tmp_path / "bare").mkdir()
-    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path))
-    assert source_in(tmp_path / "bare").tags == {"git.commit": "unknown", "git.dirty": "unknown"}
+    unknown = {"git.commit": "unknown", "git.dirty": "unknown"}
+    assert source_in(tmp_path / "bare").tags == unknown
+    # Of a package that lies in the tree of another project, nobody has added anything there.
+    (installed := repository / ".venv" / "armscan").mkdir(parents=True)
+    (installed / "code.py").write_text("installed\n")
+    assert source_in(installed).tags == unknown
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert source_in(tmp_path / "bare").diff is None
+    assert source_in(repository).tags == unknown

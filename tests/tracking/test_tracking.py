@@ -1,6 +1,8 @@
 """Runs in MLflow, on a real SQLite store."""
 
+import contextlib
 import json
+import sqlite3
 import subprocess
 import sys
 import time
@@ -185,6 +187,25 @@ def test_store_whose_artifacts_cannot_be_written_is_refused_before_anything_is_m
     (tmp_path / "artifacts").write_text("no folder")
     with pytest.raises(TrackingError, match=r"the artifacts of runs lie in .*artifacts, as their experiment"):
         open_store(uri, experiment="other", artifacts="elsewhere", wait_s=60.0)
+
+
+def test_existing_store_is_not_made_of_a_database_with_something_else(tmp_path):
+    other, empty = tmp_path / "other.db", tmp_path / "empty.db"
+    with contextlib.closing(sqlite3.connect(other)) as connection:
+        connection.execute("CREATE TABLE runs (mine)")
+        connection.commit()
+    empty.touch()
+    for database in (other, empty):
+        before = database.read_bytes()
+        with pytest.raises(TrackingError, match=f"{database} is no store of MLflow: give the one with the runs"):
+            open_existing_store(f"sqlite:///{database}")
+        assert database.read_bytes() == before
+
+
+def test_experiment_of_a_name_that_is_too_long_is_refused_before_anything_is_made(tmp_path):
+    with pytest.raises(TrackingError, match="has 20000 characters, but it must have at most 500"):
+        open_store(f"sqlite:///{tmp_path}/runs.db", experiment="x" * 20_000, artifacts="artifacts", wait_s=60.0)
+    assert not any(tmp_path.iterdir())
 
 
 def test_store_with_read_only_artifacts_is_refused(tmp_path, made_read_only):
