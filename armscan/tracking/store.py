@@ -111,7 +111,7 @@ def open_existing_store(uri: str) -> TrackingStore:
         database = sqlite_file(uri)
         if not database.is_file():
             raise TrackingError(
-                f"tracking.uri is {uri!r}, but there is no {database}: no run was tracked there; name the store they are in"
+                f"tracking.uri is {uri!r}, but there is no {database}: no run was tracked there; name another store"
             )
         _check_is_store(uri, database)
         uri = f"{SQLITE_PREFIX}{database}"
