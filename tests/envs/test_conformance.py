@@ -1,5 +1,6 @@
 """The environment as strangers use it: Gymnasium's checker, its registry and wrappers, another training library."""
 
+import gc
 import pickle
 import warnings
 
@@ -76,6 +77,8 @@ class Presented(gym.Env):
 @pytest.fixture(autouse=True)
 def no_warnings():
     """Every warning is an error, Gymnasium's own, which go through `warnings`, included."""
+    # What other tests have left open is told when it is collected, and would be told in the middle of these.
+    gc.collect()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from armscan.experiment import place_tags
 from armscan.files import CONFIG_FILE, SUM_TAGS, sum_of
+from armscan.provenance import place_tags
 from armscan.tracking import TrackedRun, open_store
 
 HOLDER = """

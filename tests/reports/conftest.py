@@ -44,10 +44,11 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setenv("HYDRA_FULL_ERROR", "0")
         for agent, words in AGENTS.items():
             for seed in range(3):
                 patch.setattr(sys, "argv", ["armscan.run", f"agent={agent}", f"seed={seed}", *words, *SMALL])
+                # The command sets it, and would take it for a person's wish the next time.
+                patch.setenv("HYDRA_FULL_ERROR", "0")
                 GlobalHydra.instance().clear()
                 assert run.main() == 0
     return Runs(folder)

@@ -163,7 +163,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
         (["-m", "sweeps=sac_y", "study.seeds=0,1"], "'study.seeds=0,1' gives several values, but a study has one"),
         (
             ["-m", "sweeps=sac_y", "+tracking.foo=1"],
-            "there is no key 'foo' in tracking, but only uri, experiment, artifacts or",
+            "there is no key 'foo' in tracking, but only uri, experiment, artifacts, wait_s,",
         ),
         (["-m", "sweeps=sac_y", "study.folder=/dev/null"], "study.folder is '/dev/null', but '/dev/null' is no folder"),
         (["-m", "sweeps=sac_y", "study.artifacts=/dev/null/a"], "study.artifacts is '/dev/null/a', but '/dev/null' is"),
