@@ -358,6 +358,7 @@ class GuesserOfAnything(Guesser):
 
 def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
     run_id = tracked(tmp_path)
+    (tmp_path / "a.json").mkdir()
     words_and_lines = [
         ([], "run is not set, but it must be: give run=ID, or agent=NAME"),
         ([f"run={run_id}", "agent=sac"], "run and agent are both given"),
