@@ -14,7 +14,7 @@ episodes=200        for each split, in turn on its volumes
 seed=0              of the episodes; the same one gives every agent the same ones
 delta=0.01          end episodes above -delta; likewise max_steps=50, start=random, clustering=metric
 judged_by_sampling=true    let the policy act as it explores; device=cpu: compute there
-out=FILE            the figures and episodes as JSON, where nothing is said in evaluations/; only such is replaced
+out=FILE.json       the figures and episodes as JSON, where nothing is said in evaluations/; only such is replaced
 tracking=URI        the store, MLFLOW_TRACKING_URI or sqlite:///mlruns.db where nothing is said
 tracking_experiment=armscan   with agent=NAME: of MLflow, that the evaluation is tracked in; otherwise the run's
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from armscan.judging import Judgement
     from armscan.judging.volumes import Volumes
 
-FOLDER = Path("evaluations")
+FOLDER, SUFFIX = Path("evaluations"), ".json"
 # What the JSON of every evaluation holds.
 KEYS_OF_A_REPORT = {"of", "name", "splits", "volumes", "episodes", "tracked_as"}
 
@@ -124,6 +124,8 @@ def _tracked(request: Request, applied: Applied) -> tuple[Judgement, Path]:
 def _check_out(out: Path | None) -> None:
     """Writes where the JSON file will lie, before an evaluation that may take hours is played for it."""
     file = out or FOLDER / "evaluation.json"
+    if file.suffix != SUFFIX:
+        raise InvalidValueError(f"out is {str(file)!r}, but it must be a file whose name ends with {SUFFIX}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         check_writable(file)

@@ -45,11 +45,13 @@ def _run(words: Sequence[str]) -> int:
 
 def _export(tracking: str, run: str, out: Path) -> None:
     # Deferred: a mistake on the command line should be answered before these are loaded.
-    from armscan.policies.model import is_model
+    from armscan.policies.model import is_model, others_in
     from armscan.policies.registry import export_policy
 
     if out.exists() and not is_model(out):
         raise InvalidValueError(f"out is {str(out)!r}, but something else is there, and would be lost: name another")
+    if out.exists() and (others := others_in(out)):
+        raise InvalidValueError(f"out is {str(out)!r}, but {others[0]!r} is in it, and would be lost: name another")
     export_policy(tracking, run, out)
     print(f"exported   {out}")
     _tell_how_to_use(str(out))

@@ -358,6 +358,7 @@ class GuesserOfAnything(Guesser):
 
 def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
     run_id = tracked(tmp_path)
+    (tmp_path / "a.json").mkdir()
     words_and_lines = [
         ([], "run is not set, but it must be: give run=ID, or agent=NAME"),
         ([f"run={run_id}", "agent=sac"], "run and agent are both given"),
@@ -401,10 +402,17 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
             [f"run={run_id}", "episodes=1", "out=/proc/x.json"],
             "out is '/proc/x.json', but no file can be written there: ",
         ),
-        ([f"run={run_id}", "episodes=1", "out=."], "out is '.', but no file can be written there: Is a directory"),
+        (
+            [f"run={run_id}", "episodes=1", "out=a.json"],
+            "out is 'a.json', but no file can be written there: Is a directory",
+        ),
         *(
-            ([f"run={run_id}", "episodes=1", f"out={name}"], f"out is '{name}', but that file is no evaluation, and")
-            for name in ("config.yaml", "volumes.json")
+            ([f"run={run_id}", "episodes=1", f"out={name}"], f"out is '{name}', but it must be a file whose name ends")
+            for name in (".", "config.yaml", "new/figures.txt")
+        ),
+        (
+            [f"run={run_id}", "episodes=1", "out=volumes.json"],
+            "out is 'volumes.json', but that file is no evaluation, and",
         ),
         (["agent=nobody"], "agent is 'nobody', but it must be "),
         (["agent=sac", *FEW], "sac has to be trained first: give run=ID"),

@@ -1,6 +1,8 @@
 """The command that exports and registers policies, as a person types it, on real tracked runs."""
 
 import json
+import logging
+import shutil
 
 import mlflow.pyfunc
 import numpy as np
@@ -10,6 +12,8 @@ from mlflow import MlflowClient
 from armscan import evaluate, policy
 from armscan.files import BEST_CHECKPOINT
 from armscan.policies.card import MAX_CHARS
+from armscan.policies.making import SUM_TAG
+from armscan.policies.model import sum_of_model
 from armscan.tracking import EVALUATED_TAG
 from armscan.training import load_checkpoint, save_checkpoint
 
@@ -61,6 +65,14 @@ def test_policy_of_an_earlier_run_is_exported_from_its_checkpoint(answer, tmp_pa
     # A model of ours is replaced.
     assert answer("export", f"run={run_id}", "out=models/mine")[0] == 0
     assert [path.name for path in (tmp_path / "models").iterdir()] == ["mine"]
+    # What else lies in its folder is not.
+    (tmp_path / "models" / "mine" / "notes.txt").write_text("precious")
+    assert answer("export", f"run={run_id}", "out=models/mine") == (
+        2,
+        "",
+        "error: out is 'models/mine', but 'notes.txt' is in it, and would be lost: name another",
+    )
+    assert (tmp_path / "models" / "mine" / "notes.txt").read_text() == "precious"
 
 
 def test_policy_is_registered_with_the_figures_of_its_run(answer, tmp_path):
@@ -182,15 +194,92 @@ def test_damaged_checkpoint_is_told_and_changes_nothing(answer, tmp_path):
     assert "policy" not in {file.path for file in client.list_artifacts(run_id)}
 
 
-def test_damaged_model_of_a_run_is_not_registered(answer, tmp_path):
-    run_id = tracked(tmp_path)
-    assert answer("export", f"run={run_id}", "out=policy")[0] == 0
-    program = tmp_path / "policy" / "artifacts" / "policy.pt2"
+def registered(answer, folder, *words):
+    """A run whose policy is registered: its id, and the folder of the model among its artifacts."""
+    run_id = tracked(folder, *words)
+    assert answer("register", f"run={run_id}", "name=n")[0] == 0
+    return run_id, folder / "artifacts" / run_id / "artifacts" / "policy"
+
+
+def versions_in(folder):
+    return [version.run_id for version in store_of(folder).search_model_versions("name='n'")]
+
+
+def test_policy_of_another_run_is_not_registered_in_the_place_of_the_kept_one(answer, tmp_path):
+    run_id, model = registered(answer, tmp_path)
+    _, another = registered(answer, tmp_path, "projection=zy")
+    before, whole = versions_in(tmp_path), tmp_path / "whole"
+    shutil.copytree(model, whole)
+    line = f"error: run {run_id}: its policy/ is not the one that it has kept: changed, or another run's; remove it "
+
+    def is_refused():
+        code, _, errors = answer("register", f"run={run_id}", "name=n")
+        return code == 2 and errors.startswith(line) and len(errors.splitlines()) == 1
+
+    for name in ("artifacts/policy.pt2", "policy.onnx", "MLmodel"):
+        shutil.copy(another / name, model / name)
+        assert is_refused(), name
+        shutil.copy(whole / name, model / name)
+    (model / "artifacts" / "policy.pt2").unlink()
+    assert is_refused()
+    shutil.copytree(another, model, dirs_exist_ok=True)
+    assert is_refused()
+    store_of(tmp_path).set_tag(run_id, SUM_TAG, sum_of_model(model))
+    assert is_refused()
+    assert versions_in(tmp_path) == before
+
+    # As earlier versions have left it: nothing says that it is the one that was kept.
+    store_of(tmp_path).delete_tag(run_id, SUM_TAG)
+    assert answer("register", f"run={run_id}", "name=n")[0] == 0
+    assert mlflow.pyfunc.load_model("models:/n/3").metadata.metadata["run"] == run_id
+    assert store_of(tmp_path).get_run(run_id).data.tags[SUM_TAG] == sum_of_model(model)
+
+
+def test_model_that_does_not_answer_is_not_registered_and_only_one_line_told(answer, tmp_path, caplog):
+    run_id, model = registered(answer, tmp_path)
+    program = model / "artifacts" / "policy.pt2"
     program.write_bytes(program.read_bytes()[:1000])
-    client = store_of(tmp_path)
-    client.log_artifacts(run_id, str(tmp_path / "policy"), "policy")
-    code, _, errors = answer("register", f"run={run_id}", "name=n")
+    store_of(tmp_path).set_tag(run_id, SUM_TAG, sum_of_model(model))
+    torchs = logging.getLogger("torch.export")
+    torchs.addHandler(caplog.handler)
+    try:
+        code, _, errors = answer("register", f"run={run_id}", "name=n")
+    finally:
+        torchs.removeHandler(caplog.handler)
     assert code == 2
     assert errors.startswith(f"error: run {run_id}: its policy/ is damaged, it does not answer its own example: ")
     assert len(errors.splitlines()) == 1
+    assert [record for record in caplog.records if record.name == "torch.export"] == []
+    assert len(versions_in(tmp_path)) == 1
+
+
+def test_policy_is_not_registered_with_a_damaged_evaluation(answer, tmp_path):
+    run_id, model = registered(answer, tmp_path)
+    for damaged in ('{"a": 1}', "{}"):
+        (model.parent / "evaluation.json").write_text(damaged)
+        line = f"error: run {run_id}: its evaluation.json is damaged; put it back, or remove it"
+        assert answer("register", f"run={run_id}", "name=n") == (2, "", line)
+    assert len(versions_in(tmp_path)) == 1
+
+
+@pytest.mark.parametrize(
+    ("part", "beginning"),
+    [
+        ("", "the artifacts of runs lie in "),
+        # Which is met when the model is there already.
+        ("{run_id}/artifacts", "tracking.uri is 'sqlite:///"),
+    ],
+    ids=["all", "the run's"],
+)
+def test_policy_is_not_registered_where_artifacts_are_read_only(answer, tmp_path, made_read_only, part, beginning):
+    run_id = tracked(tmp_path)
+    with made_read_only(tmp_path / "artifacts" / part.format(run_id=run_id)):
+        code, printed, errors = answer("register", f"run={run_id}", "name=n")
+    assert (code, printed) == (2, "")
+    assert errors.startswith(f"error: {beginning}{tmp_path}/")
+    assert errors.endswith(": Read-only file system")
+    assert len(errors.splitlines()) == 1
+    client = store_of(tmp_path)
     assert client.search_registered_models() == []
+    assert not {"policy", SUM_TAG} & client.get_run(run_id).data.tags.keys()
+    assert "policy" not in {file.path for file in client.list_artifacts(run_id)}

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from armscan.errors import TrackingError
+from armscan.errors import InvalidValueError, TrackingError
 from armscan.judging import Judgement
 from armscan.judging.report import REFUSED_BY_MLFLOW, figures_in_markdown
 from armscan.settings import evaluate_command
 from armscan.tracking import EVALUATED_TAG, FoundRun
 from armscan.tracking.run import EVALUATION_FILE
 from armscan.training import Evaluation
-from armscan.training.evaluation import Episode
 
 # What MLflow's databases take of a description.
 MAX_CHARS = 5000
@@ -36,7 +35,7 @@ class Card:
 
     @classmethod
     def of(cls, run: FoundRun, folder: Path) -> Self:
-        """Returns the card of a run's policy: of the run's own evaluation, and of the latest by `armscan.evaluate`.
+        """Returns the card of a run's policy, of its own evaluation and the latest by `armscan.evaluate` with a JSON.
 
         Args:
             run: the run.
@@ -63,42 +62,54 @@ def _judgements(run: FoundRun, folder: Path) -> dict[str, Judgement]:
     """Returns the evaluations of a run by their titles, its own first."""
     judgements = {}
     if EVALUATION_FILE in run.files:
-        own = {label: each["episodes"] for label, each in _read(run, run.run_id, EVALUATION_FILE, folder).items()}
-        judgements["at the end of the run"] = _judgement(own, run.run_id, has_total=False)
+        judgements["at the end of the run"] = _read(run, run.run_id, EVALUATION_FILE, folder, _own)
+    if (latest := _latest(run)) is not None:
+        run_id, file = latest
+        judgement = _read(run, run_id, file, folder, _by_command)
+        changes = "".join(f", {key}={value}" for key, value in judgement.facts["changes"].items())
+        judgements[f"by evaluation {run_id}, on {judgement.facts['data']}{changes}"] = judgement
+    return judgements
+
+
+def _latest(run: FoundRun) -> tuple[str, str] | None:
+    """Returns the latest evaluation of a run that has kept its JSON: the id of its own run, and the file."""
     found = run.client.search_runs(
         [run.experiment_id],
         f"tags.`{EVALUATED_TAG}` = '{run.run_id}' and attributes.status = 'FINISHED'",
         order_by=["attributes.start_time DESC"],
-        max_results=1,
     )
     for evaluation in found:
-        run_id = evaluation.info.run_id
-        files = [artifact.path for artifact in run.client.list_artifacts(run_id) if artifact.path.endswith(".json")]
-        for file in files[:1]:
-            facts = _read(run, run_id, file, folder)
-            changes = "".join(f", {key}={value}" for key, value in facts["changes"].items())
-            judgements[f"by evaluation {run_id}, on {facts['data']}{changes}"] = _judgement(
-                facts["episodes"], run_id, has_total=facts["data"] != "own volumes"
-            )
-    return judgements
+        for artifact in run.client.list_artifacts(evaluation.info.run_id):
+            if artifact.path.endswith(".json") and not artifact.is_dir:
+                return evaluation.info.run_id, artifact.path
+    return None
 
 
-def _read(run: FoundRun, run_id: str, file: str, folder: Path) -> dict[str, Any]:
+def _read(run: FoundRun, run_id: str, file: str, folder: Path, understand: Callable[[Any], Judgement]) -> Judgement:
+    contents = Path(run.client.download_artifacts(run_id, file, str(folder))).read_bytes()
     try:
-        contents = json.loads(Path(run.client.download_artifacts(run_id, file, str(folder))).read_bytes())
-    except ValueError as error:
-        raise TrackingError(f"run {run_id}: its {file} is damaged") from error
-    if not isinstance(contents, dict):
-        raise TrackingError(f"run {run_id}: its {file} holds no evaluation")
-    return contents
+        return understand(json.loads(contents))
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise TrackingError(f"run {run_id}: its {file} is damaged; put it back, or remove it") from error
 
 
-def _judgement(episodes: Mapping[str, Any], run_id: str, *, has_total: bool) -> Judgement:
-    try:
-        evaluations = {label: Evaluation(tuple(Episode(**each) for each in some)) for label, some in episodes.items()}
-    except TypeError as error:
-        raise TrackingError(f"run {run_id}: its evaluation is none that this version of armscan reads") from error
-    return Judgement(evaluations, has_total=has_total, facts={})
+def _own(contents: Any) -> Judgement:
+    return _judgement({label: each["episodes"] for label, each in contents.items()}, has_total=False, facts={})
+
+
+def _by_command(contents: Any) -> Judgement:
+    data, changes = contents["data"], contents["changes"]
+    if not isinstance(data, str) or not isinstance(changes, dict):
+        raise InvalidValueError(f"the data are {data!r} and the changes {changes!r}, but that is no text or no dict")
+    is_foreign = data != "own volumes"
+    return _judgement(contents["episodes"], has_total=is_foreign, facts={"data": data, "changes": changes})
+
+
+def _judgement(episodes: Mapping[str, object], *, has_total: bool, facts: Mapping[str, Any]) -> Judgement:
+    evaluations = {label: Evaluation.of_plain(some) for label, some in episodes.items()}
+    if not evaluations or not all(evaluation.episodes for evaluation in evaluations.values()):
+        raise InvalidValueError("there are no episodes, but each group of volumes must have some")
+    return Judgement(evaluations, has_total=has_total, facts=facts)
 
 
 def _tags(judgement: Judgement) -> dict[str, str]:

@@ -20,7 +20,7 @@ from armscan.agents.policy import Policy, batch_of
 from armscan.envs.task import Observed
 from armscan.errors import ExportError, is_interruption
 from armscan.files import CONFIG_FILE
-from armscan.policies.model import ONNX_FILE, Arrays, arrays_of, write_model
+from armscan.policies.model import ONNX_FILE, Arrays, arrays_of, sum_of_model, write_model
 from armscan.tracking import TrackedRun
 from armscan.tracking.client import reason_in
 from armscan.training.evaluation import Env
@@ -29,6 +29,8 @@ from armscan.volumes.plane import FloatArray
 # The folder of the model, in that of its run and among its artifacts, and the run's tag that says whether there is one.
 POLICY_FOLDER, POLICY_TAG = "policy", "policy"
 KEPT = "kept"
+# The run's tag with the sum of the model, by which another one in its place is known.
+SUM_TAG = "policy.sha256"
 # How far the model may be from the learner, and ONNX from the model.
 TOLERANCE, ONNX_TOLERANCE = 1e-6, 1e-5
 # First seed of the episode that the observations are from, above those of all episodes that count; and how many.
@@ -61,7 +63,12 @@ def keep_policy(agent: Learner, env: Env, tracked: TrackedRun, folder: Path, tel
         tracked.set_tags({POLICY_TAG: f"not kept: {error}"})
     else:
         tracked.log_folder(model)
-        tracked.set_tags({POLICY_TAG: KEPT})
+        tracked.set_tags(tags_of_kept(model))
+
+
+def tags_of_kept(folder: Path) -> dict[str, str]:
+    """Returns the tags of a run that keeps the model in this folder."""
+    return {SUM_TAG: sum_of_model(folder), POLICY_TAG: KEPT}
 
 
 def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any]) -> None:

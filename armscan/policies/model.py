@@ -18,10 +18,23 @@ from numpy.typing import NDArray
 
 from armscan.agents.export import exported, save_onnx, save_program
 from armscan.agents.policy import Batch, Policy
+from armscan.files import sum_of
 from armscan.tracking.run import MODEL_FILE
 
 PROGRAM_FILE, ONNX_FILE = "policy.pt2", "policy.onnx"
 CODE = Path(__file__).with_name("served.py")
+# All that a model consists of, by their places in its folder.
+FILES = (
+    MODEL_FILE,
+    f"artifacts/{PROGRAM_FILE}",
+    "conda.yaml",
+    "input_example.json",
+    ONNX_FILE,
+    "python_env.yaml",
+    "requirements.txt",
+    CODE.name,
+    "serving_input_example.json",
+)
 # What the code needs; others come with these.
 REQUIREMENTS = ("mlflow", "numpy", "torch")
 # As the model takes them: one array of shape (n, k), or the parts by their names, each of shape (n, ...).
@@ -63,6 +76,18 @@ def is_model(folder: Path) -> bool:
         return "armscan" in said["metadata"]
     except (OSError, yaml.YAMLError, TypeError, KeyError):
         return False
+
+
+def others_in(folder: Path) -> list[str]:
+    """Returns what lies in the folder of a model and is no part of one."""
+    found = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+    return sorted(found - {*FILES, *(str(Path(file).parent) for file in FILES)})
+
+
+def sum_of_model(folder: Path) -> str:
+    """Returns the SHA-256 of a model: of the sums of its files, each with its place, as `sha256sum` writes them."""
+    files = [name for name in FILES if (folder / name).is_file()]
+    return sum_of("".join(f"{sum_of((folder / name).read_bytes())}  {name}\n" for name in files).encode())
 
 
 def arrays_of(batch: Batch) -> Arrays:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 from functools import cache, partial
 from pathlib import Path
@@ -14,9 +15,10 @@ from armscan.agents import Learner
 from armscan.errors import ExportError, InvalidValueError
 from armscan.judging import Subject
 from armscan.policies.card import Card
-from armscan.policies.making import KEPT, POLICY_FOLDER, POLICY_TAG, facts_of, make_model
+from armscan.policies.making import POLICY_FOLDER, SUM_TAG, facts_of, make_model, tags_of_kept
+from armscan.policies.model import sum_of_model
 from armscan.settings import plain
-from armscan.tracking import FoundRun, found_run
+from armscan.tracking import FoundRun, check_artifacts, found_run
 from armscan.tracking.client import reason_in
 from armscan.tracking.run import MODEL_FILE
 from armscan.tracking.store import usable_store
@@ -59,6 +61,8 @@ def _as_it_is(subject: Subject) -> None:
 def register_policy(tracking: str, run_id: str, name: str) -> str:
     """Registers the policy of a tracked run, which is made from its checkpoint where the run has kept none.
 
+    One that was kept without its sum, by an earlier version, is made anew.
+
     Args:
         tracking: address of the store, whose model registry it goes to.
         run_id: of the run, or its beginning.
@@ -68,20 +72,22 @@ def register_policy(tracking: str, run_id: str, name: str) -> str:
         The address of its new version, as MLflow takes it.
 
     Raises:
-        ArmscanError: if the name is none, or the run has no policy that answers.
+        ArmscanError: if the name is none, or the run has no policy that answers, or another one than it has kept.
     """
     _check_name(name)
     run = found_run(tracking, run_id)
     with tempfile.TemporaryDirectory() as beside, usable_store(run.uri):
         folder = Path(beside, POLICY_FOLDER)
         if is_kept := _is_kept(run):
-            _check_answers(run, Path(run.client.download_artifacts(run.run_id, POLICY_FOLDER, beside)))
+            _check_kept(run, Path(run.client.download_artifacts(run.run_id, POLICY_FOLDER, beside)))
         else:
+            check_artifacts(run.client, run.experiment_id)
             export_policy(tracking, run_id, folder)
         card = Card.of(run, Path(beside))
         if not is_kept:
             run.client.log_artifacts(run.run_id, str(folder), POLICY_FOLDER)
-            run.client.set_tag(run.run_id, POLICY_TAG, KEPT)
+            for tag, value in tags_of_kept(folder).items():
+                run.client.set_tag(run.run_id, tag, value)
         return _registered(run, name, card)
 
 
@@ -95,14 +101,20 @@ def _check_name(name: str) -> None:
 
 
 def _is_kept(run: FoundRun) -> bool:
-    if POLICY_FOLDER not in run.files:
+    if SUM_TAG not in run.tags or POLICY_FOLDER not in run.files:
         return False
     return f"{POLICY_FOLDER}/{MODEL_FILE}" in [
         each.path for each in run.client.list_artifacts(run.run_id, POLICY_FOLDER)
     ]
 
 
-def _check_answers(run: FoundRun, folder: Path) -> None:
+def _check_kept(run: FoundRun, folder: Path) -> None:
+    """Raises `ExportError` for a model that is not the one that its run has kept, or that does not answer."""
+    # Before it is loaded, which runs the code that lies in it.
+    if sum_of_model(folder) != run.tags[SUM_TAG]:
+        raise _not_kept(run)
+    # What it tells of a program that it cannot read is raised as well.
+    logging.getLogger("torch.export").setLevel(logging.CRITICAL)
     try:
         model = mlflow.pyfunc.load_model(str(folder))
         model.predict(model.input_example)
@@ -111,6 +123,16 @@ def _check_answers(run: FoundRun, folder: Path) -> None:
         raise ExportError(
             f"run {run.run_id}: its {POLICY_FOLDER}/ is damaged, it does not answer its own example: {reason_in(error)}"
         ) from error
+    # A sum that was copied from another run together with its model.
+    if (model.metadata.metadata or {}).get("run") != run.run_id:
+        raise _not_kept(run)
+
+
+def _not_kept(run: FoundRun) -> ExportError:
+    return ExportError(
+        f"run {run.run_id}: its {POLICY_FOLDER}/ is not the one that it has kept: changed, or another run's; remove "
+        "it from its artifacts, and it is made anew"
+    )
 
 
 def _registered(run: FoundRun, name: str, card: Card) -> str:

@@ -17,7 +17,7 @@ from armscan.reports.finding import ID_CHARS, Found
 from armscan.tracking import TrackingStore
 from armscan.tracking.run import EVALUATION_FILE
 from armscan.tracking.store import usable_store
-from armscan.training import TEST, Episode, Evaluation
+from armscan.training import TEST, Evaluation
 from armscan.volumes.plane import FloatArray
 
 FILM_FILE = "episode.gif"
@@ -183,11 +183,8 @@ class _Files:
         if (contents := self.contents(EVALUATION_FILE)) is None:
             return None
         try:
-            episodes = json.loads(contents)[TEST]["episodes"]
-            evaluation = Evaluation(tuple(Episode(**episode) for episode in episodes))
-            # A number that is none would be met much later.
-            evaluation.metrics()
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            evaluation = Evaluation.of_plain(json.loads(contents)[TEST]["episodes"])
+        except (ValueError, TypeError, KeyError) as error:
             raise self._damaged(EVALUATION_FILE) from error
         return evaluation if evaluation.episodes else None
 

@@ -25,7 +25,7 @@ AWAY, NOT_THERE = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "REQUEST_LIMIT_E
 MAX_REASON_CHARS = 300
 # What is worth telling of an HTTP client's account of its attempts.
 SHORT = re.compile(
-    r"\[Errno -?\d+\] ([\w ]+)|(Connection reset by peer|Connection aborted|[Rr]ead timed out)|(too many 50\d)"
+    r"\[Errno -?\d+\] ([\w -]+)|(Connection reset by peer|Connection aborted|[Rr]ead timed out)|(too many 50\d)"
 )
 # A tag of each run: by which one is found again whose making was not answered.
 MADE_TAG = "made"

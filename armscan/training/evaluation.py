@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Self, get_type_hints
 
 import gymnasium as gym
 
@@ -14,10 +14,14 @@ from armscan.agents.protocols import Agent
 from armscan.anatomy import tissue_dice
 from armscan.checks import check_int
 from armscan.envs.task import Observed
+from armscan.errors import InvalidValueError
 from armscan.volumes.plane import FloatArray
 
 # What evaluations are called by, after the volumes that they are on.
 TRAINING, VALIDATION, TEST = "training volumes", "validation volumes", "test volumes"
+
+# Above any number of an episode; sums of such are finite.
+LARGEST = 1e100
 
 Env = gym.Env[Observed, FloatArray]
 
@@ -71,6 +75,17 @@ class Evaluation:
 
     episodes: tuple[Episode, ...]
 
+    @classmethod
+    def of_plain(cls, episodes: object) -> Self:
+        """Returns the evaluation of episodes that were read from JSON, as `to_dict` has given them.
+
+        Raises:
+            InvalidValueError: if they are no list, or one of them is none: a value is missing, unknown, or no number.
+        """
+        if not isinstance(episodes, list):
+            raise InvalidValueError(f"the episodes are a {type(episodes).__name__}, but they must be a list")
+        return cls(tuple(_episode_of(each) for each in episodes))
+
     @property
     def success_rate(self) -> float:
         """Share of the episodes that ended on a rewarded plane."""
@@ -115,6 +130,19 @@ class Evaluation:
 
     def _mean(self, figure: Callable[[Episode], float]) -> float:
         return statistics.fmean(map(figure, self.episodes)) if self.episodes else float("nan")
+
+
+def _episode_of(plain: object) -> Episode:
+    kinds = get_type_hints(Episode)
+    if not isinstance(plain, dict) or plain.keys() != kinds.keys():
+        raise InvalidValueError(f"an episode is {plain!r}, but it must have {', '.join(kinds)}, and nothing else")
+    for name, kind in kinds.items():
+        value = plain[name]
+        # A truth value is a number to Python; JSON writes some floats as integers.
+        is_of_kind = type(value) is kind or (kind is float and type(value) is int)
+        if not is_of_kind or (kind in (int, float) and not -LARGEST < value < LARGEST):
+            raise InvalidValueError(f"an episode's {name} is {value!r}, but it must be a finite {kind.__name__}")
+    return Episode(**plain)
 
 
 def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluation:

@@ -20,7 +20,7 @@ from mlflow.exceptions import MlflowException
 from armscan.agents.policy import batch_of
 from armscan.errors import ExportError
 from armscan.policies.making import FIRST_SEED, keep_policy, make_model, onnx_answers
-from armscan.policies.model import arrays_of, is_model
+from armscan.policies.model import FILES, arrays_of, is_model, others_in, sum_of_model
 from armscan.tracking import TrackedRun, open_store
 
 from ..agents.conftest import ALGORITHMS, MAKERS, setup_for
@@ -88,6 +88,8 @@ def test_model_says_what_goes_in_and_comes_out(made):
     assert "+" not in "".join(requirements)
     assert is_model(folder / "model")
     assert not is_model(folder)
+    assert all((folder / "model" / file).is_file() for file in FILES)
+    assert others_in(folder / "model") == []
     example = json.loads((folder / "model" / "serving_input_example.json").read_text())["inputs"]
     assert len(example["reward"]) == 2
 
@@ -236,6 +238,7 @@ def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path,
     run = store.get_run(tracked.run_id)
     assert run.info.status == "FINISHED"
     assert run.data.tags["policy"].startswith(tag)
+    assert (run.data.tags.get("policy.sha256") == sum_of_model(folder / "policy")) == (tag == "kept")
     is_kept = tag == "kept"
     assert (folder / "policy").exists() == is_kept
     assert ("the policy is not kept as a model: the model answers" in capsys.readouterr().out) != is_kept

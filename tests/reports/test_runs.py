@@ -160,8 +160,9 @@ def without_test(text):
         without_test,
         lambda text: text.replace('"n_steps"', '"steps"'),
         lambda text: text.replace('"n_steps": ', '"n_steps": "many", "of": '),
+        lambda text: text.replace('"distance_mm": ', '"distance_mm": NaN, "of": '),
     ],
-    ids=["torn", "list", "split", "field", "word"],
+    ids=["torn", "list", "split", "field", "word", "nan"],
 )
 def test_a_damaged_evaluation_is_refused_in_one_line(answer, artifacts, tmp_path, damage):
     file = artifacts / "evaluation.json"
