@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import socket
 import stat
 from collections.abc import Iterator, Mapping
@@ -19,19 +20,22 @@ from armscan.files import (
     CONFIG_FILE,
     LAST_CHECKPOINT,
     LOCK_FILE,
+    POLICY_FOLDER,
+    RESULTS,
+    RUN_FILE,
     SPOOLS,
+    STARTED_WITH,
     SUM_TAGS,
     UNFINISHED,
-    VOLUMES_FILE,
     held,
+    is_made_by_run,
     sum_of,
 )
-from armscan.tracking.run import CURVE_FILE, EVALUATION_FILE
 from armscan.tracking.spool import DELIVERED, LOCK, SUFFIX, Spool, SpoolFile, file_of
 
 CHECKPOINTS = (LAST_CHECKPOINT, BEST_CHECKPOINT)
-# What every run leaves; the spool names what it has kept beside these.
-USUAL = (*CHECKPOINTS, VOLUMES_FILE, EVALUATION_FILE, CURVE_FILE, "episode.gif", "run.json")
+# The spool names what a run has kept beside these.
+USUAL = (*RESULTS, *STARTED_WITH, RUN_FILE)
 HYDRA_FOLDER = ".hydra"
 HYDRA_FILES = tuple(f"{HYDRA_FOLDER}/{name}.yaml" for name in ("config", "hydra", "overrides"))
 
@@ -113,7 +117,9 @@ class OwnFolder:
 
     def remove_emptied(self) -> bool:
         """Removes the folder where nothing is left in it; returns whether it is gone."""
-        for folder in (self.path / HYDRA_FOLDER, self.path / SPOOLS, self.path):
+        model = self.path / POLICY_FOLDER
+        inner = [] if model.is_symlink() else [Path(where) for where, _, _ in os.walk(model, topdown=False)]
+        for folder in (*inner, self.path / HYDRA_FOLDER, self.path / SPOOLS, self.path):
             # Somebody's files are in it, or their own feet.
             with contextlib.suppress(OSError):
                 if not Path.cwd().is_relative_to(folder):
@@ -201,7 +207,10 @@ def _noted(tags: Mapping[str, str]) -> Path:
 
 
 def _named_in(spool: Path) -> list[str]:
-    """Returns the names of the files that a spool has kept."""
+    """Returns the names of the files that a spool has kept, as far as runs make files of such names.
+
+    Runs of earlier versions have kept whatever was in their folder.
+    """
     names = []
     try:
         lines = spool.read_bytes().splitlines()
@@ -211,8 +220,11 @@ def _named_in(spool: Path) -> list[str]:
         # A damaged one names nothing.
         with contextlib.suppress(ValueError):
             entry = json.loads(line)
-            if isinstance(entry, dict) and isinstance(entry.get("file"), str):
-                names.append(entry["file"])
+            kept = entry.get("file") if isinstance(entry, dict) else None
+            # One of a folder that was kept as a whole stands with its place among the artifacts.
+            name = kept[0] if isinstance(kept, list) and kept else kept
+            if isinstance(name, str) and is_made_by_run(name):
+                names.append(name)
     return names
 
 

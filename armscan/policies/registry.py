@@ -12,9 +12,10 @@ from mlflow.exceptions import MlflowException
 from armscan import judging
 from armscan.agents import Learner
 from armscan.errors import ExportError, InvalidValueError
+from armscan.files import POLICY_FOLDER
 from armscan.judging import Subject
 from armscan.policies.card import Card
-from armscan.policies.making import KEPT, POLICY_FOLDER, POLICY_TAG, facts_of, make_model
+from armscan.policies.making import KEPT, POLICY_TAG, facts_of, make_model
 from armscan.settings import plain
 from armscan.tracking import FoundRun, found_run
 from armscan.tracking.client import reason_in

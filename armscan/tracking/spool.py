@@ -19,13 +19,13 @@ from typing import Any, Literal, Self
 from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, TrackingError
-from armscan.files import SPOOLS, write_whole
+from armscan.files import SPOOL_SUFFIXES, SPOOLS, write_whole
 
 Entry = dict[str, Any]
 # Two, delivered side by side: where no file can be kept, because a disk is full, figures still are.
 Lane = Literal["figures", "files"]
 LANES: tuple[Lane, ...] = ("files", "figures")
-SUFFIX, DELIVERED, LOCK = ".jsonl", ".delivered.json", ".lock"
+DELIVERED, LOCK, SUFFIX = SPOOL_SUFFIXES
 # Whoever hands a run over may still be leaving.
 LOCK_TIMEOUT_S = 20.0
 

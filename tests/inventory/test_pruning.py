@@ -1,5 +1,6 @@
 """What prune removes, and above all what it does not: each rule on a run that would be removed without it."""
 
+import json
 import os
 import shutil
 import sqlite3
@@ -318,3 +319,30 @@ def test_artifacts_and_folders_that_may_not_be_written_are_one_line(answer, make
         code, _, errors = answer("prune", f"what={what}", "apply=true")
         assert code == 1
         assert "cannot be removed: Permission denied" in errors
+
+
+def test_file_of_somebody_else_that_an_earlier_version_has_tracked_stays(answer, make_run, tmp_path):
+    folder = tmp_path / "outputs" / "tiny"
+    folder.mkdir(parents=True)
+    (folder / "notes.txt").write_text("precious")
+    make_run(also=["notes.txt"])
+    code, printed, _ = answer("prune", "what=folders", "apply=true")
+    assert code == 0
+    assert f"{folder} stays, with what is not the run's" in printed
+    assert [file.name for file in folder.iterdir()] == ["notes.txt"]
+
+
+def test_policy_is_counted_and_goes_with_its_folder(answer, make_run, tmp_path):
+    make_run(policy={"MLmodel": bytes(10_000), "artifacts/more/policy.pt2": bytes(20_000)})
+    (row,) = json.loads(answer("list", "format=json")[1])
+    assert 33_000 < row["folder_bytes"] < 35_000
+    assert answer("prune", "what=folders", "apply=true")[0] == 0
+    assert not (tmp_path / "outputs" / "tiny").exists()
+
+
+def test_files_beside_a_policy_that_are_not_the_runs_stay(answer, make_run, tmp_path):
+    make_run(policy={"MLmodel": b"m", "artifacts/policy.pt2": b"p"})
+    mine = tmp_path / "outputs" / "tiny" / "policy" / "artifacts" / "mine.txt"
+    mine.write_text("mine")
+    assert answer("prune", "what=folders", "apply=true")[0] == 0
+    assert [file for file in (tmp_path / "outputs").rglob("*") if file.is_file()] == [mine]
