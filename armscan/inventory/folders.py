@@ -7,7 +7,7 @@ import json
 import os
 import socket
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -113,7 +113,7 @@ class OwnFolder:
     @property
     def n_bytes(self) -> int:
         """Of the files."""
-        return sum(file.lstat().st_size for file in self.files)
+        return bytes_of(self.files)
 
     def remove_emptied(self) -> bool:
         """Removes the folder where nothing is left in it; returns whether it is gone."""
@@ -133,6 +133,15 @@ class OwnFolder:
             return stat.S_ISREG(file.lstat().st_mode) and file.parent.resolve().is_relative_to(self.path)
         except OSError:
             return False
+
+
+def bytes_of(files: Iterable[Path]) -> int:
+    """Returns how much files take, as far as nobody has removed them meanwhile."""
+    n_bytes = 0
+    for file in files:
+        with contextlib.suppress(FileNotFoundError):
+            n_bytes += file.lstat().st_size
+    return n_bytes
 
 
 def check_at_rest(run: Run) -> None:
@@ -177,6 +186,7 @@ def at_rest(run: Run) -> Iterator[OwnFolder | None]:
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(held(ours.path))
+            _check_still_there(ours)
             spool = stack.enter_context(contextlib.closing(Spool(file, timeout_s=0.0))) if file.exists() else None
         except FolderInUseError as error:
             raise BusyError(f"another process is at work in its folder {ours.path}") from error
@@ -185,6 +195,19 @@ def at_rest(run: Run) -> Iterator[OwnFolder | None]:
         if spool is not None and not spool.is_delivered:
             raise BusyError(_undelivered(ours.path))
         yield ours
+
+
+def _check_still_there(ours: OwnFolder) -> None:
+    """Looks into a folder that is held by now; its lock makes one again that was removed just before.
+
+    Raises:
+        BusyError: if another process has removed it.
+    """
+    if not (ours.path / CONFIG_FILE).exists():
+        with contextlib.suppress(OSError):
+            (ours.path / LOCK_FILE).unlink()
+            ours.path.rmdir()
+        raise BusyError("it is not there any more")
 
 
 def folder_here(run: Run) -> Path | None:

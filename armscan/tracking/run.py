@@ -253,7 +253,7 @@ class TrackedRun:
         failure = self._courier.finish(self._store.wait_s if wait_s is None else wait_s)
         self._is_delivered = failure is None
         if self._is_delivered:
-            leftovers.forget(self._spool)
+            leftovers.forget(self.run_id)
         self._spool.close()
         if failure is not None:
             again = f"python -m armscan.track sync {shlex.quote(str(self._spool.folder))}"
