@@ -60,6 +60,10 @@ class FolderInUseError(ArmscanError, RuntimeError):
     """Another process is at work in a run's folder."""
 
 
+class FolderTakenError(ArmscanError, ValueError):
+    """Somebody else's file is in the folder of a new run, where the run would make one of that name."""
+
+
 class ResumeError(ArmscanError, RuntimeError):
     """A run cannot be resumed."""
 

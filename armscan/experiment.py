@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from armscan.agents import Learner
 from armscan.building import check_keys
 from armscan.console import print_results, print_where_to_look, progress_reporter
-from armscan.files import LAST_CHECKPOINT, held
+from armscan.files import CURVE_FILE, FILM_FILE, LAST_CHECKPOINT, check_free, held
 from armscan.invocation import Invocation
 from armscan.policies.making import keep_policy
 from armscan.provenance import start_tracking
@@ -51,9 +51,10 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
         The figures of the final evaluations, by the name of their volumes.
     """
     check_keys(config)
-    stage = Stage.built(config)
     job = invocation.job
     with held(invocation.folder):
+        check_free(invocation.folder)
+        stage = Stage.built(config)
         tracked = start_tracking(config, invocation, stage)
         return carry_out(stage, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
 
@@ -90,9 +91,7 @@ def carry_out(
             result = learned(stage, folder, callbacks, run_id=tracked.run_id, earlier=earlier)
         tell(f"playing {stage.experiment.n_episodes} episodes on the training volumes, and as many on the test volumes")
         evaluations = judged(stage)
-        film_episode(
-            stage.experiment.agent, stage.film_env, folder / "episode.gif", seed=FILM_SEED + stage.experiment.seed
-        )
+        film_episode(stage.experiment.agent, stage.film_env, folder / FILM_FILE, seed=FILM_SEED + stage.experiment.seed)
         tracked.keep_results(result, evaluations, folder)
         if isinstance(stage.experiment.agent, Learner):
             keep_policy(stage.experiment.agent, stage.test_env, tracked, folder, tell)
@@ -134,9 +133,7 @@ def judged(stage: Stage) -> dict[str, Evaluation]:
 def _show(result: TrainingResult | None, evaluations: dict[str, Evaluation], folder: Path, tracking_uri: str) -> None:
     how = f"deterministic policy, as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
     print_results(f"results ({how})", evaluations)
-    print_where_to_look(
-        folder, tracking_uri, files=("learning_curve.png", "episode.gif") if result else ("episode.gif",)
-    )
+    print_where_to_look(folder, tracking_uri, files=(CURVE_FILE, FILM_FILE) if result else (FILM_FILE,))
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fnmatch
 import hashlib
 import os
 import shutil
@@ -14,18 +15,29 @@ from typing import BinaryIO
 import platformdirs
 from filelock import FileLock, Timeout
 
-from armscan.errors import FolderInUseError
+from armscan.errors import FolderInUseError, FolderTakenError
 
 # What training keeps in the folder of its run, what the run was started with, and who is at work in it.
 BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
 CONFIG_FILE, VOLUMES_FILE = "config.yaml", "volumes.json"
 # The code as it differed from its commit, and the versions of all that it was run with.
 DIFF_FILE, ENVIRONMENT_FILE = "code.diff", "environment.json"
+# The code of a run that went on with another, by how often it had been resumed.
+RESUMED_DIFF_FILE = "resumed_{0}_" + DIFF_FILE
+# What came of it; of a trial's training, the run that it is.
+EVALUATION_FILE, CURVE_FILE, FILM_FILE, RUN_FILE = "evaluation.json", "learning_curve.png", "episode.gif", "run.json"
+POLICY_FOLDER = "policy"
+# All that a run makes in its folder, beside what Hydra and the spool leave there: before it is tracked, and after.
+STARTED_WITH = (CONFIG_FILE, VOLUMES_FILE, ENVIRONMENT_FILE, DIFF_FILE)
+RESULTS = (BEST_CHECKPOINT, LAST_CHECKPOINT, EVALUATION_FILE, CURVE_FILE, FILM_FILE)
 # The tags of a run that hold the sums of what it was started with.
 SUM_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
 LOCK_FILE = ".lock"
 # The folder of what is to be tracked, in that of a run.
 SPOOLS = "tracking"
+# Of a run's spool: how far it is delivered, who holds it, and itself, each named after the run.
+SPOOL_SUFFIXES = (".delivered.json", ".lock", ".jsonl")
+RUN_ID = "[0-9a-f]" * 32
 UNFINISHED = "unfinished"
 # How the address of a database in a file begins.
 SQLITE_PREFIX = "sqlite:///"
@@ -94,6 +106,33 @@ def _sync_folder(folder: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+def is_made_by_run(name: str) -> bool:
+    """Whether a file of this name, relative to the folder of a run, is one that runs make there."""
+    return (
+        name in (*STARTED_WITH, *RESULTS, RUN_FILE)
+        or fnmatch.fnmatchcase(name, RESUMED_DIFF_FILE.format("*"))
+        or name.startswith(f"{POLICY_FOLDER}/")
+    )
+
+
+def check_free(folder: Path) -> None:
+    """Looks whether a new run may make its files in a folder; those of an earlier run are in nobody's way.
+
+    Raises:
+        FolderTakenError: if there is one that no run has left there.
+    """
+    # An earlier run that was never tracked has left what it was started with: the first three, always together.
+    spools = (folder / SPOOLS).glob(RUN_ID + SPOOL_SUFFIXES[-1])
+    if any(spools) or all((folder / name).is_file() for name in STARTED_WITH[:3]):
+        return
+    # Also a link that leads nowhere.
+    if taken := [name for name in (*RESULTS, *STARTED_WITH, POLICY_FOLDER) if os.path.lexists(folder / name)]:
+        raise FolderTakenError(
+            f"{folder}: holds {taken[0]}, which no run has left there, and which this run would overwrite: "
+            "name another folder with hydra.run.dir or hydra.sweep.dir"
+        )
 
 
 def remove_unfinished(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 import shutil
@@ -16,8 +17,8 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.errors import FolderInUseError, InvalidValueError, TrackingError
-from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, SPOOLS, write_whole
+from armscan.errors import FolderInUseError, FolderTakenError, InvalidValueError, TrackingError
+from armscan.files import CONFIG_FILE, LAST_CHECKPOINT, LOCK_FILE, RUN_ID, SPOOL_SUFFIXES, SPOOLS, write_whole
 from armscan.launchers import LAUNCHER, check_launcher
 from armscan.mistakes import mistake_in_one_line
 from armscan.passwords import check_written
@@ -240,8 +241,9 @@ def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Ma
 
 def remove_if_untracked(folder: Path, error: BaseException) -> None:
     """Removes what a run has left that failed before it was tracked; from then on it can be resumed."""
+    is_tracked = (folder / CONFIG_FILE).exists() and not isinstance(error, FolderTakenError)
     # Where somebody else is at work in the folder, everything is theirs.
-    if not (folder / CONFIG_FILE).exists() and not isinstance(error, FolderInUseError):
+    if not is_tracked and not isinstance(error, FolderInUseError):
         remove_run_folder(folder)
 
 
@@ -250,10 +252,15 @@ def remove_run_folder(folder: Path) -> None:
 
     Nothing else is touched: the folder may be one that somebody named, with other files in it.
     """
-    for ours in (folder / ".hydra", folder / OUTCOME_FOLDER, folder / SPOOLS):
+    for ours in (folder / ".hydra", folder / OUTCOME_FOLDER):
         shutil.rmtree(ours, ignore_errors=True)
     for ours in (folder / PARENT_FILE, folder / "multirun.yaml", folder / LOCK_FILE):
         ours.unlink(missing_ok=True)
+    for ours in (file for suffix in SPOOL_SUFFIXES for file in (folder / SPOOLS).glob(RUN_ID + suffix)):
+        ours.unlink(missing_ok=True)
+    # Somebody else's is not empty.
+    with contextlib.suppress(OSError):
+        (folder / SPOOLS).rmdir()
     here = Path.cwd()
     for emptied in (folder, folder.parent, folder.parent.parent):
         if here.is_relative_to(emptied.resolve()) or not emptied.is_dir() or any(emptied.iterdir()):

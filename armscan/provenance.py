@@ -14,11 +14,10 @@ from omegaconf import DictConfig
 
 import armscan
 from armscan.files import (
-    BEST_CHECKPOINT,
     CONFIG_FILE,
     DIFF_FILE,
     ENVIRONMENT_FILE,
-    LAST_CHECKPOINT,
+    RESULTS,
     SUM_TAGS,
     VOLUMES_FILE,
     sum_of,
@@ -49,14 +48,17 @@ N_PRINT_CHARS = 16
 def start_tracking(
     config: DictConfig, invocation: Invocation, stage: Stage, *, patience_s: float | None = None
 ) -> TrackedRun:
-    """Writes down what is run, opens the tracking store and starts a run in it; see `open_store`."""
+    """Writes down what is run, opens the tracking store and starts a run in it; see `open_store`.
+
+    What an earlier run has made in the folder is replaced; `check_free` has found that it is a run's.
+    """
     resolved = plain(config)
     client, experiment_id = open_store(**resolved["tracking"], patience_s=patience_s)
     deliver_leftovers(client)
     choices, job = invocation.choices, invocation.job
     files = started_with(resolved, stage)
-    # Another run's, left in a folder that somebody named: they would be taken for this one's.
-    for stale in (LAST_CHECKPOINT, BEST_CHECKPOINT):
+    # Those of an earlier run, left in a folder that somebody named: they would be taken for this one's.
+    for stale in RESULTS:
         (invocation.folder / stale).unlink(missing_ok=True)
     # Before the run is there: whenever it is killed, it can be resumed.
     for name, contents in files.items():

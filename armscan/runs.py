@@ -118,7 +118,18 @@ def _list(client: TrackingStore, values: Mapping[str, Any]) -> int:
 
 
 def _prune(client: TrackingStore, values: Mapping[str, Any], words: Sequence[str]) -> int:
-    from armscan.inventory import WHAT, Sizes, find, ordered, plan, print_plan, read_selection, readable
+    from armscan.inventory import (
+        RUNS,
+        WHAT,
+        Sizes,
+        find,
+        half_removed,
+        ordered,
+        plan,
+        print_plan,
+        read_selection,
+        readable,
+    )
     from armscan.inventory.entries import Entry
 
     if "what" not in values:
@@ -126,7 +137,10 @@ def _prune(client: TrackingStore, values: Mapping[str, Any], words: Sequence[str
     what = _one_of("what", values["what"], WHAT)
     selection = read_selection(values)
     sizes = Sizes(client)
-    entries = [Entry(run, sizes) for run in find(client, selection)]
+    runs = find(client, selection)
+    if what == RUNS:
+        runs += half_removed(client, selection, sizes)
+    entries = [Entry(run, sizes) for run in runs]
     meant = ordered(entries, selection.sort, is_down=selection.is_down)[: selection.limit]
     cases = plan(client, [entry.run for entry in meant], what, sizes)
     if values.get("apply"):

@@ -32,6 +32,8 @@ SMALL = [
     "network=mlp",
     "network.hidden_sizes=[16]",
 ]
+# Of an agent that learns nothing.
+FEW = [word for word in SMALL if word.startswith(("data.", "evaluation.", "env."))]
 # Figures that no two runs share.
 TIMES = ("wall_s", "speed/", "system/")
 REPOSITORY = Path(__file__).parent.parent
@@ -260,6 +262,32 @@ def test_run_that_fails_touches_no_file_of_others(answer, tmp_path, arguments):
     code, _ = answer(*arguments, "seed=-1")
     assert code != 0
     assert {file.name for file in (tmp_path / "results").iterdir()} == {"precious.txt"}
+
+
+@pytest.mark.parametrize("name", ["last.pt", "config.yaml", "policy/notes.txt"])
+def test_run_is_refused_a_folder_where_it_would_overwrite_files_of_others(answer, tmp_path, name):
+    for precious in (name, "tracking/notes.txt"):
+        (tmp_path / "mine" / precious).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "mine" / precious).write_text("precious")
+    code, printed = answer("hydra.run.dir=mine", *SMALL)
+    assert code == 2
+    assert f"mine: holds {Path(name).parts[0]}, which no run has left there" in printed
+    assert len(printed.splitlines()) == 1
+    there = {file.relative_to(tmp_path).as_posix() for file in tmp_path.rglob("*") if file.is_file()}
+    assert there == {f"mine/{name}", "mine/tracking/notes.txt"}
+
+
+def test_folder_of_an_earlier_run_can_be_used_again_and_files_of_others_are_nobodys(answer, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.json").write_text("precious")
+    assert answer("hydra.run.dir=mine", *SMALL)[0] == 0
+    assert answer("hydra.run.dir=mine", "agent=random", *FEW)[0] == 0
+    client, (later, earlier) = runs_in(tmp_path)
+    kept = {run.info.run_id: {file.path for file in client.list_artifacts(run.info.run_id)} for run in (later, earlier)}
+    assert "best.pt" in kept[earlier.info.run_id]
+    assert not kept[later.info.run_id] & {"best.pt", "last.pt", "learning_curve.png"}
+    assert not any("notes.json" in names for names in kept.values())
+    assert (tmp_path / "mine" / "notes.json").read_text() == "precious"
 
 
 def test_run_shows_what_is_wrong_with_a_volume(answer, tmp_path, write_labelmap, write_manifest):

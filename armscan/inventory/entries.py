@@ -11,6 +11,7 @@ from functools import cached_property
 from mlflow.entities import Run
 
 from armscan.inventory.sizes import Size, Sizes
+from armscan.tracking.sync import ENDED
 
 PARENT_TAG = "mlflow.parentRunId"
 SORTS = ("started", "duration", "success", "steps", "size")
@@ -48,7 +49,8 @@ class Entry:
     @property
     def duration_s(self) -> float | None:
         """How long it took; None where it has not ended."""
-        end = self.run.info.end_time
+        # MLflow keeps the end of a run that goes on again.
+        end = self.run.info.end_time if self.run.info.status in ENDED else None
         return None if end is None else (end - self.run.info.start_time) / 1000
 
     @property

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import socket
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,19 +20,22 @@ from armscan.files import (
     CONFIG_FILE,
     LAST_CHECKPOINT,
     LOCK_FILE,
+    POLICY_FOLDER,
+    RESULTS,
+    RUN_FILE,
     SPOOLS,
+    STARTED_WITH,
     SUM_TAGS,
     UNFINISHED,
-    VOLUMES_FILE,
     held,
+    is_made_by_run,
     sum_of,
 )
-from armscan.tracking.run import CURVE_FILE, EVALUATION_FILE
 from armscan.tracking.spool import DELIVERED, LOCK, SUFFIX, Spool, SpoolFile, file_of
 
 CHECKPOINTS = (LAST_CHECKPOINT, BEST_CHECKPOINT)
-# What every run leaves; the spool names what it has kept beside these.
-USUAL = (*CHECKPOINTS, VOLUMES_FILE, EVALUATION_FILE, CURVE_FILE, "episode.gif", "run.json")
+# The spool names what a run has kept beside these.
+USUAL = (*RESULTS, *STARTED_WITH, RUN_FILE)
 HYDRA_FOLDER = ".hydra"
 HYDRA_FILES = tuple(f"{HYDRA_FOLDER}/{name}.yaml" for name in ("config", "hydra", "overrides"))
 
@@ -109,11 +113,13 @@ class OwnFolder:
     @property
     def n_bytes(self) -> int:
         """Of the files."""
-        return sum(file.lstat().st_size for file in self.files)
+        return bytes_of(self.files)
 
     def remove_emptied(self) -> bool:
         """Removes the folder where nothing is left in it; returns whether it is gone."""
-        for folder in (self.path / HYDRA_FOLDER, self.path / SPOOLS, self.path):
+        model = self.path / POLICY_FOLDER
+        inner = [] if model.is_symlink() else [Path(where) for where, _, _ in os.walk(model, topdown=False)]
+        for folder in (*inner, self.path / HYDRA_FOLDER, self.path / SPOOLS, self.path):
             # Somebody's files are in it, or their own feet.
             with contextlib.suppress(OSError):
                 if not Path.cwd().is_relative_to(folder):
@@ -127,6 +133,15 @@ class OwnFolder:
             return stat.S_ISREG(file.lstat().st_mode) and file.parent.resolve().is_relative_to(self.path)
         except OSError:
             return False
+
+
+def bytes_of(files: Iterable[Path]) -> int:
+    """Returns how much files take, as far as nobody has removed them meanwhile."""
+    n_bytes = 0
+    for file in files:
+        with contextlib.suppress(FileNotFoundError):
+            n_bytes += file.lstat().st_size
+    return n_bytes
 
 
 def check_at_rest(run: Run) -> None:
@@ -171,6 +186,7 @@ def at_rest(run: Run) -> Iterator[OwnFolder | None]:
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(held(ours.path))
+            _check_still_there(ours)
             spool = stack.enter_context(contextlib.closing(Spool(file, timeout_s=0.0))) if file.exists() else None
         except FolderInUseError as error:
             raise BusyError(f"another process is at work in its folder {ours.path}") from error
@@ -179,6 +195,19 @@ def at_rest(run: Run) -> Iterator[OwnFolder | None]:
         if spool is not None and not spool.is_delivered:
             raise BusyError(_undelivered(ours.path))
         yield ours
+
+
+def _check_still_there(ours: OwnFolder) -> None:
+    """Looks into a folder that is held by now; its lock makes one again that was removed just before.
+
+    Raises:
+        BusyError: if another process has removed it.
+    """
+    if not (ours.path / CONFIG_FILE).exists():
+        with contextlib.suppress(OSError):
+            (ours.path / LOCK_FILE).unlink()
+            ours.path.rmdir()
+        raise BusyError("it is not there any more")
 
 
 def folder_here(run: Run) -> Path | None:
@@ -201,7 +230,10 @@ def _noted(tags: Mapping[str, str]) -> Path:
 
 
 def _named_in(spool: Path) -> list[str]:
-    """Returns the names of the files that a spool has kept."""
+    """Returns the names of the files that a spool has kept, as far as runs make files of such names.
+
+    Runs of earlier versions have kept whatever was in their folder.
+    """
     names = []
     try:
         lines = spool.read_bytes().splitlines()
@@ -211,8 +243,11 @@ def _named_in(spool: Path) -> list[str]:
         # A damaged one names nothing.
         with contextlib.suppress(ValueError):
             entry = json.loads(line)
-            if isinstance(entry, dict) and isinstance(entry.get("file"), str):
-                names.append(entry["file"])
+            kept = entry.get("file") if isinstance(entry, dict) else None
+            # One of a folder that was kept as a whole stands with its place among the artifacts.
+            name = kept[0] if isinstance(kept, list) and kept else kept
+            if isinstance(name, str) and is_made_by_run(name):
+                names.append(name)
     return names
 
 

@@ -7,12 +7,12 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mlflow.entities import Run
+from mlflow.entities import LifecycleStage, Run, ViewType
 
 import armscan
 from armscan.inventory.entries import PARENT_TAG
-from armscan.inventory.folders import BusyError, NotOursError, OwnFolder, check_at_rest
-from armscan.inventory.selection import all_pages, experiment_ids, search
+from armscan.inventory.folders import BusyError, NotOursError, OwnFolder, bytes_of, check_at_rest
+from armscan.inventory.selection import Selection, all_pages, experiment_ids, find, search
 from armscan.inventory.sizes import Sizes
 from armscan.tracking import TrackingStore
 from armscan.tracking.finding import release
@@ -21,6 +21,8 @@ from armscan.tracking.sync import ENDED
 CHECKPOINTS, FOLDERS, RUNS = "checkpoints", "folders", "runs"
 WHAT = (CHECKPOINTS, FOLDERS, RUNS)
 VERSION_TAG = "armscan.version"
+# Of a run whose removal has begun, by which the rest of it is found where that was cut off.
+REMOVED_TAG = "armscan.removed"
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,12 @@ def plan(client: TrackingStore, runs: Sequence[Run], what: str, sizes: Sizes) ->
         if left := _reason_to_leave(run, what, near[run_id], removed):
             cases.append(Case(run, near[run_id], left=left))
             continue
-        n_bytes = _freed(run, what, near[run_id], sizes)
+        try:
+            n_bytes = _freed(run, what, near[run_id], sizes)
+        except NotOursError as error:
+            # Somebody has removed it since the look before.
+            cases.append(Case(run, near[run_id], left=str(error)))
+            continue
         if what != RUNS and n_bytes == 0:
             kind = "checkpoint" if what == CHECKPOINTS else "file"
             cases.append(Case(run, near[run_id], left=f"its folder holds no {kind} of it"))
@@ -84,6 +91,31 @@ def plan(client: TrackingStore, runs: Sequence[Run], what: str, sizes: Sizes) ->
         removed.add(run_id)
         cases.append(Case(run, near[run_id], n_bytes, note=folder_left(run, near[run_id]) if what == RUNS else None))
     return cases
+
+
+def half_removed(client: TrackingStore, selection: Selection, sizes: Sizes) -> list[Run]:
+    """Returns the runs of a store that are meant, and of which a removal that was cut off has left something.
+
+    Args:
+        client: of the store.
+        selection: which runs are meant.
+        sizes: measures them.
+    """
+    # A server keeps the figures of a removed run; where they can be removed from here, they are a rest, too.
+    is_all = can_forget(client)
+    found = [run for run in find(client, selection, ViewType.DELETED_ONLY) if is_half_removed(run)]
+    return [run for run in found if is_all or sizes.of(run).n_bytes]
+
+
+def is_half_removed(run: Run) -> bool:
+    """Whether the removal of a run has begun; one that somebody else has deleted can be restored, and is not ours."""
+    return run.info.lifecycle_stage == LifecycleStage.DELETED and REMOVED_TAG in run.data.tags
+
+
+def can_forget(client: TrackingStore) -> bool:
+    """Whether the rows of a deleted run can be removed from here: from a database, not from a server."""
+    # What `mlflow gc` calls; the versions of MLflow that are allowed all have it.
+    return hasattr(client.mlflow._tracking_client.store, "_hard_delete_run")
 
 
 def _reason_to_leave(run: Run, what: str, near: Neighbours, removed: Collection[str]) -> str | None:
@@ -122,7 +154,7 @@ def barred_by_store(run: Run, what: str, near: Neighbours, removed: Collection[s
 
 def barred_by_folder(run: Run, what: str, near: Neighbours) -> str | None:
     """Returns why nothing of a run may be removed, by what is known of its folder; None where it may."""
-    if what == RUNS and run.info.status in ENDED:
+    if what == RUNS and (run.info.status in ENDED or is_half_removed(run)):
         return None
     try:
         _check_own(run, near)
@@ -190,7 +222,7 @@ def _check_own(run: Run, near: Neighbours) -> OwnFolder:
 
 def _freed(run: Run, what: str, near: Neighbours, sizes: Sizes) -> int:
     if what == CHECKPOINTS:
-        return sum(file.lstat().st_size for file in OwnFolder.of(run).checkpoints)
+        return bytes_of(OwnFolder.of(run).checkpoints)
     if what == FOLDERS:
         return OwnFolder.of(run).n_bytes
     size = sizes.of(run)

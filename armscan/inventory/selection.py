@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any
 
-from mlflow.entities import Run
+from mlflow.entities import Run, ViewType
 from mlflow.exceptions import MlflowException
 
 from armscan.checks import check_int
@@ -137,8 +137,13 @@ def _moment(key: str, text: str) -> datetime:
     )
 
 
-def find(client: TrackingStore, selection: Selection) -> list[Run]:
+def find(client: TrackingStore, selection: Selection, view: int = ViewType.ACTIVE_ONLY) -> list[Run]:
     """Returns the runs of a store that are meant, in no order.
+
+    Args:
+        client: of the store.
+        selection: which are meant.
+        view: of MLflow: those that are there, or those that were deleted.
 
     Raises:
         InvalidValueError: if there is no such experiment, or MLflow does not take the filter.
@@ -151,7 +156,7 @@ def find(client: TrackingStore, selection: Selection) -> list[Run]:
         ours = f"tags.mlflow.parentRunId = '{parent.info.run_id}'"
         condition = f"{ours} and {condition}" if condition else ours
     try:
-        runs = search(client, experiments, condition)
+        runs = search(client, experiments, condition, view)
     except MlflowException as error:
         if selection.where is None or error.error_code != "INVALID_PARAMETER_VALUE":
             raise
@@ -175,11 +180,15 @@ def experiment_ids(client: TrackingStore, name: str | None = None) -> list[str]:
     return found
 
 
-def search(client: TrackingStore, experiments: list[str], condition: str = "") -> list[Run]:
+def search(
+    client: TrackingStore, experiments: list[str], condition: str = "", view: int = ViewType.ACTIVE_ONLY
+) -> list[Run]:
     """Returns all runs of experiments that a filter of MLflow lets through."""
     if not experiments:
         return []
-    return all_pages(lambda **page: client.search_runs(experiments, filter_string=condition, **page))
+    return all_pages(
+        lambda **page: client.search_runs(experiments, filter_string=condition, run_view_type=view, **page)
+    )
 
 
 def all_pages(ask: Callable[..., Any]) -> list[Any]:

@@ -11,7 +11,7 @@ from mlflow.entities import Run
 from mlflow.exceptions import MlflowException
 from requests import RequestException
 
-from armscan.inventory.folders import NotOursError, OwnFolder
+from armscan.inventory.folders import NotOursError, OwnFolder, bytes_of
 from armscan.tracking import TrackingStore
 
 
@@ -94,5 +94,5 @@ def _files_in(folder: Path) -> list[tuple[str, int]]:
         for name in names:
             file = Path(where, name)
             if not file.is_symlink():
-                found.append((file.relative_to(folder).as_posix(), file.lstat().st_size))
+                found.append((file.relative_to(folder).as_posix(), bytes_of([file])))
     return found

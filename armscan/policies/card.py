@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, Self
 
 from armscan.errors import InvalidValueError, TrackingError
+from armscan.files import EVALUATION_FILE
 from armscan.judging import Judgement
 from armscan.judging.report import REFUSED_BY_MLFLOW, figures_in_markdown
 from armscan.settings import evaluate_command
 from armscan.tracking import EVALUATED_TAG, FoundRun
-from armscan.tracking.run import EVALUATION_FILE
 from armscan.training import Evaluation
 
 # What MLflow's databases take of a description.

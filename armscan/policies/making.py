@@ -19,15 +19,15 @@ from armscan.agents.export import OBSERVATION
 from armscan.agents.policy import Policy, batch_of
 from armscan.envs.task import Observed
 from armscan.errors import ExportError, is_interruption
-from armscan.files import CONFIG_FILE
+from armscan.files import CONFIG_FILE, POLICY_FOLDER
 from armscan.policies.model import ONNX_FILE, Arrays, arrays_of, sum_of_model, write_model
 from armscan.tracking import TrackedRun
 from armscan.tracking.client import reason_in
 from armscan.training.evaluation import Env
 from armscan.volumes.plane import FloatArray
 
-# The folder of the model, in that of its run and among its artifacts, and the run's tag that says whether there is one.
-POLICY_FOLDER, POLICY_TAG = "policy", "policy"
+# The run's tag that says whether there is a model of it.
+POLICY_TAG = "policy"
 KEPT = "kept"
 # The run's tag with the sum of the model, by which another one in its place is known.
 SUM_TAG = "policy.sha256"

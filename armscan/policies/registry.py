@@ -13,9 +13,10 @@ from mlflow.exceptions import MlflowException
 from armscan import judging
 from armscan.agents import Learner
 from armscan.errors import ExportError, InvalidValueError
+from armscan.files import POLICY_FOLDER
 from armscan.judging import Subject
 from armscan.policies.card import Card
-from armscan.policies.making import POLICY_FOLDER, SUM_TAG, facts_of, make_model, tags_of_kept
+from armscan.policies.making import SUM_TAG, facts_of, make_model, tags_of_kept
 from armscan.policies.model import sum_of_model
 from armscan.settings import plain
 from armscan.tracking import FoundRun, check_artifacts, found_run

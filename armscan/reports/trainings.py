@@ -12,15 +12,13 @@ import numpy as np
 from mlflow.entities import Run
 
 from armscan.errors import TrackingError
-from armscan.files import SUM_TAGS, VOLUMES_FILE, sum_of
+from armscan.files import EVALUATION_FILE, FILM_FILE, SUM_TAGS, VOLUMES_FILE, sum_of
 from armscan.reports.finding import ID_CHARS, Found
 from armscan.tracking import TrackingStore
-from armscan.tracking.run import EVALUATION_FILE
 from armscan.tracking.store import usable_store
 from armscan.training import TEST, Evaluation
 from armscan.volumes.plane import FloatArray
 
-FILM_FILE = "episode.gif"
 WALL = "wall_s"
 VALIDATION = {
     "validation/success_rate": "success rate",

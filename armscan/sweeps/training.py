@@ -15,7 +15,7 @@ from armscan.agents import Learner
 from armscan.building import build, check_keys
 from armscan.errors import CheckpointError, InvalidValueError
 from armscan.experiment import FILM_SEED, judged, learned
-from armscan.files import LAST_CHECKPOINT, held, write_whole
+from armscan.files import CURVE_FILE, EVALUATION_FILE, FILM_FILE, LAST_CHECKPOINT, RUN_FILE, held, write_whole
 from armscan.invocation import Invocation
 from armscan.log import say
 from armscan.multirun import Job
@@ -28,15 +28,11 @@ from armscan.sweeps.attempt import Attempt
 from armscan.sweeps.tally import ENV_STEPS
 from armscan.sweeps.tasks import VolumesInMemory
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
-from armscan.tracking.run import CURVE_FILE, EVALUATION_FILE
 from armscan.training import TEST, EpochReport, Evaluation, film_episode, take_up
 from armscan.training.seeds import interquartile_mean
 
 # Of each training, beside the figures of its best validation.
 TRAINING_FIGURES = (ENV_STEPS, "training_s", "solved")
-RUN_FILE, FILM_FILE = "run.json", "episode.gif"
-# What a training leaves that is worth having in the tracking store.
-KEPT = (".pt", ".png", ".gif", ".json")
 Conclude = Callable[[Stage, TrackedRun, Path], dict[str, float]]
 
 
@@ -165,7 +161,8 @@ def trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> di
             attempt.show_picture(folder / CURVE_FILE)
             # Nobody goes on with it; the best one stays.
             (folder / LAST_CHECKPOINT).unlink(missing_ok=True)
-            tracked.log_files(*(file for file in folder.iterdir() if file.suffix in KEPT))
+            tracked.log_results(folder)
+            tracked.log_files(folder / RUN_FILE)
         attempt.opened(None)
     if pruned is not None:
         raise pruned

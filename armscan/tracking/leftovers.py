@@ -17,15 +17,15 @@ def note(spool: Spool) -> None:
     """Notes that a run has something to be delivered."""
     # Where it cannot be noted, nothing is lost: `armscan.track sync` finds it.
     with contextlib.suppress(OSError):
-        file = _note_of(spool)
+        file = _note_of(spool.address.run_id)
         file.parent.mkdir(parents=True, exist_ok=True)
         write_whole(file, lambda opened: opened.write(os.fsencode(spool.file.absolute())))
 
 
-def forget(spool: Spool) -> None:
-    """Notes that everything of a run is delivered."""
+def forget(run_id: str) -> None:
+    """Notes that everything of a run is delivered, or that it is removed."""
     with contextlib.suppress(OSError):
-        _note_of(spool).unlink(missing_ok=True)
+        _note_of(run_id).unlink(missing_ok=True)
 
 
 def noted() -> Iterator[tuple[Path, Path]]:
@@ -35,5 +35,5 @@ def noted() -> Iterator[tuple[Path, Path]]:
             yield file, Path(os.fsdecode(file.read_bytes()))
 
 
-def _note_of(spool: Spool) -> Path:
-    return cache_folder() / FOLDER / spool.address.run_id
+def _note_of(run_id: str) -> Path:
+    return cache_folder() / FOLDER / run_id

@@ -13,7 +13,7 @@ from typing import Any, Self
 from mlflow.entities import Run
 
 from armscan.errors import is_interruption
-from armscan.files import DIFF_FILE, write_whole
+from armscan.files import CURVE_FILE, EVALUATION_FILE, RESULTS, RESUMED_DIFF_FILE, write_whole
 from armscan.log import say
 from armscan.tracking import leftovers
 from armscan.tracking.client import TrackingStore
@@ -26,7 +26,7 @@ from armscan.tracking.spool import Address, Spool, file_of, now_ms
 from armscan.tracking.system import PREFIX, SystemMetrics
 from armscan.training import EpochReport, Evaluation, TrainingResult
 
-EVALUATION_FILE, CURVE_FILE, MODEL_FILE = "evaluation.json", "learning_curve.png", "MLmodel"
+MODEL_FILE = "MLmodel"
 # Why a run ended before its end.
 FAILURE_TAG = "failure"
 MAX_REASON_CHARS = 5000
@@ -120,7 +120,7 @@ class TrackedRun:
         tracked.set_tags(dict(tags) | changed | {"resumed": str(n_resumed)})
         tracked.log_config(config)
         if (diff := source().diff) and f"resumed.{DIFF_SUM}" in changed:
-            tracked.keep(f"resumed_{n_resumed}_{DIFF_FILE}", diff)
+            tracked.keep(RESUMED_DIFF_FILE.format(n_resumed), diff)
         return tracked
 
     def set_tags(self, tags: Mapping[str, str]) -> None:
@@ -206,7 +206,11 @@ class TrackedRun:
             draw_learning_curve(result.reports, folder / CURVE_FILE, title=self.name)
         contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
         (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
-        self.log_files(*sorted(file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")))
+        self.log_results(folder)
+
+    def log_results(self, folder: Path) -> None:
+        """Keeps what the run has made in its folder; nothing else that is there."""
+        self.log_files(*(folder / name for name in RESULTS if (folder / name).is_file()))
 
     def __enter__(self) -> Self:
         return self
@@ -249,7 +253,7 @@ class TrackedRun:
         failure = self._courier.finish(self._store.wait_s if wait_s is None else wait_s)
         self._is_delivered = failure is None
         if self._is_delivered:
-            leftovers.forget(self._spool)
+            leftovers.forget(self.run_id)
         self._spool.close()
         if failure is not None:
             again = f"python -m armscan.track sync {shlex.quote(str(self._spool.folder))}"

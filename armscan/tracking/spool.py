@@ -7,6 +7,7 @@ an entry that is delivered again, because only the answer was lost, changes noth
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import threading
@@ -19,13 +20,13 @@ from typing import Any, Literal, Self
 from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, TrackingError
-from armscan.files import SPOOLS, write_whole
+from armscan.files import SPOOL_SUFFIXES, SPOOLS, write_whole
 
 Entry = dict[str, Any]
 # Two, delivered side by side: where no file can be kept, because a disk is full, figures still are.
 Lane = Literal["figures", "files"]
 LANES: tuple[Lane, ...] = ("files", "figures")
-SUFFIX, DELIVERED, LOCK = ".jsonl", ".delivered.json", ".lock"
+DELIVERED, LOCK, SUFFIX = SPOOL_SUFFIXES
 # Whoever hands a run over may still be leaving.
 LOCK_TIMEOUT_S = 20.0
 
@@ -145,9 +146,13 @@ class Spool(SpoolFile):
     Raises:
         TrackingError: if the file is damaged.
         FolderInUseError: if another process holds it.
+        FileNotFoundError: if there is no such file; nothing is made in its place.
     """
 
     def __init__(self, file: Path, *, timeout_s: float = LOCK_TIMEOUT_S) -> None:
+        # The lock would make the folder of a run again that was removed.
+        if not file.exists():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(file))
         # Also who is told to leave closes it, in another thread.
         self._lock = FileLock(file.with_suffix(LOCK), timeout=timeout_s, thread_local=False)
         try:

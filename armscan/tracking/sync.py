@@ -57,6 +57,9 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore]) -> list[Delivery]
     for file in spool_files(folder):
         try:
             spool = Spool(file, timeout_s=0.0)
+        except FileNotFoundError:
+            # Its run was removed since.
+            continue
         except (FolderInUseError, TrackingError) as error:
             left = IN_USE if isinstance(error, FolderInUseError) else str(error)
             deliveries.append(Delivery(file.parent.parent, None, 0, left))

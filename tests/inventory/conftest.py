@@ -39,7 +39,18 @@ def store(tmp_path, empty_database):
 def make_run(store, tmp_path):
     """Makes a run that has ended, as `armscan.run` leaves it; returns its id."""
 
-    def make(name="tiny", *, status="FINISHED", tags=None, figures=None, parent_id=None, folder=None, opened=store):
+    def make(
+        name="tiny",
+        *,
+        status="FINISHED",
+        tags=None,
+        figures=None,
+        parent_id=None,
+        folder=None,
+        opened=store,
+        also=(),
+        policy=None,
+    ):
         client, experiment_id = opened
         folder = folder or tmp_path / "outputs" / name
         (folder / ".hydra").mkdir(parents=True, exist_ok=True)
@@ -55,7 +66,12 @@ def make_run(store, tmp_path):
             )
             stack.callback(run.end, status, reason=None if status == "FINISHED" else "no reason")
             run.log_figures(figures or {}, n_env_steps=7)
-            run.log_files(*(folder / file for file in contents))
+            run.log_files(*(folder / file for file in (*contents, *also)))
+            for file, text in (policy or {}).items():
+                (folder / "policy" / file).parent.mkdir(parents=True, exist_ok=True)
+                (folder / "policy" / file).write_bytes(text)
+            if policy:
+                run.log_folder(folder / "policy")
         return run.run_id
 
     return make

@@ -209,3 +209,14 @@ def test_sizes_and_times_are_readable():
         *("0 B", "999 B", "1 kB", "12.3 kB", "999 kB", "1 MB", "1.5 GB", "2e+03 TB")
     ]
     assert [lasting(s) for s in (None, 5, 65, 3605, 100_000)] == ["-", "0:05", "1:05", "1:00:05", "1d 3h"]
+
+
+def test_run_that_goes_on_again_has_no_duration(answer, make_run, store, aged, listed):
+    going_on, ended = aged(make_run("going_on"), took_s=90), aged(make_run("ended"), took_s=30)
+    # As a resumed one says it, whose end MLflow keeps.
+    store[0].update_run(going_on, status="RUNNING")
+    assert store[0].get_run(going_on).info.end_time is not None
+    rows = {row["run_id"]: row["duration_s"] for row in json.loads(answer("list", "format=json")[1])}
+    assert rows == {going_on: None, ended: 30.0}
+    assert listed("sort=-duration") == ["ended", "going_on"]
+    assert "running after" not in answer("show", going_on)[1]

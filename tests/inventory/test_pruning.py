@@ -1,13 +1,18 @@
 """What prune removes, and above all what it does not: each rule on a run that would be removed without it."""
 
+import json
 import os
 import shutil
 import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from armscan.files import LOCK_FILE
+from armscan.inventory import removal
+from armscan.tracking import leftovers
 from armscan.tracking.spool import file_of
 
 
@@ -318,3 +323,97 @@ def test_artifacts_and_folders_that_may_not_be_written_are_one_line(answer, make
         code, _, errors = answer("prune", f"what={what}", "apply=true")
         assert code == 1
         assert "cannot be removed: Permission denied" in errors
+
+
+def test_file_of_somebody_else_that_an_earlier_version_has_tracked_stays(answer, make_run, tmp_path):
+    folder = tmp_path / "outputs" / "tiny"
+    folder.mkdir(parents=True)
+    (folder / "notes.txt").write_text("precious")
+    make_run(also=["notes.txt"])
+    code, printed, _ = answer("prune", "what=folders", "apply=true")
+    assert code == 0
+    assert f"{folder} stays, with what is not the run's" in printed
+    assert [file.name for file in folder.iterdir()] == ["notes.txt"]
+
+
+def test_policy_is_counted_and_goes_with_its_folder(answer, make_run, tmp_path):
+    make_run(policy={"MLmodel": bytes(10_000), "artifacts/more/policy.pt2": bytes(20_000)})
+    (row,) = json.loads(answer("list", "format=json")[1])
+    assert 33_000 < row["folder_bytes"] < 35_000
+    assert answer("prune", "what=folders", "apply=true")[0] == 0
+    assert not (tmp_path / "outputs" / "tiny").exists()
+
+
+def test_files_beside_a_policy_that_are_not_the_runs_stay(answer, make_run, tmp_path):
+    make_run(policy={"MLmodel": b"m", "artifacts/policy.pt2": b"p"})
+    mine = tmp_path / "outputs" / "tiny" / "policy" / "artifacts" / "mine.txt"
+    mine.write_text("mine")
+    assert answer("prune", "what=folders", "apply=true")[0] == 0
+    assert [file for file in (tmp_path / "outputs").rglob("*") if file.is_file()] == [mine]
+
+
+def test_removal_that_is_interrupted_can_be_tried_again(answer, make_run, monkeypatch, tmp_path):
+    run_id = make_run()
+
+    def interrupted(folder):
+        (Path(folder) / "best.pt").unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(removal.shutil, "rmtree", interrupted)
+        assert answer("prune", "what=runs", "apply=true")[0] == 130
+    (row,) = json.loads(answer("list", "format=json")[1])
+    assert row["run_id"] == run_id
+    assert removal.REMOVED_TAG not in answer("show", run_id)[1]
+    assert answer("prune", "what=runs", "apply=true")[0] == 0
+    assert ids_in(tmp_path) == set()
+    assert artifacts_of(tmp_path, run_id) == []
+
+
+KILLED_IN_THE_MIDDLE = """
+import os
+from pathlib import Path
+from armscan import runs
+from armscan.inventory import removal
+
+def killed(folder):
+    (Path(folder) / "best.pt").unlink()
+    os.kill(os.getpid(), 9)
+
+removal.shutil.rmtree = killed
+runs.main(["prune", "what=runs", "apply=true"])
+"""
+
+
+def test_rest_of_a_removal_that_was_killed_is_removed_but_not_what_somebody_has_deleted(
+    answer, make_run, store, tmp_path
+):
+    run_id = make_run()
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    killed = subprocess.run([sys.executable, "-c", KILLED_IN_THE_MIDDLE], cwd=tmp_path, env=environment, check=False)
+    assert killed.returncode == -9
+    deleted = make_run("deleted")
+    store[0].delete_run(deleted)
+    assert answer("list", "format=json")[1] == "[]\n"
+    assert artifacts_of(tmp_path, run_id) == ["config.yaml", "last.pt"]
+    for what in ("checkpoints", "folders"):
+        assert "0 of 0 runs" in answer("prune", f"what={what}")[1]
+    code, printed, _ = answer("prune", "what=runs", "apply=true")
+    assert code == 0
+    assert f"{run_id} removed" in printed
+    assert ids_in(tmp_path) == {deleted}
+    assert artifacts_of(tmp_path, run_id) == []
+    assert not (tmp_path / "outputs" / "tiny").exists()
+    assert (tmp_path / "outputs" / "deleted" / "best.pt").exists()
+    assert len(artifacts_of(tmp_path, deleted)) == 3
+
+
+@pytest.mark.parametrize("what", ["folders", "runs"])
+def test_note_of_a_run_goes_with_its_folder(answer, make_run, monkeypatch, tmp_path, what):
+    monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
+    run_id = make_run()
+    # As a run leaves it whose rest was delivered by `armscan.track sync`.
+    note = tmp_path / "cache" / leftovers.FOLDER / run_id
+    note.write_text(str(file_of(tmp_path / "outputs" / "tiny", run_id)))
+    assert answer("prune", f"what={what}", "apply=true")[0] == 0
+    assert not note.exists()

@@ -104,6 +104,37 @@ def test_run_is_left_that_somebody_has_begun_to_use_since_it_was_planned(store, 
     assert len(client.list_artifacts(run_id)) == 3
 
 
+@pytest.mark.parametrize("what", ["checkpoints", "folders", "runs"])
+def test_what_another_prune_has_removed_is_no_failure(store, make_run, answer, monkeypatch, capsys, tmp_path, what):
+    run_id, client = make_run(), store[0]
+    shared = make_run("shared", tags={"host": "elsewhere"})
+    planned = plan(client, find(client, read_selection({})), "runs", Sizes(client))
+    for case in planned:
+        remove(client, case, "runs")
+    assert runs._carry_out(client, planned, what) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert {f"{each} stays: it is not there any more" for each in (run_id, shared)} <= set(printed.out.splitlines())
+    assert not (tmp_path / "outputs" / "tiny").exists()
+
+
+@pytest.mark.parametrize("step", ["set_tag", "delete_run"])
+def test_run_that_another_prune_removes_between_two_steps_is_no_failure(store, make_run, monkeypatch, capsys, step):
+    client = store[0]
+    make_run(tags={"host": "elsewhere"})
+    planned = plan(client, find(client, read_selection({})), "runs", Sizes(client))
+
+    def late(*arguments):
+        monkeypatch.undo()
+        remove(client, planned[0], "runs")
+        return getattr(client, step)(*arguments)
+
+    monkeypatch.setattr(client, step, late, raising=False)
+    assert runs._carry_out(client, planned, "runs") == 0
+    printed = capsys.readouterr()
+    assert (printed.err, printed.out.count("stays: it is not there any more")) == ("", 1)
+
+
 def test_run_that_goes_on_ends_as_if_nothing_had_been_removed_beside_it(store, make_run, answer, tmp_path):
     old = make_run("old")
     words = ["agent=random", "data.n_training=1", "data.n_validation=1", "data.n_test=1", "evaluation.episodes=300"]

@@ -126,3 +126,9 @@ def test_spool_is_taken_over_with_what_is_delivered_of_it(spool, tmp_path):
     assert kinds(again.next_entries("figures", 10)[0]) == ["tags"]
     again.close()
     take_over("c" * 32, tmp_path, tmp_path / "retry")
+
+
+def test_spool_that_is_not_there_is_not_made(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        Spool(file_of(tmp_path / "gone", ADDRESS.run_id))
+    assert not list(tmp_path.iterdir())
