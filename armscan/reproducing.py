@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from armscan.errors import InvalidValueError, TrackingError
 from armscan.experiment import carry_out
-from armscan.files import DIFF_FILE, ENVIRONMENT_FILE, held
+from armscan.files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, held
 from armscan.invocation import Invocation
 from armscan.judging.subject import from_its_folder
 from armscan.multirun import remove_if_untracked
@@ -28,7 +28,6 @@ from armscan.training import check_unchanged
 
 # Of a run that was made again: which one it is of, and whether the same came of it.
 OF_TAG, SAME_TAG = "reproduction.of", "reproduction.is_same"
-FILE = "reproduction.json"
 # Packages that are named of those whose versions seldom matter.
 N_SHOWN = 8
 ENDED = ("FINISHED", "FAILED", "KILLED")
@@ -161,7 +160,7 @@ def reproduced(original: Original, folder: Path, differing: Sequence[str]) -> Co
         raise
     comparison = compared(run.client, run.run_id, tracked.run_id)
     facts = {"of": run.run_id, "run": tracked.run_id, "differences": list(differing), **comparison.to_dict()}
-    (folder / FILE).write_text(json.dumps(facts, indent=1))
+    (folder / REPRODUCTION_FILE).write_text(json.dumps(facts, indent=1))
     run.client.set_tag(tracked.run_id, SAME_TAG, str(comparison.is_same).lower())
-    run.client.log_artifact(tracked.run_id, str(folder / FILE))
+    run.client.log_artifact(tracked.run_id, str(folder / REPRODUCTION_FILE))
     return comparison
