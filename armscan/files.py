@@ -28,6 +28,7 @@ RESUMED_DIFF_FILE = "resumed_{0}_" + DIFF_FILE
 EVALUATION_FILE, CURVE_FILE, FILM_FILE, RUN_FILE = "evaluation.json", "learning_curve.png", "episode.gif", "run.json"
 # Whether the same came of it as of the run that it repeats.
 REPRODUCTION_FILE = "reproduction.json"
+RECORDS = (RUN_FILE, REPRODUCTION_FILE)
 POLICY_FOLDER = "policy"
 # All that a run makes in its folder, beside what Hydra and the spool leave there: before it is tracked, and after.
 STARTED_WITH = (CONFIG_FILE, VOLUMES_FILE, ENVIRONMENT_FILE, DIFF_FILE)
@@ -113,7 +114,7 @@ def _sync_folder(folder: Path) -> None:
 def is_made_by_run(name: str) -> bool:
     """Whether a file of this name, relative to the folder of a run, is one that runs make there."""
     return (
-        name in (*STARTED_WITH, *RESULTS, RUN_FILE, REPRODUCTION_FILE)
+        name in (*STARTED_WITH, *RESULTS, *RECORDS)
         or fnmatch.fnmatchcase(name, RESUMED_DIFF_FILE.format("*"))
         or name.startswith(f"{POLICY_FOLDER}/")
     )

@@ -21,8 +21,8 @@ from armscan.files import (
     LAST_CHECKPOINT,
     LOCK_FILE,
     POLICY_FOLDER,
+    RECORDS,
     RESULTS,
-    RUN_FILE,
     SPOOLS,
     STARTED_WITH,
     SUM_TAGS,
@@ -35,7 +35,7 @@ from armscan.tracking.spool import DELIVERED, LOCK, SUFFIX, Spool, SpoolFile, fi
 
 CHECKPOINTS = (LAST_CHECKPOINT, BEST_CHECKPOINT)
 # The spool names what a run has kept beside these.
-USUAL = (*RESULTS, *STARTED_WITH, RUN_FILE)
+USUAL = (*RESULTS, *STARTED_WITH, *RECORDS)
 HYDRA_FOLDER = ".hydra"
 HYDRA_FILES = tuple(f"{HYDRA_FOLDER}/{name}.yaml" for name in ("config", "hydra", "overrides"))
 
