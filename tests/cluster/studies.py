@@ -33,7 +33,13 @@ WAITING = [
 # Trials that train, in epochs of a second or less.
 TRAINING = [
     *("sweeps=sac_y", "study/pruner=none", "study.max_retries=3", "training.epoch_env_steps=200", *FEW_VOLUMES),
-    *("training.validation_episodes=2", "evaluation.episodes=3", "env.max_steps=8", "agent.random_env_steps=100"),
+    *(
+        "training.validation_episodes=2",
+        "evaluation.episodes=3",
+        "env.max_steps=8",
+        "agent.random_env_steps=100",
+        "tracking.policy=false",
+    ),
     *("agent.batch_size=32", "network.vector.hidden_sizes=[16]"),
 ]
 WAIT_S, END_S = 120.0, 180.0

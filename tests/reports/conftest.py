@@ -13,7 +13,12 @@ from armscan.training import Episode, Evaluation
 
 SMALL = [
     *("data.n_training=1", "data.n_validation=1", "data.n_test=2", "training.env_steps=400", "env.max_steps=6"),
-    *("training.epoch_env_steps=100", "training.validation_episodes=2", "evaluation.episodes=6"),
+    *(
+        "training.epoch_env_steps=100",
+        "training.validation_episodes=2",
+        "evaluation.episodes=6",
+        "tracking.policy=false",
+    ),
     *("agent.num_envs=4", "agent.batch_size=16", "network=mlp", "network.hidden_sizes=[8]"),
 ]
 AGENTS = {"sac": ["agent.random_env_steps=60"], "ppo": ["agent.env_steps_per_collection=100"]}

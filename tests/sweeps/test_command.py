@@ -77,6 +77,10 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
     by_id = {each.info.run_id: each for each in runs}
     assert {each.info.status for each in runs} == {"FINISHED"}
+    # Of all that was trained, only what judges keeps its policy.
+    kept = [each.data.tags["folder"] for each in runs if each.data.tags.get("policy") == "kept"]
+    assert kept == [str(model.parent.parent) for model in tmp_path.glob("studies/**/MLmodel")]
+    assert "/judged/" in kept[0]
     storage = open_storage(str(tmp_path / "optuna.journal")).optuna
     (study_run,) = [each for each in runs if each.info.run_name == "study sac_y"]
     for trial in trials_of(tmp_path):
