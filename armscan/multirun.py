@@ -146,7 +146,9 @@ class Job:
         folder = Path(hydra_config.sweep.dir)
         word = json.loads((folder / PARENT_FILE).read_text())
         overrides = list(hydra_config.overrides.task)
-        varied = [override for override in overrides if override not in word["overrides"]]
+        # Hydra hands a truth value on as it writes it, False for false.
+        common = {override.lower() for override in word["overrides"]}
+        varied = [override for override in overrides if override.lower() not in common]
         return cls(
             hydra_config.job.num,
             shlex.join(overrides),
