@@ -40,6 +40,21 @@ def dataset(data_folder):
     return read_dataset(data_folder)
 
 
+@pytest.fixture
+def wrists(tmp_path, data_folder):
+    """A folder of volumes whose manifest splits them."""
+    import yaml
+
+    folder = tmp_path / "wrists"
+    shutil.copytree(data_folder, folder)
+    entries = json.loads((folder / "optimal_actions.json").read_text())
+    (folder / "optimal_actions.json").unlink()
+    names = list(entries)
+    splits = {"train": names[:2], "validation": [names[2]], "test": [names[3]]}
+    (folder / "manifest.yaml").write_text(yaml.safe_dump({"volumes": entries, "splits": splits}))
+    return folder
+
+
 @pytest.fixture(scope="session")
 def golden():
     """What an independent implementation saw in slices of these labelmaps."""

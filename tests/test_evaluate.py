@@ -221,19 +221,6 @@ def test_run_that_has_not_kept_what_it_was_trained_on_is_refused_by_its_network(
     assert "the checkpoint is another agent's or network's" in errors
 
 
-@pytest.fixture
-def wrists(tmp_path, data_folder):
-    """A folder of volumes whose manifest splits them."""
-    folder = tmp_path / "wrists"
-    shutil.copytree(data_folder, folder)
-    entries = json.loads((folder / "optimal_actions.json").read_text())
-    (folder / "optimal_actions.json").unlink()
-    names = list(entries)
-    splits = {"train": names[:2], "validation": [names[2]], "test": [names[3]]}
-    (folder / "manifest.yaml").write_text(yaml.safe_dump({"volumes": entries, "splits": splits}))
-    return folder
-
-
 ON_FILES = {"few": ["data=nifti", "data.path=wrists", "env.max_steps=2"]}
 
 

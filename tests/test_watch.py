@@ -12,7 +12,7 @@ from PIL import Image, ImageChops
 from armscan import evaluate, watch
 from armscan.training import load_checkpoint, save_checkpoint
 
-from .test_evaluate import FEW, GUESSER, ON_FILES, tracked, wrists  # noqa: F401
+from .test_evaluate import FEW, GUESSER, ON_FILES, tracked
 
 EPISODE = re.compile(r"^(.+): (\S+), seed (\d+): (no )?success after (\d+) steps?, ([\d.]+) mm", re.MULTILINE)
 GUESSER_OF_ANYTHING = ["agent=sac", "~agent.network", "agent._target_=tests.test_evaluate.GuesserOfAnything"]
@@ -85,7 +85,7 @@ def test_film_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(a
         at += ms // 100
 
 
-def test_film_goes_over_every_split_of_a_folder_and_says_what_is_known(answer, tmp_path, wrists):  # noqa: F811
+def test_film_goes_over_every_split_of_a_folder_and_says_what_is_known(answer, tmp_path, wrists):
     run_id = tracked(tmp_path, "projection=zy", agent=GUESSER, **ON_FILES)
     code, printed, errors = answer(f"run={run_id}", "data=wrists", "episodes=1", "out=elsewhere/films")
     assert (code, errors) == (0, "")

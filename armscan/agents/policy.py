@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -57,5 +58,5 @@ def batch_of(observations: Sequence[Observed]) -> Batch:
     """Returns single observations, one of them at least, as one batch of tensors."""
     parts = [parts_of(observation) for observation in observations]
     stacked = {name: np.stack([each[name] for each in parts]) for name in parts[0]}
-    batch: Batch = observation_of({name: torch.from_numpy(array) for name, array in stacked.items()})  # type: ignore
-    return batch
+    tensors: Any = {name: torch.from_numpy(array) for name, array in stacked.items()}
+    return cast(Batch, observation_of(tensors))

@@ -6,6 +6,7 @@ import contextlib
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from mlflow.entities import LifecycleStage, Run
 from mlflow.exceptions import MlflowException
@@ -125,8 +126,8 @@ def _remove_artifacts(client: TrackingStore, run: Run) -> None:
     folder = local_artifacts(run)
     try:
         if folder is None:
-            kept = get_artifact_repository(run.info.artifact_uri, tracking_uri=client.mlflow.tracking_uri)
-            kept.delete_artifacts()  # type: ignore[no-untyped-call]
+            kept: Any = get_artifact_repository(run.info.artifact_uri, tracking_uri=client.mlflow.tracking_uri)
+            kept.delete_artifacts()
         elif folder.is_dir():
             _remove_tree(folder)
             if folder.parent.name == run.info.run_id:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +70,7 @@ class Film:
         def look() -> None:
             if latest:
                 self.add(_titled(latest.pop(), title))
-            latest.append(env.render())  # type: ignore[arg-type]
+            latest.append(cast(Picture, env.render()))
 
         episode = play(agent, env, volume_name, seed, look)
         self.add(_titled(latest.pop(), title and f"{title}: {outcome(episode)}"), LAST_FRAME_MS)

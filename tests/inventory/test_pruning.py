@@ -72,14 +72,22 @@ def test_runs_are_gone_with_all_that_they_took(answer, make_run, tmp_path):
             assert not database.execute(f"select * from {table} where run_uuid = ?", (old,)).fetchall()
 
 
-def stays(answer, run_id, reason, what="runs", n_touched=0, run_words=()):
+def kept_files():
+    """The checkpoints and configurations below the folder that the command is in, with their contents."""
+    return {file: file.read_bytes() for file in Path.cwd().rglob("*") if file.suffix in (".pt", ".yaml")}
+
+
+def assert_stays(answer, run_id, reason, what="runs", n_touched=0, run_words=()):
     """Checks that a run is left with a reason, in the dry run and where it counts, and that this is no failure."""
     planned = answer("prune", f"what={what}", *run_words)[1]
+    kept = kept_files()
     assert f"{run_id[:8]} stays: {reason}" in planned, planned
     code, printed, errors = answer("prune", f"what={what}", "apply=true", *run_words)
     assert (code, errors) == (0, "")
     assert f"{run_id} stays: {reason}" in printed
     assert f"{what} of {n_touched} of " in printed
+    assert run_id in answer("list", "children=true", "format=csv")[1]
+    assert n_touched or kept_files() == kept
 
 
 WHAT = pytest.mark.parametrize("what", ["checkpoints", "folders", "runs"])
@@ -90,7 +98,7 @@ def test_folder_that_another_process_holds_is_left(answer, make_run, locked, sna
     run_id = make_run()
     before = snapshot()
     locked(tmp_path / "outputs" / "tiny" / LOCK_FILE)
-    stays(answer, run_id, "another process is at work in its folder", what)
+    assert_stays(answer, run_id, "another process is at work in its folder", what)
     assert snapshot().keys() - before.keys() == {tmp_path / "outputs" / "tiny" / LOCK_FILE}
     assert ids_in(tmp_path) == {run_id}
 
@@ -99,7 +107,7 @@ def test_folder_that_another_process_holds_is_left(answer, make_run, locked, sna
 def test_spool_that_another_process_holds_is_left(answer, make_run, locked, tmp_path, what):
     run_id = make_run()
     locked(file_of(tmp_path / "outputs" / "tiny", run_id).with_suffix(".lock"))
-    stays(answer, run_id, "another process is at work in its folder", what)
+    assert_stays(answer, run_id, "another process is at work in its folder", what)
 
 
 @WHAT
@@ -108,7 +116,7 @@ def test_what_is_not_delivered_is_left(answer, make_run, tmp_path, what):
     with file_of(tmp_path / "outputs" / "tiny", run_id).open("a") as spool:
         spool.write('{"tags": {"a": "b"}}\n')
     folder = tmp_path / "outputs" / "tiny"
-    stays(answer, run_id, f"not all of it is delivered: python -m armscan.track sync {folder} does that", what)
+    assert_stays(answer, run_id, f"not all of it is delivered: python -m armscan.track sync {folder} does that", what)
 
 
 def test_what_is_not_delivered_is_left_where_no_host_was_noted(answer, make_run, tmp_path):
@@ -116,14 +124,14 @@ def test_what_is_not_delivered_is_left_where_no_host_was_noted(answer, make_run,
     run_id, _ = no_host(folder, make_run)
     with file_of(folder, run_id).open("a") as spool:
         spool.write('{"tags": {"a": "b"}}\n')
-    stays(answer, run_id, "not all of it is delivered")
+    assert_stays(answer, run_id, "not all of it is delivered")
 
 
 @WHAT
 def test_damaged_spool_is_left(answer, make_run, tmp_path, what):
     run_id = make_run()
     file_of(tmp_path / "outputs" / "tiny", run_id).write_text("no entry\n")
-    stays(answer, run_id, "what it was to be tracked with cannot be read: ", what)
+    assert_stays(answer, run_id, "what it was to be tracked with cannot be read: ", what)
 
 
 @WHAT
@@ -131,13 +139,13 @@ def test_run_of_a_registered_model_version_is_left(answer, make_run, store, what
     run_id = make_run()
     store[0].create_registered_model("wrist")
     store[0].create_model_version("wrist", source=store[0].get_run(run_id).info.artifact_uri, run_id=run_id)
-    stays(answer, run_id, "a version of a registered model is kept by it", what)
+    assert_stays(answer, run_id, "a version of a registered model is kept by it", what)
 
 
 @WHAT
 def test_run_of_a_newer_armscan_is_listed_and_shown_and_left(answer, make_run, what):
     run_id = make_run(tags={"armscan.version": "99.1.0"})
-    stays(answer, run_id, "it was made by armscan 99.1.0, which is newer than this", what)
+    assert_stays(answer, run_id, "it was made by armscan 99.1.0, which is newer than this", what)
     assert run_id[:8] in answer("list")[1]
     assert "99.1.0" in answer("show", run_id)[1]
 
@@ -147,7 +155,7 @@ def test_children_of_a_parent_that_is_running_are_left(answer, make_run, store, 
     client, experiment_id = store
     parent_id = client.create_run(experiment_id, name="study", tags={}).info.run_id
     run_id = make_run(parent_id=parent_id)
-    stays(answer, run_id, f"its parent, run {parent_id}, is RUNNING", what)
+    assert_stays(answer, run_id, f"its parent, run {parent_id}, is RUNNING", what)
     client.set_terminated(parent_id, "FINISHED")
     assert "1 of 2 runs" in answer("prune", f"what={what}")[1] or what == "runs"
 
@@ -157,7 +165,7 @@ def test_parent_stays_with_a_child_that_stays_and_goes_with_all(answer, make_run
     parent_id = client.create_run(experiment_id, name="multirun", tags={}).info.run_id
     client.set_terminated(parent_id, "FINISHED")
     children = [make_run(f"job{number}", parent_id=parent_id) for number in range(2)]
-    stays(
+    assert_stays(
         answer,
         parent_id,
         f"2 of its children stay, such as run {min(children)}",
@@ -166,7 +174,7 @@ def test_parent_stays_with_a_child_that_stays_and_goes_with_all(answer, make_run
     shutil.rmtree(tmp_path / "outputs" / "job1")
     (tmp_path / "outputs" / "job0" / LOCK_FILE).touch()
     locked(tmp_path / "outputs" / "job0" / LOCK_FILE)
-    stays(answer, parent_id, f"1 of its children stay, such as run {children[0]}", n_touched=1)
+    assert_stays(answer, parent_id, f"1 of its children stay, such as run {children[0]}", n_touched=1)
     assert ids_in(tmp_path) == {parent_id, children[0]}
 
 
@@ -183,7 +191,7 @@ def test_parent_goes_with_its_children(answer, make_run, store, tmp_path):
 def test_run_that_could_go_on_keeps_its_folder(answer, make_run, store, what):
     run_id = make_run()
     store[0].update_run(run_id, status="RUNNING")
-    stays(answer, run_id, "it is RUNNING, and could be gone on with from there", what)
+    assert_stays(answer, run_id, "it is RUNNING, and could be gone on with from there", what)
 
 
 def test_dead_run_is_removed_where_it_is_certain_and_left_where_it_is_not(answer, make_run, store, tmp_path):
@@ -247,7 +255,7 @@ def test_folder_that_is_not_certainly_the_runs_is_left_and_said_so(answer, make_
     run_id, reason = change(folder, make_run)
     before = {file for file in snapshot() if file.is_relative_to(folder)}
     if what == "folders":
-        stays(answer, run_id, reason, what)
+        assert_stays(answer, run_id, reason, what)
     else:
         code, printed, errors = answer("prune", "what=runs", "apply=true")
         assert (code, errors) == (0, "")
@@ -262,7 +270,7 @@ def test_folder_of_two_runs_is_left(answer, make_run, tmp_path):
     first, second = make_run(folder=folder), make_run(folder=folder)
     # As versions did that had no spools.
     shutil.rmtree(folder / "tracking")
-    stays(answer, first, f"{folder} is the folder of run {second}, too", "folders")
+    assert_stays(answer, first, f"{folder} is the folder of run {second}, too", "folders")
     assert (folder / "best.pt").exists()
 
 
@@ -290,7 +298,7 @@ def test_artifacts_that_have_no_place_of_their_own_are_left(answer, make_run, tm
     run_id = make_run()
     with sqlite3.connect(tmp_path / "mlruns.db") as database:
         database.execute("update runs set artifact_uri = ?", ((tmp_path / "outputs").as_uri(),))
-    stays(answer, run_id, "its artifacts are in file://")
+    assert_stays(answer, run_id, "its artifacts are in file://")
     assert (tmp_path / "outputs" / "tiny").exists()
 
 
@@ -314,15 +322,21 @@ def test_run_that_cannot_be_removed_is_one_line_and_the_rest_goes_on(answer, mak
     assert ids_in(tmp_path) == set()
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere: run the tests as another user")
-def test_artifacts_and_folders_that_may_not_be_written_are_one_line(answer, make_run, tmp_path):
-    make_run()
-    for folder in (Path(tmp_path / "outputs" / "tiny"), *tmp_path.glob("mlartifacts/*/artifacts")):
-        folder.chmod(0o555)
-    for what in ("checkpoints", "runs"):
-        code, _, errors = answer("prune", f"what={what}", "apply=true")
-        assert code == 1
-        assert "cannot be removed: Permission denied" in errors
+@WHAT
+def test_folder_that_may_not_be_written_is_left(answer, make_run, made_read_only, tmp_path, what):
+    run_id = make_run()
+    with made_read_only(tmp_path / "outputs" / "tiny"):
+        assert_stays(answer, run_id, "nobody knows whether another process is at work in its folder", what)
+
+
+def test_artifacts_that_may_not_be_written_are_one_line_and_the_run_stays(answer, make_run, made_read_only, tmp_path):
+    run_id = make_run()
+    (artifacts,) = tmp_path.glob("mlartifacts/*/artifacts")
+    with made_read_only(artifacts):
+        code, _, errors = answer("prune", "what=runs", "apply=true")
+    assert code == 1
+    assert "cannot be removed: Read-only file system" in errors
+    assert ids_in(tmp_path) == {run_id}
 
 
 def test_file_of_somebody_else_that_an_earlier_version_has_tracked_stays(answer, make_run, tmp_path):

@@ -57,7 +57,8 @@ def test_verdict_leaves_out_figures_that_some_seeds_lack():
 def test_verdict_leaves_the_draws_of_others_alone(monkeypatch):
     for name in ("choice", "randint", "seed"):
         monkeypatch.setattr(np.random, name, pytest.fail)
-    verdicts([judged(0, figures_of([float(seed), 3.0])) for seed in range(3)])
+    (verdict,) = verdicts([judged(0, figures_of([float(seed), 3.0])) for seed in range(3)])
+    assert verdict.n_seeds == 3
 
 
 def test_verdict_on_one_volume_has_the_interval_of_rliable():

@@ -26,6 +26,7 @@ def test_params_of_any_configuration_are_taken_and_none_is_lost(config):
 def test_tags_of_any_name_are_taken(key):
     for name, value in tags_of({key: "x" * (MAX_TAG_CHARS + 1)}).items():
         _validate_tag(name, value)
+        assert len(value) == MAX_TAG_CHARS
 
 
 @pytest.mark.parametrize("key", ["agent.lr", "env.transform.rz_deg", "volumes.training", "a b/c:d-e", "x" * 250])
