@@ -3,15 +3,24 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup
 
-.PHONY: run test test-slow lint clean
+.PHONY: run test test-rest test-full test-slow lint clean
 
 # Trains, evaluates and tracks the default agent on phantom wrists; ARGS="projection=zy" changes what is run.
 run: $(INSTALLED)
 	$(BIN)/python -m armscan.run $(ARGS)
 
+# About five minutes on two cores: without servers, clusters, browsers and runs in processes of their own.
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" $(ARGS)
+	$(PYTEST) -m "not full and not slow" $(ARGS)
+
+# What `make test` leaves out of `make test-full`.
+test-rest: $(INSTALLED)
+	$(PYTEST) -m "full and not slow" $(ARGS)
+
+test-full: $(INSTALLED)
+	$(PYTEST) -m "not slow" $(ARGS)
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow $(ARGS)
@@ -20,6 +29,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 clean:
 	rm -rf $(VENV)

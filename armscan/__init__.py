@@ -11,6 +11,6 @@ ENV_ID = "armscan/Armscan-v0"
 
 gymnasium.register(
     id=ENV_ID,
-    entry_point="armscan.envs.making:make_armscan_env",
-    vector_entry_point="armscan.envs.making:make_armscan_vector_env",
+    entry_point="armscan.envs.factory:make_armscan_env",
+    vector_entry_point="armscan.envs.factory:make_armscan_vector_env",
 )

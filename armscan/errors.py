@@ -53,7 +53,7 @@ class CheckpointError(ArmscanError, ValueError):
 
 
 class ChangedVolumesError(ArmscanError, ValueError):
-    """Volumes are not those any more that a run or a checkpoint is of."""
+    """The volumes differ from those that the run or checkpoint was made with."""
 
 
 class FolderInUseError(ArmscanError, RuntimeError):
@@ -61,7 +61,7 @@ class FolderInUseError(ArmscanError, RuntimeError):
 
 
 class FolderTakenError(ArmscanError, ValueError):
-    """Somebody else's file is in the folder of a new run, where the run would make one of that name."""
+    """The folder of a new run contains a file, not made by a run, that the run would overwrite."""
 
 
 class ResumeError(ArmscanError, RuntimeError):
@@ -85,7 +85,7 @@ class TrackingAwayError(TrackingError, AwayError):
 
 
 class StudyError(ArmscanError, RuntimeError):
-    """A study cannot be started or gone on with."""
+    """A study cannot be started or resumed."""
 
 
 class StorageAwayError(StudyError, AwayError):
@@ -115,6 +115,6 @@ def is_interruption(error: BaseException | None) -> bool:
 
 
 def listed(allowed: Iterable[object]) -> str:
-    """Returns the allowed values as they are written in a message: 'a, b or c'."""
+    """Return the allowed values as they are written in a message: 'a, b or c'."""
     names = [str(value) for value in allowed]
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + f" or {names[-1]}"

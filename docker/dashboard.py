@@ -11,12 +11,11 @@ import sys
 
 from sqlalchemy import make_url
 
-from armscan.sweeps.storage import open_storage
+from armscan.sweeps.storage.storage import open_storage
 
 PROGRAM = "optuna-dashboard"
 
 uri = os.environ["ARMSCAN_STORAGE"]
-open_storage(uri, where="ARMSCAN_STORAGE", is_patient=True)
-# Everybody can read the words of a process: a password that stands in the address is not passed on with them.
-address = make_url(uri).set(drivername="postgresql+psycopg").render_as_string(hide_password=True)
-os.execvp(PROGRAM, [PROGRAM, address, *sys.argv[1:]])
+open_storage(uri, where="ARMSCAN_STORAGE", retry=True)
+address = make_url(uri).set(drivername="postgresql+psycopg")
+os.execvp(PROGRAM, [PROGRAM, str(address), *sys.argv[1:]])

@@ -6,7 +6,7 @@ import socket
 import sys
 from pathlib import Path
 
-from armscan.sweeps.supervising import local_workers
+from armscan.sweeps.workers.supervisor import local_workers
 
 starts = Path("studies").glob(f"*/workers/*_{socket.gethostname()}_*")
 sys.exit(0 if any(local_workers(folder) for folder in starts) else 1)

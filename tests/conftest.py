@@ -12,11 +12,31 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from armscan.utils.threads import limit_threads
+from tests.support.requirements import unavailable
+
+# As a run does: tests run on all cores already.
+limit_threads()
+
 # Whatever is compiled at first, or waits for a busy machine, takes longer than any deadline.
 settings.register_profile("armscan", deadline=None)
 settings.load_profile("armscan")
 
 DATA = Path(__file__).parent / "data"
+# Tests that start servers, clusters or browsers, or compare six real runs, are left to `make test-full`.
+FULL_FIXTURES = {"postgres_programs", "small_disk", "cluster", "look", "browser", "runs"}
+# Fixtures that take seconds to make and are shared by a module: its tests that use one run on one worker.
+SHARED_FIXTURES = ("runs", "made", "server", "cluster")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if FULL_FIXTURES.intersection(item.fixturenames):
+            item.add_marker(pytest.mark.full)
+        for name in SHARED_FIXTURES:
+            if name in item.fixturenames:
+                item.add_marker(pytest.mark.xdist_group(f"{item.path.stem} {name}"))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -31,6 +51,12 @@ def phantom_cache(tmp_path_factory):
 def data_folder():
     """Four full-size labelmaps with their manifest."""
     return DATA / "volumes"
+
+
+@pytest.fixture(scope="session")
+def more_volumes():
+    """Returns the folder of four further labelmaps, which only slow tests read."""
+    return DATA / "more_volumes"
 
 
 @pytest.fixture(scope="session")
@@ -119,7 +145,7 @@ def unseen_windows():
     from matplotlib import pyplot
 
     before = pyplot.get_backend()
-    pyplot.switch_backend("module://tests.unseen")
+    pyplot.switch_backend("module://tests.support.unseen")
     yield
     pyplot.close("all")
     pyplot.switch_backend(before)
@@ -133,7 +159,7 @@ def made_read_only():
     def read_only(folder):
         mounts = (["--bind", str(folder), str(folder)], ["-o", "remount,ro,bind", str(folder)])
         if shutil.which("mount") is None or subprocess.run(["mount", *mounts[0]], check=False).returncode:
-            pytest.skip("a read-only disk cannot be mounted here: it needs root")
+            unavailable("a read-only disk cannot be mounted here: it needs root")
         try:
             subprocess.run(["mount", *mounts[1]], check=True)
             yield
@@ -146,17 +172,17 @@ def made_read_only():
 @pytest.fixture(scope="session")
 def postgres_programs():
     """The folder of PostgreSQL's programs, which tests that start a server of their own need, too."""
-    from tests.postgres import programs
+    from tests.support.postgres import programs
 
     if (folder := programs()) is None:
-        pytest.skip("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
+        unavailable("PostgreSQL's initdb and postgres are not installed: apt-get install postgresql")
     return folder
 
 
 @pytest.fixture(scope="session")
 def postgres(postgres_programs):
     """A server for all tests of this process."""
-    from tests.postgres import postgres_server
+    from tests.support.postgres import postgres_server
 
     with postgres_server() as server:
         yield server
@@ -165,10 +191,53 @@ def postgres(postgres_programs):
 @pytest.fixture(scope="session")
 def tracking_server(postgres, tmp_path_factory):
     """An MLflow server that keeps its runs in PostgreSQL, for all tests of this process."""
-    from tests.mlflow_server import mlflow_server
+    from tests.support.mlflow_server import mlflow_server
 
     with mlflow_server(tmp_path_factory.mktemp("mlflow"), postgres.make_database()) as server:
         yield server
+
+
+@pytest.fixture(scope="session")
+def empty_database(tmp_path_factory):
+    """A database with MLflow's tables, which take a second or more to make."""
+    from armscan.tracking import open_store
+
+    folder = tmp_path_factory.mktemp("store")
+    open_store(f"sqlite:///{folder}/mlruns.db", experiment="unused", artifacts=str(folder / "artifacts"), wait_s=60.0)
+    return folder / "mlruns.db"
+
+
+@pytest.fixture
+def database(tmp_path, empty_database):
+    """Returns the address of an empty tracking database in the test's folder, `mlruns.db`."""
+    shutil.copy(empty_database, tmp_path)
+    return f"sqlite:///{tmp_path}/mlruns.db"
+
+
+@pytest.fixture
+def browser(tmp_path):
+    """Chromium with a profile of its own."""
+    from tests.support.browser import chromium, programs
+
+    if programs() is None:
+        unavailable("Chromium or its driver is not installed: apt-get install chromium chromium-driver")
+    with chromium(tmp_path / "profile") as started:
+        yield started
+
+
+@pytest.fixture
+def armscan(tmp_path, monkeypatch, capsys):
+    """Runs `armscan` in this process, in an empty folder; returns its exit code and what it printed."""
+    from armscan.cli.main import main
+
+    def command(*words, cwd=tmp_path):
+        monkeypatch.chdir(cwd)
+        capsys.readouterr()
+        code = main(words)
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err.strip()
+
+    return command
 
 
 @pytest.fixture
@@ -177,7 +246,7 @@ def answer(tmp_path, monkeypatch, capsys):
     from hydra.core.global_hydra import GlobalHydra
 
     from armscan import run
-    from armscan.multirun import Multirun
+    from armscan.launch.multirun import Multirun
 
     def command(*arguments):
         monkeypatch.chdir(tmp_path)

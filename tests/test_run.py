@@ -6,8 +6,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
-import zipfile
 from collections import Counter
 from pathlib import Path
 
@@ -16,18 +14,19 @@ import pytest
 import torch
 from mlflow import MlflowClient
 
-from armscan.files import sum_of
+from armscan.utils.files import sha256
+from tests.support.waiting import HANG_S, wait_until
 
 SMALL = [
     "data.n_training=1",
     "data.n_validation=1",
     "data.n_test=1",
     "training.env_steps=400",
-    "training.epoch_env_steps=200",
+    "training.eval_every_env_steps=200",
     "training.validation_episodes=2",
     "evaluation.episodes=3",
     "env.max_steps=8",
-    "agent.random_env_steps=100",
+    "agent.learning_starts=100",
     "agent.batch_size=32",
     "network=mlp",
     "network.hidden_sizes=[16]",
@@ -59,16 +58,17 @@ def runs_in(folder):
     return client, client.search_runs([experiment.experiment_id])
 
 
+@pytest.mark.full
 def test_run_trains_evaluates_and_tracks(tmp_path, monkeypatch):
     words = [*SMALL, "seed=3", "tracking.policy=true"]
     ended = armscan_run(*words, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
-    for word in ("400/400 steps", "return", "success", "left", "test volumes", "armscan.ui", "episode.gif"):
+    for word in ("400/400 steps", "return", "success", "left", "test volumes", "armscan ui", "episode.gif"):
         assert word in ended.stdout
     client, (tracked,) = runs_in(tmp_path)
     assert f"run {tracked.info.run_id}: sac-cluster-y-phantom-seed3" in ended.stdout
-    assert f"python -m armscan.evaluate run={tracked.info.run_id}" in ended.stdout
+    assert f"armscan evaluate {tracked.info.run_id}" in ended.stdout
     assert tracked.info.status == "FINISHED"
     assert tracked.data.params["network.hidden_sizes"] == "[16]"
     assert tracked.data.params["env.transform.rz_deg"] == "10.0"
@@ -76,7 +76,7 @@ def test_run_trains_evaluates_and_tracks(tmp_path, monkeypatch):
     assert tracked.data.tags["seed"] == "3"
     assert tracked.data.tags["command"] == shlex.join(["python", "-m", "armscan.run", *words])
     assert tracked.data.tags["version.torch"] == torch.__version__
-    assert tracked.data.tags["constraints.sha256"] == sum_of((REPOSITORY / "constraints.txt").read_bytes())
+    assert tracked.data.tags["constraints.sha256"] == sha256((REPOSITORY / "constraints.txt").read_bytes())
     logged = {
         "validation/mean_return",
         "validation/mean_steps",
@@ -114,6 +114,7 @@ def test_run_trains_evaluates_and_tracks(tmp_path, monkeypatch):
     assert len(evaluation["test volumes"]["episodes"]) == 3
 
 
+@pytest.mark.full
 def test_run_of_the_same_seed_gives_the_same_figures(tmp_path):
     for _ in range(2):
         assert armscan_run(*SMALL, "seed=3", cwd=tmp_path).returncode == 0
@@ -124,36 +125,42 @@ def test_run_of_the_same_seed_gives_the_same_figures(tmp_path):
     assert first == second
 
 
+@pytest.mark.full
 def test_run_says_when_it_validates_where_the_agent_takes_more_steps_at_once_than_an_epoch_has(tmp_path):
-    words = [word for word in SMALL if not word.startswith("agent.random")]
+    words = [word for word in SMALL if not word.startswith("agent.learning_starts")]
     ended = armscan_run(*words, "agent=ppo", "agent.env_steps_per_collection=250", cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert "validating every 256 environment steps, which the agent takes at once" in ended.stdout
-    assert "training.epoch_env_steps = 200" in ended.stdout
+    assert "training.eval_every_env_steps = 200" in ended.stdout
     assert "512/400 steps" in ended.stdout
 
 
+@pytest.mark.full
 def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_path):
-    varied = ["-m", "obs=cluster,action_reward", "env.delta=0.05,7"]
+    varied = ["-m", "obs=cluster,action_reward", "env.success_threshold=0.05,7"]
     ended = armscan_run(*varied, "projection=zy", "stack=2", "memory=1", *SMALL, cwd=tmp_path)
     assert ended.returncode == 1
     assert "Traceback" not in ended.stderr
-    assert "delta is 7, but it must be a finite number above 0 and at most 1" in ended.stderr
-    assert "again alone: python -m armscan.run obs=cluster env.delta=7" in ended.stderr
-    assert "all runs  python -m armscan.ui\n" in ended.stdout
+    assert "success_threshold is 7, but it must be a finite number above 0 and at most 1" in ended.stderr
+    assert "again alone: python -m armscan.run obs=cluster env.success_threshold=7" in ended.stderr
+    assert "all runs  armscan ui\n" in ended.stdout
     tracked = runs_in(tmp_path)[1]
     (parent,) = [each for each in tracked if each.info.run_name.startswith("multirun")]
-    assert f"compare   python -m armscan.report runs={parent.info.run_id}\n" in ended.stdout
+    assert f"compare   armscan report --runs {parent.info.run_id}\n" in ended.stdout
     children = [each for each in tracked if each is not parent]
     assert parent.info.status == "FAILED"
-    assert parent.data.tags["failure.1"].startswith("obs=cluster env.delta=7: delta is 7")
+    assert parent.data.tags["failure.1"].startswith("obs=cluster env.success_threshold=7: success_threshold is 7")
     assert [child.data.tags["mlflow.parentRunId"] for child in children] == [parent.info.run_id] * 2
     assert {child.info.status for child in children} == {"FINISHED"}
     table = ended.stdout[ended.stdout.index("jobs (") :]
     assert all(child.info.run_id[:8] in table for child in children)
     assert {child.data.tags["choice.obs"] for child in children} == {"cluster", "action_reward"}
     assert len(list((tmp_path / "multirun").glob("*/*/*/best.pt"))) == 2
-    again = armscan_run(*varied, "projection=zy", "stack=2", "memory=1", *SMALL, "resume=true", cwd=tmp_path)
+    assert f"resume all with: python -m armscan.run resume={parent.info.run_id}\n" in ended.stderr
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    again = armscan_run(f"resume={parent.info.run_id}", f"tracking.uri=sqlite:///{tmp_path}/mlruns.db", cwd=elsewhere)
+    assert not list(elsewhere.iterdir())
     assert again.returncode == 1
     # What has finished is not run again; what failed is.
     assert again.stdout.count("has finished before: run") == 2
@@ -168,6 +175,7 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
         assert f"{child.data.metrics['test_volumes/mean_steps']:.2f}" in again.stdout
 
 
+@pytest.mark.full
 def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_path):
     few = [word for word in SMALL if not word.startswith(("agent.", "network"))]
     ended = armscan_run("-m", "agent=exhaustive,optuna", "projection=zy", *few, cwd=tmp_path)
@@ -185,6 +193,7 @@ def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_pat
         assert artifacts - {"code.diff"} == kept
 
 
+@pytest.mark.full
 def test_run_on_labelmap_files(tmp_path, data_folder):
     arguments = ["data=nifti", f"data.path={data_folder}", *(word for word in SMALL if not word.startswith("data."))]
     ended = armscan_run(*arguments, cwd=tmp_path)
@@ -303,20 +312,7 @@ def test_run_shows_what_is_wrong_with_a_volume(answer, tmp_path, write_labelmap,
     assert {file.name for file in tmp_path.iterdir()} == {"wrist.nii.gz", "optimal_actions.json"}
 
 
-def test_run_works_from_the_wheel_without_the_repository(tmp_path):
-    wheel_folder, installed = tmp_path / "wheel", tmp_path / "installed"
-    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", wheel_folder, REPOSITORY], check=True)
-    (wheel,) = wheel_folder.iterdir()
-    with zipfile.ZipFile(wheel) as contents:
-        configs = {name for name in contents.namelist() if name.endswith(".yaml")}
-    assert configs == {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "armscan" / "conf").rglob("*.yaml")}
-    subprocess.run([*pip, "install", "--no-deps", "--target", installed, wheel], check=True)
-    ended = armscan_run(*SMALL, cwd=tmp_path, PYTHONPATH=str(installed), PYTHONSAFEPATH="1")
-    assert ended.returncode == 0, ended.stderr
-    assert (installed / "armscan" / "run.py").is_file()
-
-
+@pytest.mark.full
 @pytest.mark.parametrize("multirun", [[], ["-m", "seed=0,1", "hydra.launcher.n_jobs=2"]], ids=["single", "multirun"])
 def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
     command = [sys.executable, "-m", "armscan.run", *multirun, *SMALL, "training.env_steps=500000"]
@@ -325,7 +321,6 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
             command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT, start_new_session=True
         )
     n_jobs = 2 if multirun else 1
-    deadline_s = time.monotonic() + 240
 
     def n_at_work():
         lines = (tmp_path / "printed").read_text().splitlines()
@@ -333,12 +328,9 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
         told = Counter(line.partition("]")[0][:3] for line in lines if "/500000 steps" in line)
         return sum(count >= 2 for count in told.values()) if multirun else min(1, sum(told.values()) // 2)
 
-    while n_at_work() < n_jobs:
-        assert process.poll() is None, (tmp_path / "printed").read_text()
-        assert time.monotonic() < deadline_s
-        time.sleep(0.5)
+    wait_until(lambda: n_at_work() >= n_jobs, process=process, log=(tmp_path / "printed").read_text, poll_s=0.5)
     os.killpg(process.pid, signal.SIGINT)
-    assert process.wait(timeout=60) == 130
+    assert process.wait(HANG_S) == 130
     output = (tmp_path / "printed").read_text()
     assert output.rstrip().endswith("interrupted")
     # Where the signal finds compiled code, that library may still print where it was; it is no job's failure.
@@ -348,6 +340,7 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
     assert len(tracked) == n_jobs + bool(multirun)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("ending", "line"),
     [(signal.SIGKILL, "killed by SIGKILL: out of memory?"), (signal.SIGTERM, "failed: interrupted")],
@@ -366,14 +359,14 @@ def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
     ]
     with (tmp_path / "printed").open("w") as printed:
         process = subprocess.Popen(command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT)
-    deadline_s = time.monotonic() + 240
-    # Both are tracked by then, whichever of them is killed.
-    while not all(label in (tmp_path / "printed").read_text() for label in ("[0 seed=0]", "[1 seed=1]")):
-        assert process.poll() is None
-        assert time.monotonic() < deadline_s
-        time.sleep(0.2)
+
+    def are_tracked():
+        return all(label in (tmp_path / "printed").read_text() for label in ("[0 seed=0]", "[1 seed=1]"))
+
+    # Whichever of them is killed.
+    wait_until(are_tracked, process=process, log=(tmp_path / "printed").read_text)
     os.kill(job_process_ids(process.pid)[0], ending)
-    assert process.wait(timeout=240) == 1
+    assert process.wait(HANG_S) == 1
     output = (tmp_path / "printed").read_text()
     assert output.count(line) == 1
     assert "again alone: python -m armscan.run seed=" in output

@@ -6,7 +6,7 @@ from armscan.agents.multimodal import Multimodal
 from armscan.agents.networks import MLP, Network, NetworkByObservation, NetworkChoice
 from armscan.agents.optuna_search import OptunaSearch
 from armscan.agents.ppo import PPO
-from armscan.agents.protocols import Agent, AgentSetup, Algorithm, Learner, VectorEnvMaker
+from armscan.agents.protocols import Agent, AgentSetup, Algorithm, Learner, VectorEnvFactory
 from armscan.agents.regression import Regression
 from armscan.agents.sac import SAC
 
@@ -27,5 +27,5 @@ __all__ = [
     "OptunaSearch",
     "Random",
     "Regression",
-    "VectorEnvMaker",
+    "VectorEnvFactory",
 ]

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.agents.protocols import AgentSetup
-from armscan.checks import check_float
 from armscan.envs.actions import COMPONENTS, ActionBounds
-from armscan.envs.task import Observed
+from armscan.envs.rules import Observed
 from armscan.errors import InvalidValueError, listed
+from armscan.utils.validation import check_float
 from armscan.volumes.plane import FloatArray
 
 ROTATIONS = ("rz", "rx")
@@ -22,10 +22,10 @@ MOST_PLANES = 1_000_000
 
 @dataclass(frozen=True)
 class Random:
-    """Planes drawn uniformly over the free components, whatever was seen."""
+    """Planes drawn uniformly over the free components."""
 
     def agent(self, setup: AgentSetup) -> RandomAgent:
-        """Makes an agent."""
+        """Make an agent."""
         return RandomAgent(len(setup.action_names))
 
 
@@ -40,13 +40,13 @@ class RandomAgent:
         self._n_free = n_free
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Begins an episode; its planes are drawn from the seed."""
+        """Begin an episode; its planes are drawn from the seed."""
         # A child of it: the environment is often reset with the seed itself, and its volume's motion drawn from that.
         (child,) = np.random.SeedSequence(seed).spawn(1)
         self._rng = np.random.default_rng(child)
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
-        """Returns the next action, shape (n_free,)."""
+        """Return the next action, shape (n_free,)."""
         return self._rng.uniform(-1.0, 1.0, self._n_free)
 
 
@@ -89,7 +89,7 @@ class Exhaustive:
             )
 
     def agent(self, setup: AgentSetup) -> ExhaustiveAgent:
-        """Makes an agent.
+        """Make an agent.
 
         Raises:
             InvalidValueError: if a component to be swept is not free, or more than two are.
@@ -124,13 +124,13 @@ class ExhaustiveAgent:
         self._step_mm, self._step_deg = step_mm, step_deg
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Begins an episode with the middle plane."""
+        """Begin an episode with the middle plane."""
         self._planes = self.planes(bounds)
         self._rewards: list[float] = []
         self._n_looked_at = 0
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
-        """Returns the next plane, or the best one when all were seen, shape (n_free,)."""
+        """Return the next plane, or the best one when all were seen, shape (n_free,)."""
         # The first reward is the start's, which is none of these planes.
         if 0 < self._n_looked_at <= len(self._planes):
             self._rewards.append(reward)
@@ -140,7 +140,7 @@ class ExhaustiveAgent:
         return np.array(self._planes[chosen])
 
     def planes(self, bounds: ActionBounds) -> FloatArray:
-        """Returns all planes in their order, normalised, shape (n_planes, n_free).
+        """Return all planes in their order, normalised, shape (n_planes, n_free).
 
         Raises:
             InvalidValueError: if the steps are so small that there are more than a million.

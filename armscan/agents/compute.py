@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from armscan.checks import check_bool, check_choice
 from armscan.errors import InvalidValueError
+from armscan.utils.validation import check_bool, check_choice
 
 DEVICES = ("auto", "cpu", "cuda")
 PRECISIONS = ("float32", "bfloat16")
@@ -51,7 +51,7 @@ class Compute:
         return self.torch_device == "cpu" and self.precision == "float32"
 
     def apply_to(self, network: nn.Module) -> None:
-        """Makes a network compute in this way from now on; its inputs and outputs stay of 32 bits."""
+        """Make a network compute in this way from now on; its inputs and outputs stay of 32 bits."""
         if self.precision == "bfloat16":
             forward = network.forward
             device = self.torch_device
@@ -66,7 +66,7 @@ class Compute:
 
 
 def plain_copy(network: nn.Module) -> nn.Module:
-    """Returns a copy of a network that computes in 32 bits on the CPU, whatever `Compute.apply_to` has done to it."""
+    """Return a copy of a network that computes in 32 bits on the CPU, undoing `Compute.apply_to`."""
     # The copy of what was compiled is not.
     copied = deepcopy(network)
     vars(copied).pop("forward", None)

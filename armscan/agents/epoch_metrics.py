@@ -28,12 +28,12 @@ class EpochMetrics(BaseLogger):
         self._n_updates = 0
 
     def log_training_data(self, log_data: dict[str, Any], step: int) -> None:
-        """Gathers returns and lengths of the episodes that have ended."""
+        """Gather returns and lengths of the episodes that have ended."""
         self._values["train/return"].extend(log_data["returns"])
         self._values["train/length"].extend(log_data["lens"])
 
     def log_update_data(self, log_data: dict[str, Any], step: int) -> None:
-        """Gathers losses, and counts gradient steps, of which PPO reports many at once."""
+        """Gather losses and count gradient steps, of which PPO reports many at once."""
         self._n_updates += log_data.get("gradient_steps", 1)
         for theirs, ours in self.UPDATE_NAMES:
             value = log_data.get(theirs)
@@ -43,7 +43,7 @@ class EpochMetrics(BaseLogger):
                 self._values[ours].append(float(value))
 
     def take(self) -> dict[str, float]:
-        """Returns what was gathered since the last call: means, the worst episode, numbers of episodes and updates."""
+        """Return what was gathered since the last call: means, the worst episode, numbers of episodes and updates."""
         metrics = {name: float(np.mean(values)) for name, values in self._values.items() if values}
         if self._values["train/length"]:
             metrics["train/length_max"] = float(np.max(self._values["train/length"]))
@@ -58,7 +58,7 @@ class EpochMetrics(BaseLogger):
         """Unused: nothing is written anywhere from here."""
 
     def prepare_dict_for_logging(self, log_data: dict[str, Any]) -> dict[str, Any]:
-        """Returns the data as it is."""
+        """Return the data as it is."""
         return log_data
 
     def finalize(self) -> None:
@@ -74,7 +74,7 @@ class EpochMetrics(BaseLogger):
         """Unused: training keeps its own checkpoints."""
 
     def restore_data(self) -> tuple[int, int, int]:
-        """Begins at the beginning."""
+        """Begin at the beginning."""
         return 0, 0, 0
 
     @staticmethod
@@ -92,9 +92,9 @@ class EpochMetricsFactory(LoggerFactory):
     def create_logger(
         self, log_dir: str, experiment_name: str, run_id: str | None, config_dict: dict[str, Any] | None = None
     ) -> EpochMetrics:
-        """Returns a logger that has gathered nothing yet; the arguments are for those that write."""
+        """Return a logger that has gathered nothing yet; the arguments are for those that write."""
         return EpochMetrics()
 
     def get_logger_class(self) -> type[EpochMetrics]:
-        """Returns the class of the logger."""
+        """Return the class of the logger."""
         return EpochMetrics

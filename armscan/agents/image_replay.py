@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from tianshou.data import Batch
 
-from armscan.agents.frames import FrameStore, Pixels
+from armscan.agents.frame_store import FrameStore, Pixels
 from armscan.agents.multimodal import images_of
 from armscan.agents.replay import Replay, Tree
 
@@ -20,7 +20,7 @@ Seen = list[tuple[bytes, int]]
 
 
 def replay_for(observation_space: spaces.Space[Any], size: int, n_envs: int) -> Replay:
-    """Returns the replay buffer that suits the observations: a plain one where there are no images among them."""
+    """Return the replay buffer that suits the observations: a plain one where there are no images among them."""
     images = images_of(observation_space)
     return ImageReplay(size, n_envs, images) if images else Replay(size, n_envs)
 
@@ -48,7 +48,7 @@ class ImageReplay(Replay):
         self._last: dict[tuple[str, str], tuple[NDArray[np.int32], Pixels]] = {}
 
     def add(self, batch: Any, buffer_ids: Any = None) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """Adds a transition of each of these environments, which are all where none are named."""
+        """Add a transition of each of these environments, which are all where none are named."""
         envs = range(self.buffer_num) if buffer_ids is None else [int(i) for i in buffer_ids]
         slots = [self._offset[i] + self.buffers[i]._insertion_idx for i in envs]
         self._last.clear()
@@ -69,14 +69,14 @@ class ImageReplay(Replay):
         return added
 
     def get(self, index: Any, key: str, default_value: Any = None, stack_num: int | None = None) -> Any:
-        """Returns one part of transitions, its images as they were."""
+        """Return one part of transitions, its images as they were."""
         found: Any = super().get(index, key, default_value, stack_num)
         if key not in OBSERVATIONS:
             return found
         return Batch(dict(found.items()) | {name: self._decoded(key, name, found[name]) for name in self._images})
 
     def reset(self, keep_statistics: bool = False) -> None:
-        """Forgets every transition."""
+        """Forget every transition."""
         super().reset(keep_statistics)
         self._last.clear()
         for name, images in self._images.items():
@@ -103,14 +103,14 @@ class ImageReplay(Replay):
             images.frames.load_state(state["frames"][name])
 
     def _ids(self, name: str, slots: list[int]) -> list[int]:
-        """Returns the ids of all frames that transitions refer to, one for each reference."""
+        """Return the ids of all frames that transitions refer to, one for each reference."""
         return [frame_id for key in OBSERVATIONS for frame_id in self._meta[key][name][slots].ravel().tolist()]
 
     def _decoded(self, key: str, name: str, ids: NDArray[np.int32]) -> Pixels:
         last = self._last.get((key, name))
         if last is not None and np.array_equal(last[0], ids):
             return last[1]
-        images = self._images[name].decoded(ids)
+        images = self._images[name].decode(ids)
         self._last[key, name] = ids.copy(), images
         return images
 
@@ -131,23 +131,23 @@ class _ImageStore:
         self.forget_last()
 
     def forget_last(self) -> None:
-        """Forgets which frames every environment has shown last."""
+        """Forget which frames every environment has shown last."""
         self._last: list[Seen] = [[] for _ in range(self._n_envs)]
 
     def take_in(self, env: int, image: Pixels, image_next: Pixels) -> tuple[list[int], list[int]]:
-        """Takes in the images of a transition, and refers to their frames; returns the ids of these."""
+        """Store the images of a transition; return the ids of their frames."""
         seen = list(self._last[env])
         ids, ids_next = (self._ids(part.reshape(self._n_frames, -1), seen) for part in (image, image_next))
         self.frames.hold(ids + ids_next)
         self._last[env] = seen[-self._n_frames :]
         return ids, ids_next
 
-    def decoded(self, ids: NDArray[np.int32]) -> Pixels:
-        """Returns images; `ids` has the frames of each along its last axis."""
-        return self.frames.decoded(ids).reshape(*ids.shape[:-1], *self._shape)
+    def decode(self, ids: NDArray[np.int32]) -> Pixels:
+        """Return images; `ids` has the frames of each along its last axis."""
+        return self.frames.decode(ids).reshape(*ids.shape[:-1], *self._shape)
 
     def _ids(self, frames: Pixels, seen: Seen) -> list[int]:
-        """Returns the ids of the frames of an image, shape (n_frames, n_pixels), and adds them to what was seen."""
+        """Return the ids of the frames of an image, shape (n_frames, n_pixels), and add them to those seen."""
         first = len(seen)
         for frame in frames:
             pixels = frame.tobytes()

@@ -18,9 +18,9 @@ from tianshou.utils.net.continuous import ContinuousActorProbabilistic
 from tianshou.utils.torch_utils import torch_device
 from torch import nn
 
-from armscan.agents.networks import MOST_UNITS, Spread, check_weights, linear_weights
-from armscan.checks import check_ints
+from armscan.agents.networks import MOST_UNITS, GaussianStd, check_weights, linear_weights
 from armscan.errors import InvalidValueError
+from armscan.utils.validation import check_ints
 
 # Kernel and stride of each convolution.
 CONVOLUTIONS = ((8, 4), (4, 2), (3, 1))
@@ -74,7 +74,7 @@ class Multimodal:
         return self
 
     def _n_weights(self, images: Iterable[spaces.Box]) -> int:
-        """Counts the weights of one network before it is made, but for those of the vectors that come in."""
+        """Count the weights of one network before it is made, but for those of the vectors that come in."""
         n_weights, n_features = linear_weights(self.vector_sizes), self.vector_sizes[-1]
         for box in images:
             n_pixels, n_channels = np.array(box.shape[-2:]), int(np.prod(box.shape[:-2]))
@@ -84,7 +84,7 @@ class Multimodal:
             n_features += n_channels * int(np.prod(n_pixels))
         return n_weights + linear_weights([n_features, *self.head_sizes])
 
-    def actor_factory(self, spread: Spread) -> ActorFactory:
+    def actor_factory(self, spread: GaussianStd) -> ActorFactory:
         """See `Network.actor_factory`."""
         return _MultimodalActorFactory(self, spread)
 
@@ -94,7 +94,7 @@ class Multimodal:
 
 
 def smallest_side_px() -> int:
-    """Returns the smallest side of an image that the convolutions leave a pixel of."""
+    """Return the smallest side of an image that the convolutions leave a pixel of."""
     side = 1
     for kernel, stride in reversed(CONVOLUTIONS):
         side = (side - 1) * stride + kernel
@@ -102,7 +102,7 @@ def smallest_side_px() -> int:
 
 
 def images_of(space: spaces.Space[Any]) -> dict[str, spaces.Box]:
-    """Returns the images among the parts of an observation, by name: those of bytes, with two axes or more."""
+    """Return the images among the parts of an observation, by name: those of bytes, with two axes or more."""
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
     return {
         name: box
@@ -132,7 +132,7 @@ class MultimodalBody(ModuleWithVectorOutput):
         self.head = _linear_layers(n_features + network.vector_sizes[-1], network.head_sizes)
 
     def forward(self, obs: Any, state: Any = None, info: Any = None, act: Any = None) -> tuple[torch.Tensor, Any]:
-        """Returns the features of a batch of observations, shape (n, head_sizes[-1]), and the state as it came.
+        """Return the features of a batch of observations, shape (n, head_sizes[-1]), and the state as it came.
 
         Args:
             obs: the parts by name, each shape (n, ...).
@@ -165,13 +165,13 @@ class MultimodalCritic(nn.Module):
         self.last = nn.Linear(body.get_output_dim(), 1)
 
     def forward(self, obs: Any, act: Any = None, info: Any = None) -> torch.Tensor:
-        """Returns the values, shape (n, 1)."""
+        """Return the values, shape (n, 1)."""
         features, _ = self.body(obs, act=act)
         return torch.as_tensor(self.last(features))
 
 
 class _MultimodalActorFactory(ActorFactory):
-    def __init__(self, network: Multimodal, spread: Spread) -> None:
+    def __init__(self, network: Multimodal, spread: GaussianStd) -> None:
         self._network, self._spread = network, spread
 
     def create_module(self, envs: Environments, device: str | torch.device) -> nn.Module:

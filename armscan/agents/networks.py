@@ -14,8 +14,8 @@ from tianshou.highlevel.module.actor import ActorFactory, ActorFactoryContinuous
 from tianshou.highlevel.module.critic import CriticFactory, CriticFactoryDefault
 from torch import nn
 
-from armscan.checks import check_choice, check_ints
 from armscan.errors import InvalidValueError
+from armscan.utils.validation import check_choice, check_ints
 
 # An actor and two critics, their lagging copies and the moments of their optimisers take 14 times a network's weights,
 # which is then 4 GB.
@@ -24,7 +24,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "el
 
 
 @dataclass(frozen=True)
-class Spread:
+class GaussianStd:
     """What the standard deviation of a Gaussian policy is made of.
 
     Args:
@@ -36,7 +36,7 @@ class Spread:
     initial_log: float = -0.5
 
     def initialise(self, actor: nn.Module) -> nn.Module:
-        """Sets the actor's standard deviation to what it is at first; returns the actor."""
+        """Set the actor's standard deviation to what it is at first; returns the actor."""
         if not self.conditioned:
             nn.init.constant_(actor.get_parameter("sigma_param"), self.initial_log)
         return actor
@@ -46,7 +46,7 @@ class NetworkChoice(Protocol):
     """What says which network takes an observation."""
 
     def chosen_for(self, observation_space: spaces.Space[Any]) -> Network:
-        """Returns the network for such observations; a network returns itself, if it can take them.
+        """Return the network for such observations; a network returns itself, if it can take them.
 
         Raises:
             InvalidValueError: if none can; the reason is said.
@@ -56,11 +56,11 @@ class NetworkChoice(Protocol):
 class Network(NetworkChoice, Protocol):
     """A kind of network that can be an actor's and a critic's."""
 
-    def actor_factory(self, spread: Spread) -> ActorFactory:
-        """Returns the factory of a Gaussian actor."""
+    def actor_factory(self, spread: GaussianStd) -> ActorFactory:
+        """Return the factory of a Gaussian actor."""
 
     def critic_factory(self) -> CriticFactory:
-        """Returns the factory of a critic, of observations alone or of observations with actions."""
+        """Return the factory of a critic, of observations alone or of observations with actions."""
 
 
 class MLP:
@@ -91,7 +91,7 @@ class MLP:
         check_weights(self, linear_weights([*(observation_space.shape or ()), *self.hidden_sizes]))
         return self
 
-    def actor_factory(self, spread: Spread) -> ActorFactory:
+    def actor_factory(self, spread: GaussianStd) -> ActorFactory:
         """See `Network.actor_factory`."""
         return _MLPActorFactory(self.hidden_sizes, self.activation, spread)
 
@@ -109,8 +109,8 @@ class NetworkByObservation:
     """
 
     def __init__(self, vector: NetworkChoice, images: NetworkChoice) -> None:
-        self.vector = checked_network(vector, "network.vector")
-        self.images = checked_network(images, "network.images")
+        self.vector = check_network(vector, "network.vector")
+        self.images = check_network(images, "network.images")
 
     def chosen_for(self, observation_space: spaces.Space[Any]) -> Network:
         """See `NetworkChoice.chosen_for`."""
@@ -123,8 +123,8 @@ def is_vector(space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and len(space.shape) == 1
 
 
-def checked_network(network: NetworkChoice, name: str = "network") -> NetworkChoice:
-    """Returns the network, or the choice between some, if it is one; `name` says which it is in messages.
+def check_network(network: NetworkChoice, name: str = "network") -> NetworkChoice:
+    """Return the network, or the choice between some, if it is one; `name` says which it is in messages.
 
     Raises:
         InvalidValueError: if it cannot say which network takes an observation.
@@ -138,12 +138,12 @@ def checked_network(network: NetworkChoice, name: str = "network") -> NetworkCho
 
 
 def linear_weights(sizes: Sequence[int]) -> int:
-    """Returns how many weights there are between layers of these sizes."""
+    """Return how many weights there are between layers of these sizes."""
     return sum(n_before * n for n_before, n in pairwise(sizes))
 
 
 def check_weights(network: Network, n_weights: int) -> None:
-    """Raises `InvalidValueError` where a network has too many weights."""
+    """Raise `InvalidValueError` where a network has too many weights."""
     if n_weights > MOST_WEIGHTS:
         raise InvalidValueError(
             f"network is {type(network).__name__.lower()} with {n_weights} weights, but there must be at most "
@@ -154,7 +154,7 @@ def check_weights(network: Network, n_weights: int) -> None:
 class _MLPActorFactory(ActorFactory):
     """Tianshou's, with the standard deviation that is wanted at first."""
 
-    def __init__(self, hidden_sizes: Sequence[int], activation: type[nn.Module], spread: Spread) -> None:
+    def __init__(self, hidden_sizes: Sequence[int], activation: type[nn.Module], spread: GaussianStd) -> None:
         self._factory = ActorFactoryContinuousGaussianNet(
             hidden_sizes, unbounded=True, conditioned_sigma=spread.conditioned, activation=activation
         )

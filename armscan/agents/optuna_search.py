@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from armscan.agents.protocols import AgentSetup
-from armscan.checks import check_choice, check_int
 from armscan.envs.actions import ActionBounds
-from armscan.envs.task import Observed
+from armscan.envs.rules import Observed
+from armscan.utils.validation import check_choice, check_int
 from armscan.volumes.plane import FloatArray
 
 if TYPE_CHECKING:
@@ -35,16 +35,16 @@ class OptunaSearch:
     sampler: str = "tpe"
     """`tpe`, `cmaes`, or `gp`, which takes some 50 ms for a plane where the others take one."""
 
-    startup_planes: int | None = None
+    n_startup_trials: int | None = None
     """Random planes before the sampler's model is used; None for its own number: 10 for TPE and GP, 1 for CMA-ES."""
 
     def __post_init__(self) -> None:
         check_choice("agent.sampler", self.sampler, SAMPLERS)
-        if self.startup_planes is not None:
-            check_int("agent.startup_planes", self.startup_planes, at_least=1)
+        if self.n_startup_trials is not None:
+            check_int("agent.n_startup_trials", self.n_startup_trials, at_least=1)
 
     def agent(self, setup: AgentSetup) -> OptunaAgent:
-        """Makes an agent."""
+        """Make an agent."""
         # Deferred, here and below: only who searches with Optuna waits for its import.
         import optuna
 
@@ -67,14 +67,14 @@ class OptunaAgent:
         self._search = search
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Begins a study; all that its sampler draws comes from the seed."""
+        """Begin a study; all that its sampler draws comes from the seed."""
         import optuna
 
         self._study = optuna.create_study(direction="maximize", sampler=_sampler(self._search, seed))
         self._trial: optuna.Trial | None = None
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
-        """Tells the reward of the last plane and returns the next one, shape (n_free,)."""
+        """Report the reward of the last plane; return the next one, shape (n_free,)."""
         if self._trial is not None:
             self._study.tell(self._trial, reward)
         self._trial = trial = self._study.ask()
@@ -85,7 +85,7 @@ def _sampler(search: OptunaSearch, seed: int) -> BaseSampler:
     from optuna.samplers import CmaEsSampler, GPSampler, TPESampler
 
     # Each sampler has a number of its own where none is given.
-    startup: dict[str, Any] = {} if search.startup_planes is None else {"n_startup_trials": search.startup_planes}
+    startup: dict[str, Any] = {} if search.n_startup_trials is None else {"n_startup_trials": search.n_startup_trials}
     match search.sampler:
         case "cmaes":
             return CmaEsSampler(seed=seed, warn_independent_sampling=False, **startup)

@@ -11,7 +11,7 @@ from torch import nn
 
 from armscan.agents.compute import Compute, plain_copy
 from armscan.envs.history import observation_of, parts_of
-from armscan.envs.task import Observed
+from armscan.envs.rules import Observed
 
 # A batch of observations as tensors: one of shape (n, k), or the parts by their names, each of shape (n, ...).
 Batch = torch.Tensor | dict[str, torch.Tensor]
@@ -44,18 +44,18 @@ class Policy(nn.Module):
             self.differs = f"the agent has computed with {compute.precision} on {compute.torch_device}"
 
     def forward(self, observations: Batch) -> torch.Tensor:
-        """Returns the actions for a batch of observations, shape (n, n_free), within [-1, 1]."""
+        """Return the actions for a batch of observations, shape (n, n_free), within [-1, 1]."""
         (mean, _), _ = self.actor(observations)
         return self._bounded(mean)
 
 
-def clipped(mean: torch.Tensor) -> torch.Tensor:
-    """Returns a mean as a policy has it that is bounded by clipping."""
+def clip_action(mean: torch.Tensor) -> torch.Tensor:
+    """Return a mean as a policy has it that is bounded by clipping."""
     return mean.clamp(-1.0, 1.0)
 
 
 def batch_of(observations: Sequence[Observed]) -> Batch:
-    """Returns single observations, one of them at least, as one batch of tensors."""
+    """Return single observations, one of them at least, as one batch of tensors."""
     parts = [parts_of(observation) for observation in observations]
     stacked = {name: np.stack([each[name] for each in parts]) for name in parts[0]}
     tensors: Any = {name: torch.from_numpy(array) for name, array in stacked.items()}

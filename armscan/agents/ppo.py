@@ -8,14 +8,14 @@ from tianshou.highlevel.config import OnPolicyTrainingConfig
 from tianshou.highlevel.experiment import PPOExperimentBuilder
 from tianshou.highlevel.params.algorithm_params import PPOParams
 
-from armscan.agents.budget import check_batch, check_collection
+from armscan.agents.budget_checks import check_batch, check_collection
 from armscan.agents.epoch_metrics import EpochMetricsFactory
+from armscan.agents.hyperparameters import PolicyParameters, number
 from armscan.agents.image_replay import replay_for
-from armscan.agents.networks import Spread
-from armscan.agents.parameters import PolicyParameters, number
-from armscan.agents.policy import clipped
+from armscan.agents.networks import GaussianStd
+from armscan.agents.policy import clip_action
 from armscan.agents.protocols import AgentSetup
-from armscan.agents.tianshou_envs import SideBySideFactory
+from armscan.agents.tianshou_envs import TianshouEnvFactory
 from armscan.agents.tianshou_learner import TianshouLearner, experiment_config
 from armscan.errors import InvalidValueError
 
@@ -33,40 +33,40 @@ class PPO(PolicyParameters):
     clip_range: float = number(0.2, at_least=0.0, at_most=1000.0)
     """How far an action's probability may move from what it was, as a ratio, before that stops being rewarded."""
 
-    entropy_coefficient: float = number(0.003, at_least=0.0, at_most=1000.0)
+    ent_coef: float = number(0.003, at_least=0.0, at_most=1000.0)
     """Weight of the policy's entropy; higher where it settles too early."""
 
-    value_coefficient: float = number(0.5, at_least=0.0, at_most=1000.0)
+    vf_coef: float = number(0.5, at_least=0.0, at_most=1000.0)
     """Weight of the critic's loss."""
 
     max_grad_norm: float = number(0.5, above=0.0, at_most=1e6)
     """To which the gradient is clipped."""
 
-    normalise_advantage: bool = True
+    normalize_advantage: bool = True
     """Whether advantages are normalised in each batch, which then has two transitions at least."""
 
     conditioned_sigma: bool = False
     """Whether the policy's standard deviation depends on the observation."""
 
-    initial_log_sigma: float = number(-0.5, at_least=-20.0, at_most=2.0)
+    log_std_init: float = number(-0.5, at_least=-20.0, at_most=2.0)
     """Logarithm of the policy's standard deviation at first, where it does not depend on the observation."""
 
     env_steps_per_collection: int = 2_048
     """Environment steps between two rounds of updates, rounded up to as many for each environment."""
 
-    passes_per_collection: int = 8
+    n_epochs: int = 8
     """How often each round of updates goes through all that was collected."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.normalise_advantage and self.batch_size == 1:
+        if self.normalize_advantage and self.batch_size == 1:
             raise InvalidValueError(
-                "agent.batch_size is 1, but it must be at least 2 with agent.normalise_advantage=true: a single "
+                "agent.batch_size is 1, but it must be at least 2 with agent.normalize_advantage=true: a single "
                 "advantage has no spread that it could be divided by"
             )
 
     def agent(self, setup: AgentSetup) -> TianshouLearner:
-        """Makes an agent that has learned nothing yet.
+        """Make an agent that has learned nothing yet.
 
         Raises:
             InvalidValueError: if the training is shorter than a collection, a collection too small for a batch, or the
@@ -76,7 +76,7 @@ class PPO(PolicyParameters):
         n_collected = check_collection(self.env_steps_per_collection, self.num_envs, setup)
         check_batch(self.batch_size, n_collected, "the environment steps of a collection")
         builder = PPOExperimentBuilder(
-            SideBySideFactory(setup.make_envs),
+            TianshouEnvFactory(setup.make_envs),
             experiment_config(setup),
             OnPolicyTrainingConfig(
                 num_training_envs=self.num_envs,
@@ -84,7 +84,7 @@ class PPO(PolicyParameters):
                 # Tianshou's own, which ours takes the place of.
                 buffer_size=self.num_envs,
                 collection_step_num_env_steps=n_collected,
-                update_step_num_repetitions=self.passes_per_collection,
+                update_step_num_repetitions=self.n_epochs,
                 batch_size=self.batch_size,
             ),
         )
@@ -95,24 +95,24 @@ class PPO(PolicyParameters):
                 gamma=self.gamma,
                 gae_lambda=self.gae_lambda,
                 eps_clip=self.clip_range,
-                ent_coef=self.entropy_coefficient,
-                vf_coef=self.value_coefficient,
+                ent_coef=self.ent_coef,
+                vf_coef=self.vf_coef,
                 max_grad_norm=self.max_grad_norm,
-                advantage_normalization=self.normalise_advantage,
+                advantage_normalization=self.normalize_advantage,
                 action_bound_method="clip",
                 # Actions are within [-1, 1] as they are.
                 action_scaling=False,
-                deterministic_eval=not self.judged_by_sampling,
+                deterministic_eval=self.deterministic_eval,
             )
         )
-        spread = Spread(conditioned=self.conditioned_sigma, initial_log=self.initial_log_sigma)
+        spread = GaussianStd(conditioned=self.conditioned_sigma, initial_log=self.log_std_init)
         builder.with_actor_factory(network.actor_factory(spread))
         builder.with_critic_factory(network.critic_factory())
         return TianshouLearner(
             builder.build(),
             replay=replay_for(setup.observation_space, n_collected, self.num_envs),
-            random_env_steps=0,
-            final_lr_share=self.final_lr_share,
-            bounded=clipped,
+            learning_starts=0,
+            lr_end_factor=self.lr_end_factor,
+            bounded=clip_action,
             setup=setup,
         )

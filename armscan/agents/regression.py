@@ -11,17 +11,17 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import nn
 
-from armscan.agents.budget import check_batch, check_updates, kept_at_most
-from armscan.agents.examples import Examples
-from armscan.agents.networks import Spread
-from armscan.agents.parameters import Parameters, lr_share, number
-from armscan.agents.policy import Policy, clipped
+from armscan.agents.budget_checks import buffer_capacity, check_batch, check_updates
+from armscan.agents.hyperparameters import Parameters, lr_share, number
+from armscan.agents.networks import GaussianStd
+from armscan.agents.policy import Policy, clip_action
 from armscan.agents.protocols import AgentSetup
-from armscan.agents.tianshou_envs import SideBySideFactory
+from armscan.agents.supervised_buffer import SupervisedBuffer
+from armscan.agents.tianshou_envs import TianshouEnvFactory
 from armscan.agents.tianshou_learner import load_into
 from armscan.envs.actions import ActionBounds
 from armscan.envs.history import observation_of, parts_of
-from armscan.envs.task import Observed
+from armscan.envs.rules import Observed
 from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
 from armscan.errors import DivergedError, InvalidValueError
 from armscan.volumes.plane import FloatArray
@@ -46,7 +46,7 @@ class Regression(Parameters):
     buffer_size: int = 100_000
     """Slices that are kept, the latest; never more than the whole training takes."""
 
-    updates_per_env_step: float = number(0.25, above=0.0, at_most=1000.0)
+    utd_ratio: float = number(0.25, above=0.0, at_most=1000.0)
     """Gradient steps for each environment step."""
 
     own_planes_share: float = number(0.0, at_least=0.0, at_most=1.0)
@@ -61,7 +61,7 @@ class Regression(Parameters):
             )
 
     def agent(self, setup: AgentSetup) -> RegressionLearner:
-        """Makes an agent that has learned nothing yet.
+        """Make an agent that has learned nothing yet.
 
         Raises:
             InvalidValueError: if the training takes too few steps to learn anything, or the network cannot take the
@@ -73,19 +73,19 @@ class Regression(Parameters):
                 f"agent.num_envs is {self.num_envs}, but it must be at most training.env_steps = "
                 f"{setup.total_env_steps}"
             )
-        check_updates(self.updates_per_env_step, setup)
-        size = kept_at_most(self.buffer_size, self.num_envs, setup)
+        check_updates(self.utd_ratio, setup)
+        size = buffer_capacity(self.buffer_size, self.num_envs, setup)
         check_batch(self.batch_size, size, "which is all that is kept of the training's slices")
         envs = setup.make_envs(self.num_envs)
-        shapes = SideBySideFactory(lambda _: envs).create_envs(self.num_envs, 1, seed=setup.seed)
+        shapes = TianshouEnvFactory(lambda _: envs).create_envs(self.num_envs, 1, seed=setup.seed)
         torch.manual_seed(setup.seed)
-        network = chosen.actor_factory(Spread(conditioned=False)).create_module(shapes, setup.compute.torch_device)
-        examples = Examples(size, setup.observation_space, len(setup.action_names))
+        network = chosen.actor_factory(GaussianStd(conditioned=False)).create_module(shapes, setup.compute.torch_device)
+        examples = SupervisedBuffer(size, setup.observation_space, len(setup.action_names))
         return RegressionLearner(self, envs, network, examples, setup)
 
 
 class RegressionLearner:
-    """Looks at planes, random ones where nothing else is said, and fits a network to where the optimal ones lie.
+    """Fits a network to the optimal actions of observed planes; default: random planes.
 
     As in `TianshouLearner`, every epoch begins with new episodes and draws whatever it draws from `seed` and its own
     number, so that it goes on from its state bit for bit.
@@ -103,7 +103,7 @@ class RegressionLearner:
         regression: Regression,
         envs: VectorEnv[Any, Any, Any],
         network: nn.Module,
-        examples: Examples,
+        examples: SupervisedBuffer,
         setup: AgentSetup,
     ) -> None:
         self._regression = regression
@@ -128,10 +128,10 @@ class RegressionLearner:
         return self._envs.num_envs
 
     def warm_up(self) -> None:
-        """Does nothing: every step is random, and the first slices can be learned from."""
+        """Do nothing: every step is random, and the first slices can be learned from."""
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
-        """Learns for one epoch of at least `n_env_steps`; returns its training metrics by name.
+        """Learn for one epoch of at least `n_env_steps`; returns its training metrics by name.
 
         Raises:
             DivergedError: if the weights are not finite afterwards.
@@ -141,7 +141,7 @@ class RegressionLearner:
         torch.manual_seed(int(for_torch.generate_state(1)[0]))
         rng = np.random.default_rng(for_draws)
         seeds = [int(word) for word in for_envs.generate_state(self._envs.num_envs)]
-        share = lr_share(self._regression.final_lr_share, self._n_env_steps, self._total_env_steps)
+        share = lr_share(self._regression.lr_end_factor, self._n_env_steps, self._total_env_steps)
         for group in self._lr_groups():
             group["lr"] = share * self._regression.lr
         observations, _ = reset_each(self._envs, seeds)
@@ -165,10 +165,10 @@ class RegressionLearner:
     @property
     def _n_updates(self) -> int:
         """Updates that are due after the steps taken so far."""
-        return int(self._n_env_steps * self._regression.updates_per_env_step)
+        return int(self._n_env_steps * self._regression.utd_ratio)
 
     def _step(self, observations: Observed, rng: np.random.Generator) -> Observed:
-        """Keeps what is seen, starts of episodes included; returns what is seen from the next planes."""
+        """Keep what is seen, starts of episodes included; returns what is seen from the next planes."""
         self._examples.add(observations, self._teacher.optimal_actions)
         observations, _, terminated, truncated, _ = self._envs.step(self._next_planes(observations, rng))
         self._n_env_steps += self._envs.num_envs
@@ -177,7 +177,7 @@ class RegressionLearner:
         return observations
 
     def _next_planes(self, observations: Observed, rng: np.random.Generator) -> FloatArray:
-        """Draws random planes, or such near its own choice, at distances of every order; shape (n, n_free)."""
+        """Draw random planes, or such near its own choice, at distances of every order; shape (n, n_free)."""
         planes = rng.uniform(-1.0, 1.0, self._envs.action_space.shape or ())
         if not self._regression.own_planes_share:
             return planes
@@ -198,7 +198,7 @@ class RegressionLearner:
         return loss.detach()
 
     def _predicted(self, observations: Observed) -> torch.Tensor:
-        """The predicted optimal actions of a batch, shape (n, n_free), not yet clipped."""
+        """Return the predicted optimal actions of a batch, shape (n, n_free), not yet clipped."""
         (mean, _), _ = self._network(observations)
         return torch.as_tensor(mean)
 
@@ -213,24 +213,24 @@ class RegressionLearner:
         )
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Learns that an episode begins, in which nothing is drawn."""
+        """Learn that an episode begins, in which nothing is drawn."""
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
-        """Returns the optimal action as predicted from this observation alone, shape (n_free,)."""
+        """Return the optimal action as predicted from this observation alone, shape (n_free,)."""
         one = observation_of({name: part[None] for name, part in parts_of(observation).items()})
         with torch.no_grad():
             return self._predicted(one)[0].clamp(-1.0, 1.0).cpu().numpy()
 
     def policy(self) -> Policy:
-        """Returns a copy of the network that `act` asks."""
-        return Policy(self._network, clipped, self._compute)
+        """Return a copy of the network that `act` asks."""
+        return Policy(self._network, clip_action, self._compute)
 
     def weights(self) -> dict[str, Any]:
-        """Returns the network's weights."""
+        """Return the network's weights."""
         return dict(self._network.state_dict())
 
     def load_weights(self, weights: dict[str, Any]) -> None:
-        """Takes over a network's weights.
+        """Take over a network's weights.
 
         Raises:
             CheckpointError: if they are those of another network.
@@ -238,7 +238,7 @@ class RegressionLearner:
         load_into(self._network, weights)
 
     def state(self) -> dict[str, Any]:
-        """Returns network, optimiser, examples and counters."""
+        """Return network, optimiser, examples and counters."""
         return {
             "network": self.weights(),
             "optimiser": self._optimiser.state_dict(),
@@ -248,7 +248,7 @@ class RegressionLearner:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Takes over what `state` returned.
+        """Take over what `state` returned.
 
         Raises:
             CheckpointError: if it is that of another agent.

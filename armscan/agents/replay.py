@@ -24,7 +24,7 @@ class Replay(VectorReplayBuffer):
         super().__init__(size, n_envs)
 
     def hasnull(self) -> bool:
-        """Says that nothing is NaN.
+        """Say that nothing is NaN.
 
         Tianshou's collectors ask at every collection, and searching all that is kept costs more the fuller it is; the
         environment's observations are clipped counts and finite by construction.
@@ -38,7 +38,7 @@ class Replay(VectorReplayBuffer):
             ring._random_state.seed(child.generate_state(1))
 
     def cut_off(self) -> None:
-        """Marks episodes that have not ended as truncated, because their environments are reset."""
+        """Mark episodes that have not ended as truncated, because their environments are reset."""
         if len(self):
             unfinished = self.unfinished_index()
             self.truncated[unfinished] = self.done[unfinished] = True
@@ -46,12 +46,12 @@ class Replay(VectorReplayBuffer):
             ring._ep_return, ring._ep_len, ring._ep_start_idx = 0.0, 0, ring._insertion_idx
 
     def state(self) -> Tree:
-        """Returns all transitions and where each ring goes on, for after `cut_off`."""
+        """Return all transitions and where each ring goes on, for after `cut_off`."""
         rings = [(ring._insertion_idx, len(ring), int(ring.last_index[0])) for ring in self.buffers]
         return {"transitions": _tensors(self._meta) if len(self) else {}, "rings": rings}
 
     def load_state(self, state: Tree) -> None:
-        """Takes over what `state` returned."""
+        """Take over what `state` returned."""
         self.reset()
         if state["transitions"]:
             self.set_batch(_batch(state["transitions"]))
@@ -62,7 +62,7 @@ class Replay(VectorReplayBuffer):
 
 
 def _tensors(batch: Any) -> Tree:
-    """Returns the arrays of a batch as tensors; empty parts are left out."""
+    """Return the arrays of a batch as tensors; empty parts are left out."""
     return {
         name: _tensors(part) if isinstance(part, Batch) else torch.from_numpy(part)
         for name, part in batch.items()

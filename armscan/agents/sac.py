@@ -11,13 +11,13 @@ from tianshou.highlevel.experiment import SACExperimentBuilder
 from tianshou.highlevel.params.algorithm_params import SACParams
 from tianshou.highlevel.params.alpha import AutoAlphaFactoryDefault
 
-from armscan.agents.budget import check_batch, check_collection, check_updates, kept_at_most, rounded_up
+from armscan.agents.budget_checks import buffer_capacity, check_batch, check_collection, check_updates, round_up
 from armscan.agents.epoch_metrics import EpochMetricsFactory
+from armscan.agents.hyperparameters import PolicyParameters, number
 from armscan.agents.image_replay import replay_for
-from armscan.agents.networks import Spread
-from armscan.agents.parameters import PolicyParameters, number
+from armscan.agents.networks import GaussianStd
 from armscan.agents.protocols import AgentSetup
-from armscan.agents.tianshou_envs import SideBySideFactory
+from armscan.agents.tianshou_envs import TianshouEnvFactory
 from armscan.agents.tianshou_learner import TianshouLearner, experiment_config
 from armscan.errors import InvalidValueError
 
@@ -26,10 +26,10 @@ from armscan.errors import InvalidValueError
 class SAC(PolicyParameters):
     """Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) with a learned entropy coefficient."""
 
-    initial_entropy_coefficient: float = number(0.1, above=0.0, at_most=1000.0)
+    ent_coef_init: float = number(0.1, above=0.0, at_most=1000.0)
     """What the entropy coefficient is at first; rewards here are small, so that 1 would drown them for long."""
 
-    entropy_lr: float = number(3e-4, above=0.0, at_most=1.0)
+    ent_coef_lr: float = number(3e-4, above=0.0, at_most=1.0)
     """Learning rate of the entropy coefficient."""
 
     target_entropy_per_dim: float = number(-2.0, at_least=-1000.0, at_most=1000.0)
@@ -44,13 +44,13 @@ class SAC(PolicyParameters):
     buffer_size: int = 100_000
     """Transitions that the replay buffer holds; never more than the whole training takes."""
 
-    random_env_steps: int = 2_000
+    learning_starts: int = 2_000
     """Steps with random actions before the first update, rounded up to as many for each environment."""
 
     env_steps_per_collection: int = 16
     """Environment steps between two rounds of updates, rounded up to as many for each environment."""
 
-    updates_per_env_step: float = number(0.25, above=0.0, at_most=1000.0)
+    utd_ratio: float = number(0.25, above=0.0, at_most=1000.0)
     """Gradient steps for each environment step, on average; they are what training costs."""
 
     def __post_init__(self) -> None:
@@ -61,25 +61,25 @@ class SAC(PolicyParameters):
             )
 
     def agent(self, setup: AgentSetup) -> TianshouLearner:
-        """Makes an agent that has learned nothing yet.
+        """Make an agent that has learned nothing yet.
 
         Raises:
             InvalidValueError: if the training takes too few steps to learn anything, or the network cannot take the
                 observations.
         """
         network = self.network.chosen_for(setup.observation_space)
-        n_random = rounded_up(self.random_env_steps, self.num_envs)
+        n_random = round_up(self.learning_starts, self.num_envs)
         if n_random >= setup.total_env_steps:
             raise InvalidValueError(
-                f"agent.random_env_steps is {self.random_env_steps}, {n_random} for {self.num_envs} environments, but "
+                f"agent.learning_starts is {self.learning_starts}, {n_random} for {self.num_envs} environments, but "
                 f"it must be below training.env_steps = {setup.total_env_steps}, or nothing is learned"
             )
-        n_collected = check_collection(self.env_steps_per_collection, self.num_envs, setup, random_env_steps=n_random)
-        check_updates(self.updates_per_env_step, setup, random_env_steps=n_random)
-        n_kept = kept_at_most(self.buffer_size, self.num_envs, setup)
+        n_collected = check_collection(self.env_steps_per_collection, self.num_envs, setup, learning_starts=n_random)
+        check_updates(self.utd_ratio, setup, learning_starts=n_random)
+        n_kept = buffer_capacity(self.buffer_size, self.num_envs, setup)
         check_batch(self.batch_size, n_kept, "which is all that training.env_steps leaves to draw from")
         builder = SACExperimentBuilder(
-            SideBySideFactory(setup.make_envs),
+            TianshouEnvFactory(setup.make_envs),
             experiment_config(setup),
             OffPolicyTrainingConfig(
                 num_training_envs=self.num_envs,
@@ -87,33 +87,33 @@ class SAC(PolicyParameters):
                 # Tianshou's own, which ours takes the place of.
                 buffer_size=self.num_envs,
                 collection_step_num_env_steps=n_collected,
-                update_step_num_gradient_steps_per_sample=self.updates_per_env_step,
+                update_step_num_gradient_steps_per_sample=self.utd_ratio,
                 batch_size=self.batch_size,
             ),
         )
         builder.with_logger_factory(EpochMetricsFactory())
         builder.with_sac_params(
             SACParams(
-                deterministic_eval=not self.judged_by_sampling,
+                deterministic_eval=self.deterministic_eval,
                 gamma=self.gamma,
                 tau=self.tau,
                 actor_lr=self.lr,
                 critic1_lr=self.lr,
                 critic2_lr=self.lr,
                 alpha=AutoAlphaFactoryDefault(
-                    lr=self.entropy_lr,
+                    lr=self.ent_coef_lr,
                     target_entropy_coefficient=self.target_entropy_per_dim,
-                    log_alpha=math.log(self.initial_entropy_coefficient),
+                    log_alpha=math.log(self.ent_coef_init),
                 ),
             )
         )
-        builder.with_actor_factory(network.actor_factory(Spread(conditioned=True)))
+        builder.with_actor_factory(network.actor_factory(GaussianStd(conditioned=True)))
         builder.with_common_critic_factory(network.critic_factory())
         return TianshouLearner(
             builder.build(),
             replay=replay_for(setup.observation_space, n_kept, self.num_envs),
-            random_env_steps=n_random,
-            final_lr_share=self.final_lr_share,
+            learning_starts=n_random,
+            lr_end_factor=self.lr_end_factor,
             bounded=torch.tanh,
             setup=setup,
         )

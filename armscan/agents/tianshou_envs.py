@@ -13,14 +13,14 @@ from tianshou.data import Batch
 from tianshou.env import BaseVectorEnv
 from tianshou.highlevel.env import ContinuousEnvironments, EnvFactory, EnvMode, VectorEnvType
 
-from armscan.agents.protocols import VectorEnvMaker
-from armscan.envs.task import Observed
+from armscan.agents.protocols import VectorEnvFactory
+from armscan.envs.rules import Observed
 from armscan.envs.vector_env import reset_each
 
 Ids = int | list[int] | NDArray[np.int64] | None
 
 
-class SideBySide(BaseVectorEnv):
+class TianshouVectorEnv(BaseVectorEnv):
     """A Gymnasium vector environment without autoreset, under the interface of Tianshou's own ones.
 
     `info` is left out, because a replay buffer would store it with every transition.
@@ -43,13 +43,13 @@ class SideBySide(BaseVectorEnv):
         self._action_spaces = [deepcopy(envs.single_action_space) for _ in range(envs.num_envs)]
 
     def get_env_attr(self, key: str, id: Ids = None) -> list[Any]:  # noqa: A002 - Tianshou's name
-        """Returns the spaces of each environment."""
+        """Return the spaces of each environment."""
         if key == "action_space":
             return list(self._action_spaces)
         return [getattr(self._envs, f"single_{key}", getattr(self._envs, key, None))] * self.env_num
 
     def reset(self, env_id: Ids = None, **kwargs: Any) -> tuple[Any, NDArray[Any]]:
-        """Starts episodes; returns the first observations of those environments, and no information."""
+        """Start episodes; returns the first observations of those environments, and no information."""
         ids = np.arange(self.env_num) if env_id is None else np.atleast_1d(env_id)
         mask = np.isin(np.arange(self.env_num), ids)
         observations, _ = reset_each(self._envs, self._seeds, {"reset_mask": mask})
@@ -57,7 +57,7 @@ class SideBySide(BaseVectorEnv):
         return _batched(observations)[ids], self._no_info(ids)
 
     def step(self, action: Any, id: Ids = None) -> tuple[Any, ...]:  # noqa: A002
-        """Takes a step in all environments."""
+        """Take a step in all environments."""
         assert id is None or len(np.atleast_1d(id)) == self.env_num, "the environments are only stepped all at once"
         observations, rewards, terminated, truncated, _ = self._envs.step(np.asarray(action))
         # Nothing but success terminates an episode.
@@ -75,11 +75,11 @@ class SideBySide(BaseVectorEnv):
         return [None if seeds is None else [one_seed] for one_seed in seeds or [0] * self.env_num]
 
     def render(self, **kwargs: Any) -> list[Any]:
-        """Draws nothing."""
+        """Draw nothing."""
         return []
 
     def close(self) -> None:
-        """Closes the environments."""
+        """Close the environments."""
         self._envs.close()
         self.is_closed = True
 
@@ -93,14 +93,14 @@ def _batched(observations: Observed) -> Any:
     return Batch(observations) if isinstance(observations, dict) else observations
 
 
-class SideBySideFactory(EnvFactory):
+class TianshouEnvFactory(EnvFactory):
     """Gives Tianshou the training environments.
 
     Args:
         make_envs: makes as many as are asked for.
     """
 
-    def __init__(self, make_envs: VectorEnvMaker) -> None:
+    def __init__(self, make_envs: VectorEnvFactory) -> None:
         super().__init__(VectorEnvType.DUMMY)
         self._make_envs = make_envs
 
@@ -108,8 +108,8 @@ class SideBySideFactory(EnvFactory):
         raise NotImplementedError("environments are made side by side")
 
     def create_venv(self, num_envs: int, mode: EnvMode, seed: int | None = None) -> BaseVectorEnv:
-        """Makes environments with seeds drawn from the one given."""
-        envs = SideBySide(self._make_envs(num_envs))
+        """Make environments with seeds drawn from the one given."""
+        envs = TianshouVectorEnv(self._make_envs(num_envs))
         rng = self._create_rng(seed)
         envs.seed([self._next_seed(rng) for _ in range(num_envs)])
         return envs
@@ -117,7 +117,7 @@ class SideBySideFactory(EnvFactory):
     def create_envs(
         self, num_training_envs: int, num_test_envs: int, create_watch_env: bool = False, seed: int | None = None
     ) -> ContinuousEnvironments:
-        """Makes the training environments; testing is not left to Tianshou."""
+        """Make the training environments; testing is not left to Tianshou."""
         training = self.create_venv(num_training_envs, EnvMode.TRAINING, seed)
         spaces = _SpacesOnly(training.get_env_attr("observation_space")[0], training.get_env_attr("action_space")[0])
         return ContinuousEnvironments(spaces, training, training)

@@ -14,14 +14,14 @@ from tianshou.highlevel.persistence import PolicyPersistence
 from tianshou.trainer import OffPolicyTrainer
 
 from armscan.agents.epoch_metrics import EpochMetrics
-from armscan.agents.parameters import lr_share
+from armscan.agents.hyperparameters import lr_share
 from armscan.agents.policy import Policy
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
-from armscan.agents.steady_updates import SteadyTrainer
-from armscan.agents.tianshou_envs import SideBySide
+from armscan.agents.tianshou_envs import TianshouVectorEnv
+from armscan.agents.tianshou_trainer import EvenUpdatesTrainer
 from armscan.envs.actions import ActionBounds
-from armscan.envs.task import Observed
+from armscan.envs.rules import Observed
 from armscan.errors import CheckpointError, DivergedError
 from armscan.volumes.plane import FloatArray
 
@@ -38,8 +38,8 @@ class TianshouLearner:
     Args:
         experiment: as its builder gives it.
         replay: what the experiment's transitions are kept in.
-        random_env_steps: steps with random actions before the first update.
-        final_lr_share: what the learning rates of actor and critics have come down to at the training's end, as a share
+        learning_starts: steps with random actions before the first update.
+        lr_end_factor: what the learning rates of actor and critics have come down to at the training's end, as a share
             of what they were; they fall by as much in each epoch as it has steps.
         bounded: takes the mean of the policy's actions to [-1, 1], as the experiment's policy does.
         setup: what the agent was given.
@@ -50,8 +50,8 @@ class TianshouLearner:
         experiment: Experiment,
         *,
         replay: Replay,
-        random_env_steps: int,
-        final_lr_share: float,
+        learning_starts: int,
+        lr_end_factor: float,
         bounded: Callable[[torch.Tensor], torch.Tensor],
         setup: AgentSetup,
     ) -> None:
@@ -64,19 +64,19 @@ class TianshouLearner:
         assert world.training_collector is not None
         self._collector = world.training_collector
         self._collector.buffer = replay
-        assert isinstance(self._collector.env, SideBySide)
+        assert isinstance(self._collector.env, TianshouVectorEnv)
         self._envs = self._collector.env
         trainer: Any = experiment.algorithm_factory.create_trainer(world, _NoPersistence())
         trainer.params.show_progress = False
         if isinstance(trainer, OffPolicyTrainer):
-            trainer = SteadyTrainer(trainer.algorithm, trainer.params, random_env_steps)
+            trainer = EvenUpdatesTrainer(trainer.algorithm, trainer.params, learning_starts)
         trainer.reset(reset_collectors=False)
         self._algorithm = world.algorithm
         self._trainer = trainer
         self._replay = replay
-        self._random_env_steps = random_env_steps
+        self._learning_starts = learning_starts
         self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
-        self._final_lr_share = final_lr_share
+        self._lr_end_factor = lr_end_factor
         self._bounded, self._compute = bounded, setup.compute
         self._n_epochs = 0
         self._first_lrs = [group["lr"] for group in self._lr_groups()]
@@ -94,13 +94,13 @@ class TianshouLearner:
         return int(self._trainer.params.collection_step_num_env_steps)
 
     def warm_up(self) -> None:
-        """Fills the replay buffer with random steps."""
+        """Fill the replay buffer with random steps."""
         self._begin_epoch()
-        if self._random_env_steps:
-            self._collector.collect(n_step=self._random_env_steps, random=True)
+        if self._learning_starts:
+            self._collector.collect(n_step=self._learning_starts, random=True)
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
-        """Learns for one epoch of at least `n_env_steps`; returns its training metrics by name.
+        """Learn for one epoch of at least `n_env_steps`; returns its training metrics by name.
 
         Raises:
             DivergedError: if the weights are not finite afterwards.
@@ -126,7 +126,7 @@ class TianshouLearner:
         return metrics
 
     def _begin_epoch(self) -> None:
-        """Begins episodes anew, and everything that is drawn; the learning rates are those of this moment."""
+        """Begin episodes anew, and everything that is drawn; the learning rates are those of this moment."""
         self._replay.cut_off()
         for_torch, for_numpy, for_replay, for_envs = np.random.SeedSequence([self._seed, self._n_epochs]).spawn(4)
         torch.manual_seed(int(for_torch.generate_state(1)[0]))
@@ -136,7 +136,7 @@ class TianshouLearner:
         self._envs.seed([int(word) for word in for_envs.generate_state(self._collector.env_num)])
         self._envs.n_ended = self._envs.n_successes = 0
         self._collector.reset_env()
-        share = lr_share(self._final_lr_share, self.n_env_steps, self._total_env_steps)
+        share = lr_share(self._lr_end_factor, self.n_env_steps, self._total_env_steps)
         for group, first_lr in zip(self._lr_groups(), self._first_lrs, strict=True):
             group["lr"] = share * first_lr
 
@@ -145,34 +145,34 @@ class TianshouLearner:
 
     def _check_weights(self, cause: ValueError | None = None) -> None:
         if not all(torch.isfinite(weights).all() for weights in self._algorithm.parameters()):
-            or_entropy = " or agent.entropy_lr" if _entropy_optimiser(self._algorithm) else ""
+            or_entropy = " or agent.ent_coef_lr" if _entropy_optimiser(self._algorithm) else ""
             raise DivergedError(
                 f"learning has diverged: after {self.n_env_steps} environment steps the networks' weights are not "
                 f"finite any more; a smaller agent.lr{or_entropy} may help"
             ) from cause
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Learns that an episode begins; only a policy that is judged by sampling draws anything in it."""
+        """Learn that an episode begins; only a policy whose evaluation samples actions draws anything in it."""
         torch.manual_seed(seed)
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
-        """Returns the policy's action, shape (n_free,)."""
+        """Return the policy's action, shape (n_free,)."""
         policy = self._algorithm.policy
         with torch.no_grad():
             result = policy(Batch(obs=_batch_of_one(observation), info=Batch()))
         return np.asarray(policy.map_action(result.act.cpu().numpy())[0])
 
     def policy(self) -> Policy:
-        """Returns a copy of the actor that `act` asks, with the mode of its actions as its answer."""
+        """Return a copy of the actor that `act` asks, with the mode of its actions as its answer."""
         policy = self._algorithm.policy
         return Policy(policy.actor, self._bounded, self._compute, is_sampling=not policy.deterministic_eval)
 
     def weights(self) -> dict[str, Any]:
-        """Returns the policy's weights."""
+        """Return the policy's weights."""
         return dict(self._algorithm.policy.state_dict())
 
     def load_weights(self, weights: dict[str, Any]) -> None:
-        """Takes over a policy's weights.
+        """Take over a policy's weights.
 
         Raises:
             CheckpointError: if they are those of another network.
@@ -180,7 +180,7 @@ class TianshouLearner:
         load_into(self._algorithm.policy, weights)
 
     def state(self) -> dict[str, Any]:
-        """Returns networks, optimisers, replay buffer and counters."""
+        """Return networks, optimisers, replay buffer and counters."""
         self._replay.cut_off()
         return {
             "algorithm": dict(self._algorithm.state_dict()),  # type: ignore[no-untyped-call]
@@ -191,7 +191,7 @@ class TianshouLearner:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Takes over what `state` returned.
+        """Take over what `state` returned.
 
         Raises:
             CheckpointError: if it is that of another agent.
@@ -205,18 +205,18 @@ class TianshouLearner:
 
 
 def experiment_config(setup: AgentSetup) -> ExperimentConfig:
-    """Returns what Tianshou has to know of a setup."""
+    """Return what Tianshou has to know of a setup."""
     return ExperimentConfig(seed=setup.seed, device=setup.compute.torch_device, watch=False, persistence_enabled=False)
 
 
 def networks_of(algorithm: torch.nn.Module) -> list[torch.nn.Module]:
-    """Returns the networks of an algorithm: its actor, its critics, and their lagging copies."""
+    """Return the networks of an algorithm: its actor, its critics, and their lagging copies."""
     critics = [module for name, module in algorithm.named_children() if name.startswith("critic")]
     return [algorithm.get_submodule("policy.actor"), *critics]
 
 
 def load_into(module: torch.nn.Module, weights: dict[str, Any]) -> None:
-    """Gives a network its weights.
+    """Give a network its weights.
 
     Raises:
         CheckpointError: if they are those of another network.
@@ -228,7 +228,7 @@ def load_into(module: torch.nn.Module, weights: dict[str, Any]) -> None:
 
 
 def _entropy_optimiser(algorithm: Any) -> torch.optim.Optimizer | None:
-    """The optimiser of a learned entropy coefficient, which Tianshou leaves out of an algorithm's state."""
+    """Return the optimiser of a learned entropy coefficient, which Tianshou leaves out of an algorithm's state."""
     return getattr(getattr(algorithm, "alpha", None), "_optim", None)
 
 

@@ -1,15 +1,15 @@
 """What is seen in a slice: tissues, their clusters, and the rewards computed from them."""
 
+from armscan.anatomy.dice import tissue_dice
 from armscan.anatomy.landmarks import Clusters, Landmarks, TissueClusters
-from armscan.anatomy.optimum import FoundPlane, Judge, find_optimal_plane
-from armscan.anatomy.overlap import tissue_dice
+from armscan.anatomy.plane_search import FoundPlane, PlaneScorer, find_optimal_plane
 from armscan.anatomy.rewards import (
     OTHER_PUBLISHED_TARGETS,
     PUBLISHED_TARGETS,
     AgreementReward,
     LandmarkReward,
     Reward,
-    checked_targets,
+    check_targets,
     landmark_reward,
 )
 from armscan.anatomy.scanner import Scanner
@@ -24,7 +24,7 @@ from armscan.anatomy.tissues import (
     PixelTissue,
     Tissue,
     Tissues,
-    checked_tissues,
+    check_tissues,
 )
 
 __all__ = [
@@ -39,18 +39,18 @@ __all__ = [
     "AgreementReward",
     "Clusters",
     "FoundPlane",
-    "Judge",
     "LandmarkReward",
     "Landmarks",
     "MetricTissue",
     "PixelTissue",
+    "PlaneScorer",
     "Reward",
     "Scanner",
     "Tissue",
     "TissueClusters",
     "Tissues",
-    "checked_targets",
-    "checked_tissues",
+    "check_targets",
+    "check_tissues",
     "find_optimal_plane",
     "landmark_reward",
     "tissue_dice",

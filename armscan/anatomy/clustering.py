@@ -20,7 +20,7 @@ Pixels = NDArray[np.uint8]
 
 @numba.njit(cache=True, nogil=True)
 def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -> IntArray:
-    """Returns for each row distance d = 0, 1, .. the largest w with (d row_step)^2 + (w col_step)^2 <= eps^2.
+    """Return for each row distance d = 0, 1, .. the largest w with (d row_step)^2 + (w col_step)^2 <= eps^2.
 
     Args:
         eps: radius, in the unit of the steps.
@@ -44,13 +44,13 @@ def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -
 
 @numba.njit(cache=True, nogil=True)
 def count_disc_pixels(half_widths: IntArray) -> int:
-    """Returns how many pixels a disc has, its middle included."""
+    """Return how many pixels a disc has, its middle included."""
     return int(2 * np.sum(2 * half_widths + 1) - (2 * half_widths[0] + 1))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _find_core(mask: Pixels, stride: int, half_widths: IntArray, min_samples: int, zero: Any) -> Pixels:
-    """Marks the core pixels of a flat mask.
+    """Mark the core pixels of a flat mask.
 
     Args:
         mask: 0 or 1, rows of `stride` with as many columns of margin as the disc is wide, and as many rows above and
@@ -99,7 +99,7 @@ def _core_pixels(mask: Pixels, stride: int, half_widths: IntArray, min_samples: 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _find_runs(core: Pixels, n_cols: int, longest: int) -> tuple[RunArray, RunArray, IntArray]:
-    """Returns the first and last column of each run of core pixels, and the number of the first run of each row."""
+    """Return the first and last column of each run of core pixels, and the number of the first run of each row."""
     n_rows = core.shape[0]
     capacity = n_rows * (n_cols // 2 + 1 if longest > 1 else n_cols)
     starts, stops = np.empty(capacity, dtype=np.int32), np.empty(capacity, dtype=np.int32)
@@ -131,7 +131,7 @@ def _find_root(parents: IntArray, run: int) -> int:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _number_runs(starts: RunArray, stops: RunArray, first_run: IntArray, half_widths: IntArray) -> tuple[RunArray, int]:
-    """Returns the cluster of each run, from 0 in the order of the clusters' first runs, and how many there are."""
+    """Return the cluster of each run, from 0 in the order of the clusters' first runs, and how many there are."""
     n_rows, n_runs = first_run.size - 1, starts.size
     parents = np.arange(n_runs)
     for row in range(n_rows):
@@ -167,7 +167,7 @@ def _reached(
     half_widths: IntArray,
     n_clusters: int,
 ) -> RunArray:
-    """Returns for each pixel the lowest cluster with a core pixel within eps, `n_clusters` where there is none."""
+    """Return for each pixel the lowest cluster with a core pixel within eps, `n_clusters` where there is none."""
     n_rows, n_cols = shape
     reached = np.full(shape, np.int32(n_clusters))
     reach = half_widths.size - 1
@@ -183,7 +183,7 @@ def _reached(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _bounding_box(slice_xz: Pixels, label: int) -> tuple[int, int, int, int]:
-    """Returns first row, row after the last, first column and column after the last of a label; all 0 without it."""
+    """Return first row, row after the last, first column and column after the last of a label; all 0 without it."""
     n_rows, n_cols = slice_xz.shape
     row_first, row_stop = n_rows, 0
     in_column = np.zeros(n_cols, dtype=np.uint8)

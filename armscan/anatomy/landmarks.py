@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.anatomy.clustering import cluster_label
-from armscan.anatomy.tissues import ARTERY, BONES, TENDONS, USUAL_PIXEL_MM, Tissue, checked_tissue
+from armscan.anatomy.tissues import ARTERY, BONES, TENDONS, USUAL_PIXEL_MM, Tissue, check_tissue
 from armscan.errors import InvalidValueError
 
 Landmarks = NDArray[np.float64]
@@ -53,7 +53,7 @@ class Clusters:
         Raises:
             InvalidValueError: if the slice is not a 2-D array of integers, or the tissue is none.
         """
-        neighbourhood = checked_tissue("tissue", tissue).neighbourhood(pixel_mm)
+        neighbourhood = check_tissue("tissue", tissue).neighbourhood(pixel_mm)
         return cls(*cluster_label(_checked_slice(slice_xz), tissue.label, *neighbourhood))
 
 
@@ -91,7 +91,7 @@ class TissueClusters:
         return cls(*(Clusters.of_tissue(slice_xz, tissue, pixel_mm) for tissue in (bones, tendons, artery)))
 
     def each(self) -> tuple[Clusters, Clusters, Clusters]:
-        """Returns the tissues in their fixed order: bones, tendons, artery."""
+        """Return the tissues in their fixed order: bones, tendons, artery."""
         return self.bones, self.tendons, self.artery
 
     @property

@@ -10,8 +10,8 @@ import numpy as np
 
 from armscan.anatomy.landmarks import Landmarks, TissueClusters
 from armscan.anatomy.tissues import PIXEL_TISSUES, USUAL_PIXEL_MM, Tissues
-from armscan.checks import check_float, check_ints
 from armscan.errors import InvalidValueError, OptimalPlaneError
+from armscan.utils.validation import check_float, check_ints
 from armscan.volumes.volume import LabelVolume
 
 PUBLISHED_TARGETS = (4, 3, 1)
@@ -25,13 +25,13 @@ class Reward(Protocol):
     """Scores slices; implement both methods to make one's own."""
 
     def fitted_to(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Reward:
-        """Returns the reward with what it takes from labelled planes of training volumes, if it has nothing yet.
+        """Return the reward with what it takes from labelled planes of training volumes, if it has nothing yet.
 
         `tissues` says how what they show is clustered.
         """
 
     def score(self, landmarks: Landmarks, pixel_mm: tuple[float, float]) -> float:
-        """Returns the reward, in [-1, 0], of a slice with this summary and pixels of this size, (across, depth)."""
+        """Return the reward, in [-1, 0], of a slice with this summary and pixels of this size, (across, depth)."""
 
 
 class LandmarkReward:
@@ -50,10 +50,10 @@ class LandmarkReward:
     """
 
     def __init__(self, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
-        self.targets = checked_targets(targets)
+        self.targets = check_targets(targets)
 
     def fitted_to(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Self:
-        """Returns the reward as it is: it takes nothing from volumes."""
+        """Return the reward as it is: it takes nothing from volumes."""
         return self
 
     def score(self, landmarks: Landmarks, pixel_mm: tuple[float, float]) -> float:
@@ -183,7 +183,7 @@ class Range(NamedTuple):
     above: float
 
     def cost(self, feature: float) -> float:
-        """Returns the cost of a feature, in [0, 1]."""
+        """Return the cost of a feature, in [0, 1]."""
         if feature < self.lowest:
             return min(1.0, (self.lowest - feature) / self.below)
         return min(1.0, max(0.0, feature - self.highest) / self.above)
@@ -203,7 +203,7 @@ def _features(landmarks: Landmarks, pixel_mm: tuple[float, float]) -> list[float
 
 
 def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED_TARGETS) -> float:
-    """Returns the published reward, `LandmarkReward`, of what a slice shows.
+    """Return the published reward, `LandmarkReward`, of what a slice shows.
 
     Args:
         clusters: what it shows.
@@ -217,7 +217,7 @@ def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED
     return LandmarkReward(targets).score(clusters.landmarks, USUAL_PIXEL_MM)
 
 
-def checked_targets(targets: Sequence[int]) -> tuple[int, int, int]:
-    """Returns the targets as a tuple of three ints, each from 1 to 1000."""
+def check_targets(targets: Sequence[int]) -> tuple[int, int, int]:
+    """Return the targets as a tuple of three ints, each from 1 to 1000."""
     bones, tendons, artery = check_ints("targets", targets, 3, "(bones, tendons, artery)", at_least=1, at_most=1000)
     return bones, tendons, artery

@@ -31,7 +31,7 @@ def _look(
     slice_xz: Pixels,
     landmarks: Landmarks,
 ) -> None:
-    """Fills a slice and its summary; `half_widths` has a row for each tissue, ended by -1."""
+    """Fill a slice and its summary; `half_widths` has a row for each tissue, ended by -1."""
     sample_plane(labels_xyz, spacing_mm, matrix, offset_mm, slice_xz)
     for tissue in range(tissue_labels.size):
         n_widths = np.sum(half_widths[tissue] >= 0)
@@ -94,7 +94,7 @@ class Scanner:
         self._typed_volumes: numba.typed.List | None = None
 
     def look(self, which: int, matrix: FloatArray, offset_mm: FloatArray) -> tuple[Pixels, Landmarks]:
-        """Looks at one plane.
+        """Look at one plane.
 
         Args:
             which: place of the volume.
@@ -122,7 +122,7 @@ class Scanner:
     def look_all(
         self, which: IntArray, matrices: FloatArray, offsets_mm: FloatArray
     ) -> tuple[list[Pixels], FloatArray]:
-        """Looks at n planes in one compiled call, on as many threads as `numba.get_num_threads()` says.
+        """Look at n planes in one compiled call, on as many threads as `numba.get_num_threads()` says.
 
         Args:
             which: place of each plane's volume, shape (n,).

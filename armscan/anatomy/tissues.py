@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from armscan.anatomy.clustering import IntArray, count_disc_pixels, disc_half_widths
-from armscan.checks import check_float, check_int, check_numbers
 from armscan.errors import InvalidValueError
+from armscan.utils.validation import check_float, check_int, check_numbers
 
 USUAL_PIXEL_MM = (0.27, 0.55)
 # A pixel at exactly eps is a neighbour, also where its spacing was kept as a 32-bit float.
@@ -33,7 +33,7 @@ class Tissue(Protocol):
         """Its value in a labelmap."""
 
     def neighbourhood(self, pixel_mm: tuple[float, float]) -> Neighbourhood:
-        """Returns what makes a core pixel in slices of pixels of this size, (across, depth)."""
+        """Return what makes a core pixel in slices of pixels of this size, (across, depth)."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,8 @@ METRIC_TISSUES = Tissues(
 CLUSTERINGS: dict[str, Tissues] = {"pixels": PIXEL_TISSUES, "metric": METRIC_TISSUES}
 
 
-def checked_tissues(clustering: str | Tissues) -> Tissues:
-    """Returns the tissues, given as such or by the name of their clustering.
+def check_tissues(clustering: str | Tissues) -> Tissues:
+    """Return the tissues, given as such or by the name of their clustering.
 
     Raises:
         InvalidValueError: if there is no clustering of that name, or what is given is no `Tissues`.
@@ -130,12 +130,12 @@ def checked_tissues(clustering: str | Tissues) -> Tissues:
             f"clustering is {clustering!r}, but it must be {' or '.join(CLUSTERINGS)}, or an armscan.anatomy.Tissues"
         )
     for name, tissue in clustering._asdict().items():
-        checked_tissue(name, tissue)
+        check_tissue(name, tissue)
     return clustering
 
 
-def checked_tissue(name: str, tissue: Tissue) -> Tissue:
-    """Returns `tissue` if it has what `Tissue` has."""
+def check_tissue(name: str, tissue: Tissue) -> Tissue:
+    """Return `tissue` if it has what `Tissue` has."""
     has_parts = hasattr(tissue, "label") and callable(getattr(tissue, "neighbourhood", None))
     if isinstance(tissue, type) or not has_parts:
         raise InvalidValueError(f"{name} is {tissue!r}, but it must be a PixelTissue, a MetricTissue or the like")

@@ -2,15 +2,9 @@
 
 from armscan.envs.actions import COMPONENTS, PROJECTIONS, ActionBounds
 from armscan.envs.env import ArmscanEnv
-from armscan.envs.making import EnvMaker, make_armscan_env, make_armscan_vector_env
-from armscan.envs.observations import (
-    ActionRewardObservation,
-    ClusterObservation,
-    MergedObservation,
-    Observation,
-    SliceGeometry,
-    View,
-)
+from armscan.envs.factory import EnvFactory, make_armscan_env, make_armscan_vector_env
+from armscan.envs.observation_registry import MergedObservation
+from armscan.envs.observations import ActionRewardObservation, ClusterObservation, Observation, SliceGeometry, View
 from armscan.envs.scene import RandomTransform, Scene
 from armscan.envs.slice_observations import SliceChannelsObservation, SliceObservation
 from armscan.envs.spaces import MultiBoxSpace
@@ -28,7 +22,7 @@ __all__ = [
     "ArmscanVectorEnv",
     "BestActionMemory",
     "ClusterObservation",
-    "EnvMaker",
+    "EnvFactory",
     "FrameStack",
     "ManipulatorAction",
     "MergedObservation",

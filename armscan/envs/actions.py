@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.checks import check_float, check_numbers
 from armscan.errors import InvalidValueError, listed
+from armscan.utils.validation import check_float, check_numbers
 from armscan.volumes.plane import FloatArray, ManipulatorAction
 
 COMPONENTS = ("rz", "rx", "tx", "ty")
@@ -44,8 +44,8 @@ class ActionBounds:
         for name, bound in zip(("tx", "ty"), translation_mm, strict=True):
             check_float(f"translation bound of {name} in mm", bound, at_least=0.0, at_most=MAX_TRANSLATION_MM)
 
-    def denormalised(self, normalised: Sequence[float]) -> ManipulatorAction:
-        """Returns the plane of a normalised vector (rz, rx, tx, ty)."""
+    def denormalise(self, normalised: Sequence[float]) -> ManipulatorAction:
+        """Return the plane of a normalised vector (rz, rx, tx, ty)."""
         rz, rx, tx, ty = normalised
         (bound_rz, bound_rx), (bound_tx, bound_ty) = self.rotation_deg, self.translation_mm
         return ManipulatorAction(
@@ -53,7 +53,7 @@ class ActionBounds:
         )
 
     def normalised(self, action: ManipulatorAction) -> FloatArray:
-        """Returns the normalised vector of a plane, shape (4,); 0 (a translation: -1) where the bound is zero."""
+        """Return the normalised vector of a plane, shape (4,); 0 (a translation: -1) where the bound is zero."""
         rz, rx, tx, ty = (
             value / bound if bound > 0 else 0.0
             for value, bound in zip(
@@ -64,7 +64,7 @@ class ActionBounds:
 
 
 def free_components(projection: str | Sequence[str]) -> tuple[int, ...]:
-    """Returns the indices into (rz, rx, tx, ty) of the components that a projection leaves free, in that order.
+    """Return the indices into (rz, rx, tx, ty) of the components that a projection leaves free, in that order.
 
     Args:
         projection: one of the names in `PROJECTIONS`, or the components themselves.

@@ -9,12 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from armscan.checks import check_choice, check_int
 from armscan.envs.actions import COMPONENTS
-from armscan.envs.episode import Episode, begin, checked_actions, info_of, look, wanted_volume
+from armscan.envs.episode import Episode, begin, check_actions, info_of, look, wanted_volume
+from armscan.envs.rules import Observed, Rules, Volumes
 from armscan.envs.scene import Scene
-from armscan.envs.task import Observed, Task, Volumes
 from armscan.errors import ResetNeededError
+from armscan.utils.validation import check_choice, check_int
 from armscan.volumes import LabelVolume
 from armscan.volumes.plane import FloatArray, ManipulatorAction
 
@@ -54,10 +54,10 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     ## Starting state
     The fixed components at the optimum; the free ones at normalised 0 (`start="middle"`) or drawn (`start="random"`).
     `reset(options={"volume": name})` chooses the volume. An episode may start on a plane that already scores above
-    -delta: it still takes its first step, and `info["starts_solved"]` says so.
+    -success_threshold: it still takes its first step, and `info["starts_solved"]` says so.
 
     ## Episode end
-    Terminated when the reward is above -delta; truncated after `max_steps` steps.
+    Terminated when the reward is above -success_threshold; truncated after `max_steps` steps.
 
     ## Info
     `volume` (name), `rotation_deg` (rz, rx), `translation_mm` (tx, ty), `counts` (clusters of bones, tendons, artery),
@@ -75,7 +75,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
             is fitted to labelled planes, and is not yet, is fitted to those of these volumes.
         targets: clusters of bones, tendons and artery that the published reward wants.
         clustering: `pixels`, as published, `metric`, which serves every spacing, or an `armscan.anatomy.Tissues`.
-        delta: the episode ends above -delta.
+        success_threshold: the episode ends above -success_threshold.
         max_steps: steps after which an episode is truncated.
         start: `middle` or `random`.
         rotation_bounds_deg: bounds of rz and rx.
@@ -84,7 +84,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
 
     Raises:
         InvalidValueError: if an argument is outside what is allowed.
-        OptimalPlaneError: if a volume's labelled plane is missing, outside the bounds, or scores no better than -delta.
+        OptimalPlaneError: if a volume's labelled plane is missing, outside the bounds, or not above -success_threshold.
         DisplayError: if the mode is `human` and no window can be opened.
     """
 
@@ -95,9 +95,9 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
 
     def __init__(self, volumes: Volumes = None, *, render_mode: str | None = None, **rules: Any) -> None:
         self.render_mode = check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        self.task = Task(volumes, **rules)
-        self.observation_space = self.task.observation_space  # type: ignore[assignment]
-        self.action_space: spaces.Box = self.task.action_space  # type: ignore[assignment]
+        self.rules = Rules(volumes, **rules)
+        self.observation_space = self.rules.observation_space  # type: ignore[assignment]
+        self.action_space: spaces.Box = self.rules.action_space  # type: ignore[assignment]
         self._episode: Episode | None = None
         self._window: Window | None = None
         if self.render_mode == "human":
@@ -109,12 +109,12 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     @property
     def volumes(self) -> dict[str, LabelVolume]:
         """The volumes by name."""
-        return self.task.volumes
+        return self.rules.volumes
 
     @property
     def action_names(self) -> tuple[str, ...]:
         """The free components of an action, in its order, such as `("rz", "ty")`."""
-        return tuple(COMPONENTS[component] for component in self.task.free)
+        return tuple(COMPONENTS[component] for component in self.rules.free)
 
     @property
     def episode(self) -> Episode:
@@ -147,23 +147,23 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
-        """Starts an episode; `options={"volume": name}` chooses its volume."""
-        volume_name = wanted_volume(self.task, options)
+        """Start an episode; `options={"volume": name}` chooses its volume."""
+        volume_name = wanted_volume(self.rules, options)
         super().reset(seed=None if seed is None else check_int("seed", seed, at_least=0))
-        (self._episode,) = begin(self.task, [self.np_random], volume_name)
+        (self._episode,) = begin(self.rules, [self.np_random], volume_name)
         return self._seen()
 
     def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
-        """Places the plane; see the class for what comes back."""
+        """Place the plane; see the class for what comes back."""
         episode = self._episode
         if episode is None or not episode.is_running:
             raise ResetNeededError("the episode has ended or not begun: call reset() before step()")
-        episode.aim(checked_actions(action, self.action_space.shape))
+        episode.aim(check_actions(action, self.action_space.shape))
         observation, info = self._seen()
         return observation, episode.view.reward, episode.is_solved, episode.is_truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Returns a picture of the current step, shape (512, 860, 3); None in `human`, whose window has it already."""
+        """Return a picture of the current step, shape (512, 860, 3); None in `human`, whose window has it already."""
         if self.render_mode is None:
             gym.logger.warn("render() was called without a render_mode; make the environment with 'rgb_array'.")
             return None
@@ -171,15 +171,15 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         return _drawn(episode) if self._window is None else None
 
     def close(self) -> None:
-        """Closes the window, where there is one."""
+        """Close the window, where there is one."""
         if self._window is not None:
             self._window.close()
 
     def _seen(self) -> tuple[Observed, dict[str, Any]]:
-        look(self.task, [self.episode])
+        look(self.rules, [self.episode])
         if self._window is not None:
             self._window.show(_drawn(self.episode))
-        return self.task.observe(self.episode.view), info_of(self.episode)
+        return self.rules.observe(self.episode.view), info_of(self.episode)
 
 
 def _drawn(episode: Episode) -> NDArray[np.uint8]:

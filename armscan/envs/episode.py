@@ -7,30 +7,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from armscan.checks import check_choice
 from armscan.envs.observations import View
+from armscan.envs.rules import Rules
 from armscan.envs.scene import Scene
-from armscan.envs.task import Task
 from armscan.errors import InvalidValueError, listed
+from armscan.utils.validation import check_choice
 from armscan.volumes.plane import FloatArray, ManipulatorAction
 
 
 class Episode:
-    """One episode of a task.
+    """One episode.
 
     Each plane comes in two steps, so that many environments can be looked at together between them: `aim` at it, then
     `see` what is there. The first plane is the start, every further one a step.
 
     Args:
-        task: the rules.
+        rules: the rules.
         scene: the episode's volume.
         start: the first action.
     """
 
     view: View
 
-    def __init__(self, task: Task, scene: Scene, start: FloatArray) -> None:
-        self.task = task
+    def __init__(self, rules: Rules, scene: Scene, start: FloatArray) -> None:
+        self.rules = rules
         self.scene = scene
         self.n_steps = -1
         self.is_solved = self.starts_solved = self.is_truncated = False
@@ -38,24 +38,24 @@ class Episode:
         self.aim(start)
 
     def aim(self, action: FloatArray) -> None:
-        """Places the plane; `action` holds the free components, normalised and within [-1, 1]."""
+        """Place the plane; `action` holds the free components, normalised and within [-1, 1]."""
         normalised = self.scene.optimum_normalised.tolist()
-        for component, value in zip(self.task.free, action.tolist(), strict=True):
+        for component, value in zip(self.rules.free, action.tolist(), strict=True):
             normalised[component] = value
         self.action = action
         self._distance: tuple[float, float] | None = None
-        self.plane: ManipulatorAction = self.scene.bounds.denormalised(normalised)
+        self.plane: ManipulatorAction = self.scene.bounds.denormalise(normalised)
 
     def see(self, view: View) -> None:
-        """Takes what the plane shows."""
+        """Take what the plane shows."""
         view.action = self.action
         self.view = view
         self.n_steps += 1
         self.rewards.append(view.reward)
-        self.is_solved = self.task.is_solved(view)
+        self.is_solved = self.rules.is_solved(view)
         if self.n_steps == 0:
             self.starts_solved = self.is_solved
-        self.is_truncated = not self.is_solved and self.n_steps >= self.task.max_steps
+        self.is_truncated = not self.is_solved and self.n_steps >= self.rules.max_steps
 
     @property
     def distance(self) -> tuple[float, float]:
@@ -71,7 +71,7 @@ class Episode:
 
 
 def info_of(episode: Episode) -> dict[str, Any]:
-    """Returns `info`, as `ArmscanEnv` describes it."""
+    """Return `info`, as `ArmscanEnv` describes it."""
     return {
         name: field.of(episode) if field.dtype is None else np.array(field.of(episode), dtype=field.dtype)
         for name, field in INFO.items()
@@ -104,29 +104,29 @@ INFO = {
 }
 
 
-def begin(task: Task, rngs: Sequence[np.random.Generator], volume_name: str | None = None) -> list[Episode]:
-    """Begins an episode for each generator, which everything of it is drawn from; on the named volume, if there is one.
+def begin(rules: Rules, rngs: Sequence[np.random.Generator], volume_name: str | None = None) -> list[Episode]:
+    """Begin an episode for each generator, which everything of it is drawn from; on the named volume, if there is one.
 
     The episodes have been started but not seen: their first planes are still to be looked at.
     """
-    drawn = [volume_name or task.names[int(rng.integers(len(task.names)))] for rng in rngs]
-    scenes = task.draw_scenes(drawn, rngs)
-    n_free = len(task.free)
+    drawn = [volume_name or rules.names[int(rng.integers(len(rules.names)))] for rng in rngs]
+    scenes = rules.draw_scenes(drawn, rngs)
+    n_free = len(rules.free)
     return [
-        Episode(task, scene, np.zeros(n_free) if task.start == "middle" else rng.uniform(-1.0, 1.0, n_free))
+        Episode(rules, scene, np.zeros(n_free) if rules.start == "middle" else rng.uniform(-1.0, 1.0, n_free))
         for scene, rng in zip(scenes, rngs, strict=True)
     ]
 
 
-def look(task: Task, episodes: Sequence[Episode]) -> None:
-    """Looks at the current plane of each episode."""
-    views = task.look([episode.scene for episode in episodes], [episode.plane for episode in episodes])
+def look(rules: Rules, episodes: Sequence[Episode]) -> None:
+    """Look at the current plane of each episode."""
+    views = rules.look([episode.scene for episode in episodes], [episode.plane for episode in episodes])
     for episode, view in zip(episodes, views, strict=True):
         episode.see(view)
 
 
-def checked_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
-    """Returns an action, or a batch of them, as numbers within [-1, 1]; values outside are clipped.
+def check_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
+    """Return an action, or a batch of them, as numbers within [-1, 1]; values outside are clipped.
 
     Raises:
         InvalidValueError: if the shape is another, or a value is not finite.
@@ -143,11 +143,11 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
     return np.minimum(np.maximum(received, -1.0), 1.0)
 
 
-def wanted_volume(task: Task, options: Any) -> str | None:
-    """Returns the volume that the options of a reset name, None where they name none.
+def wanted_volume(rules: Rules, options: Any) -> str | None:
+    """Return the volume that the options of a reset name, None where they name none.
 
     Raises:
-        InvalidValueError: if the options are no dict, hold anything else, or name no volume of the task.
+        InvalidValueError: if the options are no dict, hold anything else, or name no volume of the rules.
     """
     if options is None:
         return None
@@ -155,4 +155,4 @@ def wanted_volume(task: Task, options: Any) -> str | None:
         raise InvalidValueError(f"reset options are {options!r}, but they must be a dict such as {{'volume': name}}")
     if unknown := sorted(map(str, options.keys() - {"volume"})):
         raise InvalidValueError(f"reset option is {listed(unknown)}, but only 'volume' is known")
-    return check_choice("reset option 'volume'", options["volume"], task.names) if "volume" in options else None
+    return check_choice("reset option 'volume'", options["volume"], rules.names) if "volume" in options else None

@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 
 def boxes_of(space: spaces.Space[Any], who: str) -> dict[str, spaces.Box]:
-    """Returns the boxes of a space by name; a single one goes by `FLAT`.
+    """Return the boxes of a space by name; a single one goes by `FLAT`.
 
     Raises:
         InvalidValueError: if the space is neither a vector nor a `Dict` of boxes; `who` cannot wrap it.
@@ -34,22 +34,22 @@ def boxes_of(space: spaces.Space[Any], who: str) -> dict[str, spaces.Box]:
 
 
 def space_of(boxes: Mapping[str, spaces.Box]) -> spaces.Box | MultiBoxSpace:
-    """Returns the space that `boxes_of` takes apart."""
+    """Return the space that `boxes_of` takes apart."""
     return boxes[FLAT] if FLAT in boxes else MultiBoxSpace(boxes)
 
 
 def parts_of(observation: NDArray[Any] | Parts) -> Parts:
-    """Returns an observation by name."""
+    """Return an observation by name."""
     return observation if isinstance(observation, dict) else {FLAT: observation}
 
 
 def observation_of(parts: Parts) -> NDArray[Any] | Parts:
-    """Returns the observation that `parts_of` takes apart."""
+    """Return the observation that `parts_of` takes apart."""
     return parts.get(FLAT, parts)
 
 
-def checked_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozenset[str]:
-    """Returns the names of the parts that are not stacked.
+def check_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozenset[str]:
+    """Return the names of the parts that are not stacked.
 
     Raises:
         InvalidValueError: if it is no collection of names, or one is not among those of `boxes`.
@@ -79,7 +79,7 @@ class FrameHistory:
 
     def __init__(self, boxes: Mapping[str, spaces.Box], size: int, excluded: Collection[str], n_envs: int) -> None:
         self._size = size
-        self._excluded = checked_exclusions(excluded, boxes)
+        self._excluded = check_exclusions(excluded, boxes)
         # Every frame is written twice, `size` apart, so that the last ones always lie in one piece.
         self._frames = {
             name: np.empty((2 * size, n_envs, *box.shape), dtype=box.dtype)
@@ -90,7 +90,7 @@ class FrameHistory:
         self.boxes = {name: self._stacked_box(name, box) for name, box in boxes.items()}
 
     def refill(self, parts: Parts, is_first: Mask) -> None:
-        """Fills the stacks of environments whose episode begins with its first observation.
+        """Fill the stacks of environments whose episode begins with its first observation.
 
         Args:
             parts: by name, shape (n_envs, ...).
@@ -100,13 +100,13 @@ class FrameHistory:
             frames[:, is_first] = parts[name][is_first]
 
     def push(self, parts: Parts) -> None:
-        """Adds the latest observation of every environment; parts by name, shape (n_envs, ...)."""
+        """Add the latest observation of every environment; parts by name, shape (n_envs, ...)."""
         self._latest = (self._latest + 1) % self._size
         for name, frames in self._frames.items():
             frames[self._latest] = frames[self._latest + self._size] = parts[name]
 
-    def stacked(self, parts: Parts) -> Parts:
-        """Returns the latest observations, shape (n_envs, ...), with what is stacked of them as (n_envs, size, ...)."""
+    def stack_frames(self, parts: Parts) -> Parts:
+        """Return the latest observations, shape (n_envs, ...), with what is stacked of them as (n_envs, size, ...)."""
         return {name: self._stack(name) if name in self._frames else part for name, part in parts.items()}
 
     def _stack(self, name: str) -> NDArray[Any]:
@@ -149,7 +149,7 @@ class BestPairs:
         )
 
     def refill(self, actions: NDArray[Any], rewards: NDArray[Any], is_first: Mask) -> None:
-        """Makes all pairs of environments whose episode begins those of its first plane.
+        """Make all pairs of environments whose episode begins those of its first plane.
 
         Args:
             actions: shape (n_envs, n_free).
@@ -159,7 +159,7 @@ class BestPairs:
         self.pairs[is_first] = self._paired(actions, rewards)[is_first, None]
 
     def push(self, actions: NDArray[Any], rewards: NDArray[Any]) -> None:
-        """Adds the latest pair of every environment where it is good enough; shapes as in `refill`."""
+        """Add the latest pair of every environment where it is good enough; shapes as in `refill`."""
         enters = rewards.astype(np.float32) > self.pairs[:, -1, -1]
         if enters.any():
             self.pairs[enters, -1] = self._paired(actions, rewards)[enters]
@@ -167,7 +167,7 @@ class BestPairs:
             self.pairs[enters] = np.take_along_axis(self.pairs[enters], order[:, :, None], axis=1)
 
     def flat(self) -> NDArray[np.float32]:
-        """Returns the pairs of each environment in a row, shape (n_envs, size * (n_free + 1))."""
+        """Return the pairs of each environment in a row, shape (n_envs, size * (n_free + 1))."""
         return self.pairs.reshape(len(self.pairs), -1).copy()
 
     def _paired(self, actions: NDArray[Any], rewards: NDArray[Any]) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, runtime_checkable
@@ -17,11 +17,10 @@ from armscan.anatomy import (
     Landmarks,
     TissueClusters,
     Tissues,
-    checked_targets,
+    check_targets,
 )
-from armscan.checks import check_bool
 from armscan.envs.spaces import Parts
-from armscan.errors import InvalidValueError, listed
+from armscan.utils.validation import check_bool
 from armscan.volumes.plane import FloatArray
 
 # Of bones, tendons and artery, at the usual pixel size.
@@ -38,7 +37,7 @@ class SliceGeometry:
 
 
 def smallest_shape(geometries: Sequence[SliceGeometry]) -> tuple[int, int]:
-    """Returns the shape that slices of every geometry have at least."""
+    """Return the shape that slices of every geometry have at least."""
     return min(g.shape[0] for g in geometries), min(g.shape[1] for g in geometries)
 
 
@@ -74,14 +73,14 @@ class Observation(Protocol):
     """A set of named parts of what the agent sees; implement both methods to make one's own."""
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
-        """Returns the space of each part, for every geometry that can occur and `n_free` action components."""
+        """Return the space of each part, for every geometry that can occur and `n_free` action components."""
 
     def observe(self, view: View) -> Parts:
-        """Returns the value of each part, within its space, in arrays that are not filled again."""
+        """Return the value of each part, within its space, in arrays that are not filled again."""
 
 
 def observe_all(observation: Observation, views: Sequence[View]) -> Parts:
-    """Returns the parts of an observation for many views at once, shape (n_views, ...).
+    """Return the parts of an observation for many views at once, shape (n_views, ...).
 
     An observation of one's own is asked view by view, unless it has a method `observe_all(views)` too.
     """
@@ -132,7 +131,7 @@ class ClusterObservation:
 
     def __init__(self, *, normalised: bool = True, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
         self.normalised = check_bool("normalised", normalised)
-        self._targets = checked_targets(targets)
+        self._targets = check_targets(targets)
         self._scales: dict[SliceGeometry, tuple[FloatArray, FloatArray]] = {}
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
@@ -157,7 +156,7 @@ class ClusterObservation:
         return {"clusters": np.array(features).reshape(len(views), -1)}
 
     def _features(self, landmarks: Landmarks, geometry: SliceGeometry) -> NDArray[np.float32]:
-        """Turns summaries of clusters, shape (..., 3, 4), into the wanted form."""
+        """Turn summaries of clusters, shape (..., 3, 4), into the wanted form."""
         if not self.normalised:
             return landmarks.astype(np.float32)
         if geometry not in self._scales:
@@ -168,7 +167,7 @@ class ClusterObservation:
         return features.astype(np.float32)
 
     def _scale(self, geometry: SliceGeometry) -> tuple[FloatArray, FloatArray]:
-        """What is subtracted of a summary, and what it is then multiplied by, each shape (3, 4)."""
+        """Return what is subtracted from a summary, and the factor that follows, each of shape (3, 4)."""
         zero, scale = np.zeros((3, 4)), np.empty((3, 4))
         zero[:, 2:] = (np.array(geometry.shape) - 1) / 2
         scale[:, 0] = 1.0 / np.array(self._targets)
@@ -178,106 +177,8 @@ class ClusterObservation:
 
 
 def _most_landmarks(geometry: SliceGeometry) -> Landmarks:
-    """The largest summary that a slice could have, shape (3, 4)."""
+    """Return the largest summary that a slice could have, shape (3, 4)."""
     n_across, n_depth = geometry.shape
     # At least 1, so that a slice of one pixel's thickness has a space that is not a single point.
     most = [n_across * n_depth, n_across * n_depth, max(1, n_across - 1), max(1, n_depth - 1)]
     return np.array([most] * len(USUAL_AREAS_PX), dtype=float)
-
-
-class MergedObservation:
-    """Several observations as one.
-
-    Args:
-        observations: what to merge, as objects or by name; no two may have a part of the same name.
-        targets: what `cluster`, given by name, divides its counts by.
-
-    Raises:
-        InvalidValueError: if there is none, or one is no observation.
-    """
-
-    def __init__(
-        self, observations: Sequence[str | Observation], *, targets: Sequence[int] = PUBLISHED_TARGETS
-    ) -> None:
-        if isinstance(observations, str) or not isinstance(observations, Sequence) or not observations:
-            raise InvalidValueError(f"observations is {observations!r}, but it must be a list of at least one")
-        self.observations = tuple(
-            member for observation in observations for member in members_of(checked_observation(observation, targets))
-        )
-
-    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
-        """See `Observation.spaces`.
-
-        Raises:
-            InvalidValueError: if two observations have a part of the same name.
-        """
-        merged: dict[str, spaces.Box] = {}
-        for observation in self.observations:
-            parts = observation.spaces(geometries, n_free)
-            if twice := sorted(merged.keys() & parts.keys()):
-                raise InvalidValueError(f"merged observations both have the key {listed(twice)}")
-            merged.update(parts)
-        return merged
-
-    def observe(self, view: View) -> Parts:
-        """See `Observation.observe`."""
-        return {key: part for observation in self.observations for key, part in observation.observe(view).items()}
-
-    def observe_all(self, views: Sequence[View]) -> Parts:
-        """See `observe_all`."""
-        return {key: part for each in self.observations for key, part in observe_all(each, views).items()}
-
-
-def named_observations() -> Mapping[str, type[Observation]]:
-    """Returns the observations that have a name."""
-    # Deferred: the module of the slices builds on this one.
-    from armscan.envs.slice_observations import SliceChannelsObservation, SliceObservation
-
-    return {
-        "action_reward": ActionRewardObservation,
-        "cluster": ClusterObservation,
-        "slice": SliceObservation,
-        "slice_channels": SliceChannelsObservation,
-    }
-
-
-def members_of(observation: Observation) -> tuple[Observation, ...]:
-    """Returns what an observation is merged of, itself where it is not."""
-    return observation.observations if isinstance(observation, MergedObservation) else (observation,)
-
-
-def checked_observation(
-    observation: str | Observation | Sequence[str | Observation], targets: Sequence[int] = PUBLISHED_TARGETS
-) -> Observation:
-    """Returns an observation given as such, by name, or as a list of those that are merged.
-
-    Args:
-        observation: likewise.
-        targets: what `cluster`, given by name, divides its counts by.
-
-    Raises:
-        InvalidValueError: if there is no observation of that name, or it is no observation.
-    """
-    names = named_observations()
-    if isinstance(observation, str) and observation in names:
-        return ClusterObservation(targets=targets) if observation == "cluster" else names[observation]()
-    if isinstance(observation, list | tuple):
-        return MergedObservation(observation, targets=targets)
-    has_methods = all(callable(getattr(observation, method, None)) for method in ("spaces", "observe"))
-    if isinstance(observation, str | type) or not has_methods:
-        raise InvalidValueError(
-            f"observation is {observation!r}, but it must be {listed(names)}, a list of them, or an object with the "
-            "methods of Observation"
-        )
-    return observation  # type: ignore[return-value]
-
-
-def with_action_reward(
-    observation: str | Observation | Sequence[str | Observation], targets: Sequence[int] = PUBLISHED_TARGETS
-) -> Observation:
-    """Returns the observation, as `checked_observation` does, with action and reward, which are part of every one."""
-    checked = checked_observation(observation, targets)
-    members = members_of(checked)
-    if any(isinstance(member, ActionRewardObservation) for member in members):
-        return checked
-    return MergedObservation([*members, ActionRewardObservation()])

@@ -50,12 +50,12 @@ class OutlinedPlane(NamedTuple):
 
 @lru_cache
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Returns the font of every text, loaded once a size."""
+    """Return the font of every text, loaded once a size."""
     return ImageFont.load_default(size)
 
 
 def slice_panel(view: View, room: Size) -> Image.Image:
-    """Draws a slice, palm up: each cluster outlined, numbered, and in a shade of its tissue's colour.
+    """Draw a slice, palm up: each cluster outlined, numbered, and in a shade of its tissue's colour.
 
     Pixels of a landmark that belong to no cluster are darker.
 
@@ -83,13 +83,13 @@ def slice_panel(view: View, room: Size) -> Image.Image:
 
 
 def _cluster_numbers(view: View) -> NDArray[np.int32]:
-    """The number of each pixel's cluster among those of its tissue, from 1; 0 where it has none."""
+    """Return the number of each pixel's cluster among those of its tissue, from 1; 0 where it has none."""
     # No pixel is of two tissues.
     return sum((tissue.image for tissue in view.clusters.each()), start=np.zeros(view.slice_xz.shape, np.int32))
 
 
 def _slice_inks(view: View, numbers: NDArray[np.int32]) -> Inks:
-    """The colours of a slice, shape (across, depth, 3)."""
+    """Return the colours of a slice, shape (across, depth, 3)."""
     inks = TISSUE_INKS[view.slice_xz]
     shades = np.array(SHADES)[(numbers - 1) % len(SHADES)]
     shades[numbers == 0] = UNCLUSTERED
@@ -113,7 +113,7 @@ def side_panels(
     planes: Sequence[OutlinedPlane],
     rooms: tuple[Size, Size],
 ) -> tuple[Image.Image, Image.Image]:
-    """Draws the volume as it was read from the palm (frontal) and from the side (sagittal), fingers up, in one scale.
+    """Draw the volume as it was read from the palm (frontal) and from the side (sagittal), fingers up, in one scale.
 
     Args:
         volume: the volume.
@@ -140,20 +140,20 @@ def side_panels(
 
 
 def _from_two_sides(volume: LabelVolume) -> tuple[Inks, Inks]:
-    """The volume from the palm, shape (along, across, 3), and from the side, (along, depth, 3)."""
+    """Return the volume from the palm, shape (along, across, 3), and from the side, (along, depth, 3)."""
     from_palm = _first_seen(volume.labels[:, :, ::-1], 2)
     from_side = _first_seen(volume.labels, 0)
     return TISSUE_INKS[from_palm.T], TISSUE_INKS[from_side]
 
 
 def _first_seen(labels_xyz: NDArray[np.uint8], axis: int) -> NDArray[np.uint8]:
-    """The first label along an axis that is not background, 0 where there is none."""
+    """Return the first label along an axis that is not background, 0 where there is none."""
     first = np.expand_dims((labels_xyz > 0).argmax(axis=axis), axis)
     return np.take_along_axis(labels_xyz, first, axis).squeeze(axis)
 
 
 def _corners_mm(volume: LabelVolume, transform: RigidTransform | None, action: ManipulatorAction) -> FloatArray:
-    """The four corners of a slice where they lie in the volume as it was read, shape (4, 3)."""
+    """Return the four corners of a slice where they lie in the volume as it was read, shape (4, 3)."""
     matrix, offset_mm = (transform or RigidTransform()).plane_map(action)
     across_mm, _, depth_mm = volume.size_mm
     corners = np.array([[0, 0, 0], [across_mm, 0, 0], [across_mm, 0, depth_mm], [0, 0, depth_mm]])
@@ -161,7 +161,7 @@ def _corners_mm(volume: LabelVolume, transform: RigidTransform | None, action: M
 
 
 def reward_panel(rewards: Sequence[float], places: range, threshold: float, size: Size) -> Image.Image:
-    """Draws rewards from left to right between 0, at the top, and -1.
+    """Draw rewards from left to right between 0, at the top, and -1.
 
     Args:
         rewards: one for each place from the first, at least one, each in [-1, 0].
@@ -192,7 +192,7 @@ def reward_panel(rewards: Sequence[float], places: range, threshold: float, size
 
 
 def _scale(size_mm: tuple[float, float], room: Size) -> float:
-    """The pixels a mm of the largest picture that fits into a room."""
+    """Return the pixels a mm of the largest picture that fits into a room."""
     return min(room[0] / size_mm[0], room[1] / size_mm[1])
 
 

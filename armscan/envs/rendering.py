@@ -62,7 +62,7 @@ class History:
     Args:
         rewards: from the first to the current one, each in [-1, 0].
         places: their numbers, and those of the ones that can follow.
-        threshold: above which a plane is good enough, -delta.
+        threshold: above which a plane is good enough, -success_threshold.
         title: what they are: `reward by step`.
     """
 
@@ -73,7 +73,7 @@ class History:
 
 
 def draw_frame(episode: Episode) -> NDArray[np.uint8]:
-    """Draws an episode as it stands.
+    """Draw an episode as it stands.
 
     Args:
         episode: one whose first plane has been looked at.
@@ -81,14 +81,14 @@ def draw_frame(episode: Episode) -> NDArray[np.uint8]:
     Returns:
         The picture, shape (512, 860, 3).
     """
-    scene, task = episode.scene, episode.task
+    scene, rules = episode.scene, episode.rules
     return draw_plane(
         scene.volume,
         episode.plane,
         episode.view,
         transform=scene.transform,
         beside=Beside(scene.optimum, "optimal plane"),
-        history=History(episode.rewards, range(task.max_steps + 1), -task.delta, "reward by step"),
+        history=History(episode.rewards, range(rules.max_steps + 1), -rules.success_threshold, "reward by step"),
         caption=f"step {episode.n_steps}",
     )
 
@@ -103,7 +103,7 @@ def draw_plane(
     history: History | None = None,
     caption: str = "",
 ) -> NDArray[np.uint8]:
-    """Draws a plane: its slice, the volume from two sides, what it is worth.
+    """Draw a plane: its slice, the volume from two sides, what it is worth.
 
     Args:
         volume: where the plane lies.
@@ -145,7 +145,7 @@ def view_of(
     tissues: Tissues = PIXEL_TISSUES,
     reward: Reward = LandmarkReward(),  # noqa: B008 - it is not changed
 ) -> View:
-    """Looks at a plane outside of an episode, in a volume as it was read.
+    """Look at a plane outside of an episode, in a volume as it was read.
 
     Args:
         volume: the volume.
@@ -205,7 +205,7 @@ def _write_facts(
 
 
 def _shortened(line: str) -> str:
-    """A line that fits beside the rewards: the middle of a long file name is left out."""
+    """Return a line that fits beside the rewards: the middle of a long file name is left out."""
     n_kept = len(line)
     shortened = line
     while font(15).getlength(shortened) > FACTS_WIDTH:

@@ -7,11 +7,11 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from armscan.checks import check_choice, check_float
 from armscan.envs.actions import ActionBounds
 from armscan.envs.observations import SliceGeometry
 from armscan.errors import InvalidValueError, OptimalPlaneError
-from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, plane_distance, slid_into
+from armscan.utils.validation import check_choice, check_float
+from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, plane_distance, shift_into
 from armscan.volumes.volume import LabelVolume
 
 MAX_SHIFT_MM = 10_000.0
@@ -45,7 +45,7 @@ class RandomTransform:
         check_choice("transform centre", self.centre, CENTRES)
 
     def draw(self, volume: LabelVolume, rng: np.random.Generator) -> RigidTransform:
-        """Draws one motion of a volume."""
+        """Draw one motion of a volume."""
         limits = np.array([self.rz_deg, self.rx_deg, self.tx_mm, self.ty_mm])
         rz, rx, tx, ty = rng.uniform(-limits, limits)
         centre_mm = volume.centre_mm if self.centre == "middle" else (0.0, 0.0, 0.0)
@@ -74,13 +74,13 @@ class Scene:
         return self.bounds.normalised(self.optimum)
 
     def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
-        """Returns (M, b): a point p of the plane's frame lies at M p + b in the volume as it was read."""
+        """Return (M, b): a point p of the plane's frame lies at M p + b in the volume as it was read."""
         if self.transform is None:
             return action.matrix, action.offset_mm
         return self.transform.plane_map(action)
 
     def distance(self, action: ManipulatorAction) -> tuple[float, float]:
-        """Returns how far a plane is from the optimal one, as `plane_distance` does: (mm, degrees)."""
+        """Return how far a plane is from the optimal one, as `plane_distance` does: (mm, degrees)."""
         centre_mm = self.volume.centre_mm
         return plane_distance(action, self.optimum, (centre_mm[0], centre_mm[2]))
 
@@ -104,12 +104,12 @@ class SceneSampler:
             raise InvalidValueError(f"transform is {self.transform!r}, but it must be a RandomTransform or None")
 
     def bounds(self, volume: LabelVolume) -> ActionBounds:
-        """Returns the bounds that hold for every scene of a volume."""
+        """Return the bounds that hold for every scene of a volume."""
         size_mm = volume.size_mm
         return _bounds(self.rotation_bounds_deg, self.translation_bounds_mm or (size_mm[0], size_mm[1]))
 
     def unmoved(self, volume: LabelVolume) -> Scene:
-        """Returns the scene of a volume as it is.
+        """Return the scene of a volume as it is.
 
         Raises:
             OptimalPlaneError: if scenes of this volume cannot be drawn, because it has no labelled plane, or the plane
@@ -136,14 +136,14 @@ class SceneSampler:
         return scene
 
     def propose(self, volume: LabelVolume, rng: np.random.Generator) -> Scene | None:
-        """Draws a motion of the volume; None where it takes the optimal plane out of the bounds."""
+        """Draw a motion of the volume; None where it takes the optimal plane out of the bounds."""
         return self._scene(volume, self.transform.draw(volume, rng) if self.transform else None)
 
     def _scene(self, volume: LabelVolume, transform: RigidTransform | None) -> Scene | None:
         assert volume.optimal_action is not None
         bounds = self.bounds(volume)
         optimum = volume.optimal_action if transform is None else transform.inverse_plane(volume.optimal_action)
-        within = slid_into(optimum, bounds.translation_mm)
+        within = shift_into(optimum, bounds.translation_mm)
         (rz, rx), (bound_rz, bound_rx) = optimum.rotation, self.rotation_bounds_deg
         if within is None or abs(rz) > bound_rz or abs(rx) > bound_rx:
             return None
@@ -155,5 +155,5 @@ _bounds = lru_cache(ActionBounds)
 
 
 def slice_geometry(volume: LabelVolume) -> SliceGeometry:
-    """Returns the geometry of a volume's slices."""
+    """Return the geometry of a volume's slices."""
     return SliceGeometry(volume.slice_shape, volume.pixel_mm)

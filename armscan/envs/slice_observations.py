@@ -10,10 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from armscan.checks import check_ints
 from armscan.envs.observations import SliceGeometry, View, smallest_shape
 from armscan.envs.spaces import Parts
 from armscan.errors import InvalidValueError
+from armscan.utils.validation import check_ints
 from armscan.volumes.volume import LABEL_NAMES, LANDMARK_LABELS
 
 Shape = tuple[int, int]
@@ -43,7 +43,7 @@ class SliceFrame:
         self.shape = None if shape is None else _checked_shape("shape", shape)
 
     def observed_shape(self, geometries: Sequence[SliceGeometry]) -> Shape:
-        """Returns the shape of what is observed of slices of any of these geometries.
+        """Return the shape of what is observed of slices of any of these geometries.
 
         Raises:
             InvalidValueError: if the crop is larger than the smallest slice.
@@ -57,7 +57,7 @@ class SliceFrame:
         return self.shape or self.crop or smallest
 
     def cropped(self, view: View) -> NDArray[np.uint8]:
-        """Returns the middle of a slice."""
+        """Return the middle of a slice."""
         crop = self.crop or view.smallest_shape
         first = [(n - wanted + 1) // 2 for n, wanted in zip(view.slice_xz.shape, crop, strict=True)]
         return view.slice_xz[first[0] : first[0] + crop[0], first[1] : first[1] + crop[1]]
@@ -65,7 +65,7 @@ class SliceFrame:
 
 @numba.njit(cache=True, nogil=True)
 def _reduce(image: NDArray[np.uint8], reduced: NDArray[np.uint8]) -> None:
-    """Fills each pixel with the highest value of the pixels that it stands for."""
+    """Fill each pixel with the highest value of the pixels that it stands for."""
     (n_rows, n_cols), (m_rows, m_cols) = image.shape, reduced.shape
     for i in range(m_rows):
         for k in range(m_cols):

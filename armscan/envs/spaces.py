@@ -50,7 +50,7 @@ class MultiBoxSpace(spaces.Dict):
 
 
 def in_order(parts: Parts, boxes: Mapping[str, spaces.Box], leading: tuple[int, ...] = ()) -> Parts:
-    """Returns the parts of an observation in the order of their boxes.
+    """Return the parts of an observation in the order of their boxes.
 
     Args:
         parts: as an observation gave them.
@@ -75,13 +75,13 @@ def in_order(parts: Parts, boxes: Mapping[str, spaces.Box], leading: tuple[int, 
 
 
 def flat_space(boxes: Mapping[str, spaces.Box]) -> spaces.Box:
-    """Returns the space of `flattened` parts, their bounds in the order of the data."""
+    """Return the space of parts as `flatten` returns them, their bounds in the order of the data."""
     low = np.concatenate([box.low.ravel() for box in boxes.values()])
     high = np.concatenate([box.high.ravel() for box in boxes.values()])
     return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
-def flattened(parts: Parts) -> NDArray[np.float32]:
-    """Returns the parts, each shape (..., n), as one of 32-bit floats, side by side in their order."""
+def flatten(parts: Parts) -> NDArray[np.float32]:
+    """Return the parts, each shape (..., n), as one of 32-bit floats, side by side in their order."""
     # Of 32-bit floats already, unless an image is among them.
     return np.concatenate(list(parts.values()), axis=-1).astype(np.float32, copy=False)

@@ -11,11 +11,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from armscan.checks import check_int
-from armscan.envs.episode import INFO, Episode, begin, checked_actions, look, wanted_volume
+from armscan.envs.episode import INFO, Episode, begin, check_actions, look, wanted_volume
 from armscan.envs.history import Mask
-from armscan.envs.task import Observed, Task, Volumes
+from armscan.envs.rules import Observed, Rules, Volumes
 from armscan.errors import InvalidValueError, ResetNeededError
+from armscan.utils.validation import check_int
 from armscan.volumes.plane import FloatArray
 
 MOST_ENVS = 65536
@@ -56,18 +56,18 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             raise InvalidValueError(f"render_mode is {render_mode!r}, but many environments are not drawn: use one")
         self._autoreset_mode = _checked_mode(autoreset_mode)
         self.metadata = {"autoreset_mode": self._autoreset_mode}
-        self.task = Task(volumes, **rules)
-        self.single_observation_space = self.task.observation_space
-        self.single_action_space = self.task.action_space
-        self.observation_space = batch_space(self.task.observation_space, self.num_envs)
-        self.action_space = batch_space(self.task.action_space, self.num_envs)
+        self.rules = Rules(volumes, **rules)
+        self.single_observation_space = self.rules.observation_space
+        self.single_action_space = self.rules.action_space
+        self.observation_space = batch_space(self.rules.observation_space, self.num_envs)
+        self.action_space = batch_space(self.rules.action_space, self.num_envs)
         self._rngs = [seeding.np_random()[0] for _ in range(self.num_envs)]
         self._episodes: list[Episode | None] = [None] * self.num_envs
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
-        """Starts an episode in each environment, or in those that `options["reset_mask"]` marks.
+        """Start an episode in each environment, or in those that `options["reset_mask"]` marks.
 
         Args:
             seed: of the first environment, the next has the next seed; or one for each, None to leave it as it is.
@@ -78,16 +78,16 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         """
         options = dict(options) if isinstance(options, dict) else options
         chosen = np.flatnonzero(self._popped_mask(options))
-        volume_name, seeds = wanted_volume(self.task, options), self._seeds(seed)
+        volume_name, seeds = wanted_volume(self.rules, options), self._seeds(seed)
         for i, one_seed in enumerate(seeds):
             if one_seed is not None and i in chosen:
                 self._rngs[i] = seeding.np_random(one_seed)[0]
         self._begin(chosen, volume_name)
-        look(self.task, [self._episode(int(i)) for i in chosen])
+        look(self.rules, [self._episode(int(i)) for i in chosen])
         return self._observed(), self._infos(chosen)
 
     def step(self, actions: Any) -> VectorStep:
-        """Takes a step in every environment."""
+        """Take a step in every environment."""
         episodes = [self._episode(i) for i in range(self.num_envs)]
         is_over = np.array([not episode.is_running for episode in episodes])
         if self._autoreset_mode is AutoresetMode.DISABLED and is_over.any():
@@ -95,12 +95,12 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
                 f"the episodes of environments {np.flatnonzero(is_over).tolist()} have ended: reset them by "
                 "reset(options={'reset_mask': mask}) before step()"
             )
-        for episode, action in zip(episodes, checked_actions(actions, self._action_shape), strict=True):
+        for episode, action in zip(episodes, check_actions(actions, self._action_shape), strict=True):
             if episode.is_running:
                 episode.aim(action)
         self._begin(np.flatnonzero(is_over))
         episodes = [self._episode(i) for i in range(self.num_envs)]
-        look(self.task, episodes)
+        look(self.rules, episodes)
         rewards = np.array([0.0 if over else e.view.reward for e, over in zip(episodes, is_over, strict=True)])
         terminated = np.array([episode.is_solved for episode in episodes]) & ~is_over
         truncated = np.array([episode.is_truncated for episode in episodes]) & ~is_over
@@ -113,12 +113,12 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         Privileged: neither observations nor `info` give it, and an agent that looked it up would have nothing to find.
         It is for learning from the labelled planes of training volumes.
         """
-        free = list(self.task.free)
+        free = list(self.rules.free)
         return np.array([self._episode(i).scene.optimum_normalised[free] for i in range(self.num_envs)])
 
     @property
     def _action_shape(self) -> tuple[int, ...]:
-        return (self.num_envs, *self.task.action_space.shape)
+        return (self.num_envs, *self.rules.action_space.shape)
 
     def _episode(self, i: int) -> Episode:
         episode = self._episodes[i]
@@ -128,15 +128,15 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _begin(self, chosen: NDArray[np.int64], volume_name: str | None = None) -> None:
         if len(chosen):
-            begun = begin(self.task, [self._rngs[i] for i in chosen], volume_name)
+            begun = begin(self.rules, [self._rngs[i] for i in chosen], volume_name)
             for i, episode in zip(chosen, begun, strict=True):
                 self._episodes[i] = episode
 
     def _observed(self) -> Observed:
-        return self.task.observe_all([self._episode(i).view for i in range(self.num_envs)])
+        return self.rules.observe_all([self._episode(i).view for i in range(self.num_envs)])
 
     def _infos(self, chosen: NDArray[np.int64]) -> dict[str, Any]:
-        """Returns `info` as arrays, and under `_key` which environments it is given for, as Gymnasium has it."""
+        """Return `info` as arrays, and under `_key` which environments it is given for, as Gymnasium has it."""
         episodes = [self._episode(i) for i in chosen]
         is_given = np.isin(np.arange(self.num_envs), chosen)
         infos: dict[str, Any] = {}
@@ -179,7 +179,7 @@ def reset_each(
     seeds: int | Sequence[int | None] | None = None,
     options: dict[str, Any] | None = None,
 ) -> tuple[Observed, dict[str, Any]]:
-    """Resets vector environments, with a seed for each where there is a list of them."""
+    """Reset vector environments, with a seed for each where there is a list of them."""
     # Gymnasium's types leave out such lists, which its own vector environments take.
     return envs.reset(seed=seeds, options=options)  # type: ignore[arg-type]
 

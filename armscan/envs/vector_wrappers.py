@@ -10,24 +10,24 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from armscan.checks import check_int
 from armscan.envs.history import BestPairs, FrameHistory, Mask, boxes_of, observation_of, parts_of, space_of
-from armscan.envs.task import Observed
+from armscan.envs.rules import Observed
 from armscan.envs.vector_env import VectorStep, reset_each
-from armscan.envs.wrappers import MOST_KEPT, checked_env, with_memory, with_memory_box
+from armscan.envs.wrappers import MOST_KEPT, check_env, with_memory, with_memory_box
+from armscan.utils.validation import check_int
 
 
 class _VectorRemembering(VectorWrapper, ABC):
     """A wrapper whose observations depend on those before them in the episodes."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
-        super().__init__(checked_env(env, VectorEnv))
+        super().__init__(check_env(env, VectorEnv))
         self._has_ended = np.zeros(env.num_envs, dtype=np.bool_)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
-        """Starts episodes."""
+        """Start episodes."""
         observations, infos = reset_each(self.env, seed, options)
         is_first = infos["_reward"]
         self._has_ended &= ~is_first
@@ -35,7 +35,7 @@ class _VectorRemembering(VectorWrapper, ABC):
         return self._remembering(observations), infos
 
     def step(self, actions: Any) -> VectorStep:
-        """Takes a step in every environment."""
+        """Take a step in every environment."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         self._push(observations, infos)
         if self._has_ended.any():
@@ -45,15 +45,15 @@ class _VectorRemembering(VectorWrapper, ABC):
 
     @abstractmethod
     def _refill(self, observations: Observed, infos: dict[str, Any], is_first: Mask) -> None:
-        """Begins anew what is remembered of some environments."""
+        """Begin anew what is remembered of some environments."""
 
     @abstractmethod
     def _push(self, observations: Observed, infos: dict[str, Any]) -> None:
-        """Takes a step of every environment into what is remembered."""
+        """Take a step of every environment into what is remembered."""
 
     @abstractmethod
     def _remembering(self, observations: Observed) -> Observed:
-        """Returns the observations with what is remembered."""
+        """Return the observations with what is remembered."""
 
 
 class VectorFrameStack(_VectorRemembering):
@@ -81,7 +81,7 @@ class VectorFrameStack(_VectorRemembering):
         self._history.push(parts_of(observations))
 
     def _remembering(self, observations: Observed) -> Observed:
-        return observation_of(self._history.stacked(parts_of(observations)))
+        return observation_of(self._history.stack_frames(parts_of(observations)))
 
 
 class VectorBestActionMemory(_VectorRemembering):

@@ -1,4 +1,4 @@
-"""A window that shows pictures as they come; Matplotlib's, which also has the sliders of `armscan.explore`."""
+"""A window that shows pictures as they come; Matplotlib's, which also has the sliders of `armscan data explore`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Window:
         self._shown_s = 0.0
 
     def show(self, picture: NDArray[np.uint8]) -> None:
-        """Shows a picture, shape (height, width, 3), not before the last one has been seen long enough."""
+        """Show a picture, shape (height, width, 3), not before the last one has been seen long enough."""
         if self._figure is None or self._image is None:
             self._figure, self._image = opened(self.title, picture)
             self._figure.canvas.mpl_connect("close_event", self._was_closed)
@@ -59,7 +59,7 @@ class Window:
             self._shown_s = time.monotonic()
 
     def close(self) -> None:
-        """Closes the window; nothing happens where none is open."""
+        """Close the window; nothing happens where none is open."""
         if self._figure is not None:
             from matplotlib import pyplot
 
@@ -72,7 +72,7 @@ class Window:
 
 
 def opened(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tuple[Figure, AxesImage]:
-    """Makes a figure, not shown yet, that a picture fills in its own pixels.
+    """Make a figure, not shown yet, that a picture fills in its own pixels.
 
     Args:
         title: of the window.
@@ -101,11 +101,11 @@ def opened(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tup
 
 
 def check_display() -> None:
-    """Raises `DisplayError` unless Matplotlib can show a window here."""
+    """Raise `DisplayError` unless Matplotlib can show a window here."""
     try:
         from matplotlib import pyplot
 
-        # Where nothing else is set, this looks for a backend that works here.
+        # Default: the first backend that works here.
         backend = str(pyplot.get_backend())
         pyplot.switch_backend(backend)
     except (ImportError, ValueError) as error:

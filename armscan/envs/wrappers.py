@@ -14,7 +14,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from armscan.checks import check_int
 from armscan.envs.history import (
     FLAT,
     BestPairs,
@@ -24,9 +23,10 @@ from armscan.envs.history import (
     parts_of,
     space_of,
 )
+from armscan.envs.rules import Observed
 from armscan.envs.spaces import Parts, flat_space
-from armscan.envs.task import Observed
 from armscan.errors import InvalidValueError
+from armscan.utils.validation import check_int
 from armscan.volumes.plane import FloatArray
 
 Env = gym.Env[Any, FloatArray]
@@ -37,8 +37,8 @@ MOST_KEPT = 1000
 ALL = np.array([True])
 
 
-def checked_env(env: Any, kind: type[Any]) -> Any:
-    """Returns `env` if it is an environment of the given kind."""
+def check_env(env: Any, kind: type[Any]) -> Any:
+    """Return `env` if it is an environment of the given kind."""
     if not isinstance(env, kind):
         raise InvalidValueError(f"env is {env!r}, but it must be a gymnasium {kind.__name__}")
     return env
@@ -50,18 +50,18 @@ class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstruc
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
-        """Starts an episode."""
+        """Start an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         return self._remembering(observation, info, is_first=True), info
 
     def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
-        """Takes a step."""
+        """Take a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._remembering(observation, info, is_first=False), float(reward), terminated, truncated, info
 
     @abstractmethod
     def _remembering(self, observation: Observed, info: dict[str, Any], *, is_first: bool) -> Observed:
-        """Takes an observation into what is remembered, and returns it with that."""
+        """Add an observation to the memory; return it with the memory."""
 
 
 class FrameStack(_Remembering):
@@ -79,7 +79,7 @@ class FrameStack(_Remembering):
     """
 
     def __init__(self, env: Env, stack: int, *, exclude: Collection[str] = ()) -> None:
-        boxes = boxes_of(checked_env(env, gym.Env).observation_space, "FrameStack")
+        boxes = boxes_of(check_env(env, gym.Env).observation_space, "FrameStack")
         size = check_int("stack", stack, at_least=1, at_most=MOST_KEPT)
         self._history = FrameHistory(boxes, size, exclude, 1)
         RecordConstructorArgs.__init__(self, stack=stack, exclude=exclude)
@@ -92,7 +92,7 @@ class FrameStack(_Remembering):
             self._history.refill(batch, ALL)
         else:
             self._history.push(batch)
-        return observation_of({name: part[0] for name, part in self._history.stacked(batch).items()})
+        return observation_of({name: part[0] for name, part in self._history.stack_frames(batch).items()})
 
 
 class BestActionMemory(_Remembering):
@@ -110,7 +110,7 @@ class BestActionMemory(_Remembering):
     """
 
     def __init__(self, env: Env, memory: int) -> None:
-        n_free = int(np.prod(checked_env(env, gym.Env).action_space.shape or ()))
+        n_free = int(np.prod(check_env(env, gym.Env).action_space.shape or ()))
         self._best = BestPairs(check_int("memory", memory, at_least=1, at_most=MOST_KEPT), n_free, 1)
         boxes = with_memory_box(boxes_of(env.observation_space, "BestActionMemory"), self._best)
         RecordConstructorArgs.__init__(self, memory=memory)
@@ -127,7 +127,7 @@ class BestActionMemory(_Remembering):
 
 
 def with_memory_box(boxes: dict[str, gym.spaces.Box], best: BestPairs) -> dict[str, gym.spaces.Box]:
-    """Returns the boxes of an observation with a memory.
+    """Return the boxes of an observation with a memory.
 
     Raises:
         InvalidValueError: if there is a part of that name already.
@@ -140,7 +140,7 @@ def with_memory_box(boxes: dict[str, gym.spaces.Box], best: BestPairs) -> dict[s
 
 
 def with_memory(parts: Parts, pairs: np.ndarray[Any, np.dtype[np.float32]]) -> Parts:
-    """Returns the parts of an observation, or of a batch, with the pairs."""
+    """Return the parts of an observation, or of a batch, with the pairs."""
     if FLAT in parts:
         return {FLAT: np.concatenate([parts[FLAT], pairs], axis=-1)}
     return {**parts, MEMORY: pairs}

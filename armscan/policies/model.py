@@ -16,13 +16,13 @@ from mlflow.models import ModelSignature
 from mlflow.types import Schema, TensorSpec
 from numpy.typing import NDArray
 
-from armscan.agents.export import exported, save_onnx, save_program
 from armscan.agents.policy import Batch, Policy
-from armscan.files import sum_of
+from armscan.agents.torch_export import export_program, save_onnx, save_program
 from armscan.tracking.run import MODEL_FILE
+from armscan.utils.files import sha256
 
 PROGRAM_FILE, ONNX_FILE = "policy.pt2", "policy.onnx"
-CODE = Path(__file__).with_name("served.py")
+CODE = Path(__file__).with_name("pyfunc.py")
 # All that a model consists of, by their places in its folder.
 FILES = (
     MODEL_FILE,
@@ -42,7 +42,7 @@ Arrays = NDArray[Any] | dict[str, NDArray[Any]]
 
 
 def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, Any]) -> None:
-    """Writes a policy as a model, with an ONNX file beside it.
+    """Write a policy as a model, with an ONNX file beside it.
 
     Args:
         folder: of the model, which is not there yet.
@@ -53,7 +53,7 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
     Raises:
         ExportError: if torch.export or ONNX cannot take the policy.
     """
-    program = exported(policy, batch)
+    program = export_program(policy, batch)
     with tempfile.TemporaryDirectory() as beside:
         file = Path(beside, PROGRAM_FILE)
         save_program(program, file)
@@ -79,26 +79,26 @@ def is_model(folder: Path) -> bool:
 
 
 def others_in(folder: Path) -> list[str]:
-    """Returns what lies in the folder of a model and is no part of one."""
+    """Return what lies in the folder of a model and is no part of one."""
     found = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     return sorted(found - {*FILES, *(str(Path(file).parent) for file in FILES)})
 
 
-def sum_of_model(folder: Path) -> str:
-    """Returns the SHA-256 of a model: of the sums of its files, each with its place, as `sha256sum` writes them."""
+def model_sha256(folder: Path) -> str:
+    """Return the SHA-256 of a model: of the sums of its files, each with its place, as `sha256sum` writes them."""
     files = [name for name in FILES if (folder / name).is_file()]
-    return sum_of("".join(f"{sum_of((folder / name).read_bytes())}  {name}\n" for name in files).encode())
+    return sha256("".join(f"{sha256((folder / name).read_bytes())}  {name}\n" for name in files).encode())
 
 
 def arrays_of(batch: Batch) -> Arrays:
-    """Returns a batch of tensors as the model takes it."""
+    """Return a batch of tensors as the model takes it."""
     if isinstance(batch, torch.Tensor):
         return batch.numpy()
     return {name: part.numpy() for name, part in batch.items()}
 
 
 def _release(name: str) -> str:
-    """Returns the version of a library without the build that is installed here, such as `+cpu`."""
+    """Return the version of a library without the build that is installed here, such as `+cpu`."""
     return metadata.version(name).partition("+")[0]
 
 

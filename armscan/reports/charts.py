@@ -14,8 +14,8 @@ from plotly.subplots import make_subplots
 
 from armscan.reports.curves import AXES, Curve
 from armscan.reports.groups import Group
-from armscan.reports.outcomes import judged
-from armscan.training import Figures
+from armscan.reports.significance import evaluated_trainings
+from armscan.training import MetricEstimates
 from armscan.volumes.plane import FloatArray
 
 # By figure, axis and number of the group.
@@ -52,13 +52,13 @@ class Trace:
 
 
 def colours(n: int) -> list[str]:
-    """Returns a colour for each of some groups."""
+    """Return a colour for each of some groups."""
     palette = qualitative.D3 if n <= len(qualitative.D3) else qualitative.Dark24
     return [str(palette[number % len(palette)]) for number in range(n)]
 
 
 def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str, str]) -> Figure:
-    """Returns figures below each other, with switches for the axis and for the lines of single seeds.
+    """Return figures below each other, with switches for the axis and for the lines of single seeds.
 
     Args:
         groups: in their order.
@@ -103,8 +103,8 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
     return figure
 
 
-def final_chart(groups: Sequence[Group], reached: Sequence[Figures | None]) -> Figure:
-    """Returns the final figures of all groups with their intervals, and beside them those of single seeds.
+def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Figure:
+    """Return the final figures of all groups with their intervals, and beside them those of single seeds.
 
     Args:
         groups: in their order.
@@ -117,7 +117,9 @@ def final_chart(groups: Sequence[Group], reached: Sequence[Figures | None]) -> F
             if figures is None:
                 continue
             value, low, high = figures.estimates[name]
-            seeds = [(each.label, each.evaluation.metrics()[name]) for each in judged(group) if each.evaluation]
+            seeds = [
+                (each.label, each.evaluation.metrics()[name]) for each in evaluated_trainings(group) if each.evaluation
+            ]
             figure.add_scatter(
                 x=[of_seed for _, of_seed in seeds],
                 y=[_wrapped(group.label)] * len(seeds),
@@ -141,7 +143,7 @@ def final_chart(groups: Sequence[Group], reached: Sequence[Figures | None]) -> F
 
 
 def _traces(of_axes: Sequence[Curve | None], colour: str) -> Iterator[Trace]:
-    """Yields the band, the lines of the seeds, and the line of all of them together."""
+    """Yield the band, the lines of the seeds, and the line of all of them together."""
     curve = of_axes[0]
     if curve is None:
         return
@@ -161,7 +163,7 @@ def _traces(of_axes: Sequence[Curve | None], colour: str) -> Iterator[Trace]:
 
 
 def _mode(places: FloatArray) -> str:
-    """Returns how a curve is drawn: a line through a single point would be nowhere to be seen."""
+    """Return how a curve is drawn: a line through a single point would be nowhere to be seen."""
     return "lines" if len(places) > 1 else "lines+markers"
 
 
@@ -177,7 +179,7 @@ def _line(curve: Curve | None, label: str) -> Points:
 
 
 def _said(curve: Curve | None) -> list[str]:
-    """Returns what is said of each place of a curve."""
+    """Return what is said of each place of a curve."""
     if curve is None or curve.n_seeds == 1:
         return [f"{value:.3g} (one seed)" for value in curve.band.values] if curve else []
     return [f"{value:.3g} ({low:.3g} to {high:.3g})" for value, low, high in zip(*curve.band, strict=True)]
@@ -188,7 +190,7 @@ def _wrapped(label: str) -> str:
 
 
 def _axis_switch(traces: Sequence[Trace], n_rows: int) -> dict[str, Any]:
-    """Returns buttons that draw the same lines over another axis."""
+    """Return buttons that draw the same lines over another axis."""
     last = f"xaxis{n_rows if n_rows > 1 else ''}"
     buttons = []
     for number, axis in enumerate(AXES):
@@ -203,7 +205,7 @@ def _axis_switch(traces: Sequence[Trace], n_rows: int) -> dict[str, Any]:
 
 
 def _kind_switch(traces: Sequence[Trace], shown: str) -> dict[str, Any]:
-    """Returns buttons that show and hide bands and the lines of single seeds."""
+    """Return buttons that show and hide bands and the lines of single seeds."""
     numbers = [number for number, trace in enumerate(traces) if trace.kind]
     buttons = []
     for label, kinds in SHOWN.items():

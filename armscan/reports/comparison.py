@@ -1,4 +1,4 @@
-"""The comparison of any runs: learning curves, final figures, which is likely to be better, and films side by side."""
+"""The comparison of any runs: learning curves, final figures, which is likely to be better, and videos side by side."""
 
 from __future__ import annotations
 
@@ -8,17 +8,24 @@ from pathlib import Path
 from typing import Any
 
 from armscan.reports.charts import MANY, Curves, final_chart, learning_curves
+from armscan.reports.csv_tables import all_numbers, run_rows
 from armscan.reports.curves import AXES, curve_of
-from armscan.reports.films import films
 from armscan.reports.groups import Group
+from armscan.reports.html import Markup, chart, table, write_page
+from armscan.reports.load import VALIDATION, TrackedTraining
 from armscan.reports.notes import notes_on
-from armscan.reports.numbers import all_numbers, run_rows
-from armscan.reports.outcomes import COMPARED_BY, Pair, compared, final_figures, judged, opposite
-from armscan.reports.page import Markup, chart, table, write_page
-from armscan.reports.trainings import VALIDATION, Training
-from armscan.training import Figures
-from armscan.training.bootstrap import Estimate
-from armscan.training.seeds import FEWEST_SEEDS
+from armscan.reports.significance import (
+    COMPARED_BY,
+    Pair,
+    compare_groups,
+    complement,
+    evaluated_trainings,
+    final_metrics,
+)
+from armscan.reports.videos import videos
+from armscan.stats.aggregation import FEWEST_SEEDS
+from armscan.stats.bootstrap import Estimate
+from armscan.training import MetricEstimates
 
 SHOWN = {
     "success rate": ("success_rate", "{:.1%}"),
@@ -27,14 +34,14 @@ SHOWN = {
     "angle (°)": ("mean_distance_deg", "{:.1f}"),
     "Dice": ("mean_dice", "{:.2f}"),
 }
-# A chart that was drawn where nothing was seen has no width.
+# A chart drawn while hidden has no width.
 FITTED = "this.querySelectorAll('.js-plotly-plot').forEach((chart) => Plotly.Plots.resize(chart))"
 HOW_CURVES = (
     "On the validation volumes, after each epoch. Thick: the seeds of a group together, their interquartile mean (of "
     "success rates the mean; of fewer than four seeds both are the mean). Band: its 95 % interval by a bootstrap of "
     "the seeds; a group of one seed has none. Thin: each seed. A training that ran to its end before others of its "
     "group is carried on with its last value; where one was cut off or is still running, the curve of its group ends. "
-    "Seconds are of training and validation on whatever machine it was, with whatever else it did."
+    "Seconds are wall time of training and validation, on the machine of the run."
 )
 HOW_FINAL = (
     "The final evaluation, with the weights of the best epoch, on test volumes that had no part in anything before: "
@@ -51,8 +58,8 @@ HOW_BETTER = (
 )
 
 
-def write_comparison(groups: Sequence[Group], left_out: Sequence[Training], title: str, folder: Path) -> Path:
-    """Writes the report.
+def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining], title: str, folder: Path) -> Path:
+    """Write the report.
 
     Args:
         groups: that are compared.
@@ -71,15 +78,15 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[Training], titl
         for number, group in enumerate(groups)
         if (curve := curve_of(group, figure, axis))
     }
-    reached = [final_figures(group) for group in groups]
-    pairs = {figure: list(compared(groups, figure)) for figure in COMPARED_BY}
+    reached = [final_metrics(group) for group in groups]
+    pairs = {figure: list(compare_groups(groups, figure)) for figure in COMPARED_BY}
     parts = [
         _summary(groups),
         notes_on(groups, left_out, has_other_volumes=any(each.probability is None for each in pairs["mean_steps"])),
         *_learning(groups, curves),
         *_final(groups, reached),
         *_better(groups, pairs),
-        films(groups),
+        videos(groups),
         *_of_the_training(groups, curves, [figure for figure in figures if figure not in VALIDATION]),
         "<h2>Runs</h2>",
         table(run_rows(groups)),
@@ -88,7 +95,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[Training], titl
 
 
 def _figures(groups: Sequence[Group]) -> list[str]:
-    """Returns the names of what can be drawn: figures of the validation first."""
+    """Return the names of what can be drawn: figures of the validation first."""
     names = {name for group in groups for training in group.trainings for name in training.series}
     return [*(name for name in VALIDATION if name in names), *sorted(names - VALIDATION.keys())]
 
@@ -100,7 +107,7 @@ def _summary(groups: Sequence[Group]) -> str:
     return f"<p>{counted}: those of a group differ by nothing but the seed.</p>{table(rows)}"
 
 
-def _seeds(trainings: Sequence[Training]) -> list[str]:
+def _seeds(trainings: Sequence[TrackedTraining]) -> list[str]:
     return [training.seed if training.seed is not None else training.label for training in trainings]
 
 
@@ -116,11 +123,11 @@ def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
 def _of_the_training(groups: Sequence[Group], curves: Curves, figures: Sequence[str]) -> Iterator[str]:
     if figures:
         drawn = chart(learning_curves(groups, curves, {name: name.partition("/")[2] for name in figures}))
-        summary = "<summary>Figures of the training itself: losses, returns, speed</summary>"
+        summary = "<summary>MetricEstimates of the training itself: losses, returns, speed</summary>"
         yield f'<details ontoggle="{FITTED}">{summary}{drawn}</details>'
 
 
-def _final(groups: Sequence[Group], reached: Sequence[Figures | None]) -> Iterator[str]:
+def _final(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Iterator[str]:
     yield "<h2>On the test volumes</h2>"
     if not any(reached):
         yield "<p>None of these runs has kept a final evaluation.</p>"
@@ -129,7 +136,7 @@ def _final(groups: Sequence[Group], reached: Sequence[Figures | None]) -> Iterat
     yield f"<p>{HOW_FINAL}</p>{table(rows)}{chart(final_chart(groups, reached))}"
 
 
-def _final_row(group: Group, figures: Figures | None) -> dict[str, Any]:
+def _final_row(group: Group, figures: MetricEstimates | None) -> dict[str, Any]:
     cost = {
         "training, s": _span([training.wall_s for training in group.trainings]),
         "environment steps": _span([training.env_steps for training in group.trainings]),
@@ -140,7 +147,7 @@ def _final_row(group: Group, figures: Figures | None) -> dict[str, Any]:
     success = figures.estimates["success_rate"]
     if success.low == success.high:
         shown["success rate"] = _text(figures.estimates["success_rate_wilson"], "{:.1%}")
-    counts = f"{len(judged(group))}, {figures.n_volumes}, {figures.n_episodes}"
+    counts = f"{len(evaluated_trainings(group))}, {figures.n_volumes}, {figures.n_episodes}"
     return {"group": group.title, **shown, "seeds, volumes, episodes": counts, **cost}
 
 
@@ -159,12 +166,12 @@ def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Ite
 
 
 def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
-    """Returns a table of the groups against each other; the columns are numbered as the rows are."""
+    """Return a table of the groups against each other; the columns are numbered as the rows are."""
     cells: dict[tuple[int, int], Markup] = {}
     is_few = len(groups) <= MANY
     for pair in pairs:
-        theirs = opposite(pair.probability) if pair.probability else None
-        n_seeds = min(len(judged(groups[number])) for number in (pair.ours, pair.theirs))
+        theirs = complement(pair.probability) if pair.probability else None
+        n_seeds = min(len(evaluated_trainings(groups[number])) for number in (pair.ours, pair.theirs))
         how = {"is_few": is_few, "is_sure": n_seeds >= FEWEST_SEEDS}
         cells[pair.ours, pair.theirs] = _cell(pair.probability, **how)
         cells[pair.theirs, pair.ours] = _cell(theirs, **how)
@@ -181,7 +188,7 @@ def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
 
 
 def _cell(probability: Estimate | None, *, is_few: bool, is_sure: bool) -> Markup:
-    """Returns a cell of the matrix.
+    """Return a cell of the matrix.
 
     Args:
         probability: that the row's group is better, None where the two were judged on other volumes.
@@ -206,7 +213,7 @@ def _text(estimate: Estimate, form: str) -> Markup:
 
 
 def _span(values: Sequence[float]) -> str:
-    """Returns the mean of what is known, with the lowest and the highest where they differ."""
+    """Return the mean of what is known, with the lowest and the highest where they differ."""
     known = [value for value in values if not math.isnan(value)]
     if not known:
         return "–"

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.reports.groups import Group
-from armscan.reports.trainings import Series, Training
-from armscan.training.seeds import Band, band_over_seeds, mean_for
+from armscan.reports.load import Series, TrackedTraining
+from armscan.stats.aggregation import Band, band_over_seeds, mean_for
 from armscan.volumes.plane import FloatArray
 
 # What curves are drawn over, and how a series says it.
@@ -38,7 +38,7 @@ class Curve:
 
 
 def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
-    """Returns the curve of a group; None where none of its trainings has measured the figure.
+    """Return the curve of a group; None where none of its trainings has measured the figure.
 
     Between two validations a seed's line is straight. A training that has run to its end is carried on with its last
     value for as long as others of its group go on; where one has not, the curve ends with it. It begins where all are
@@ -66,7 +66,7 @@ def _line(series: Series, axis: str) -> tuple[FloatArray, FloatArray]:
     return places[is_known], series.values[is_known]
 
 
-def _places(known: Sequence[tuple[Training, tuple[FloatArray, FloatArray]]]) -> FloatArray:
+def _places(known: Sequence[tuple[TrackedTraining, tuple[FloatArray, FloatArray]]]) -> FloatArray:
     first = max(line[0][0] for _, line in known)
     last = max(line[0][-1] for _, line in known)
     last = min([last, *(line[0][-1] for training, line in known if not training.is_whole)])

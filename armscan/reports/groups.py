@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from armscan.reports.trainings import Training
-from armscan.settings import NOT_COMPARED
+from armscan.config.defaults import NOT_COMPARED
+from armscan.reports.load import TrackedTraining
 
 LEFT_OUT = (*NOT_COMPARED, "data.cache_dir")
 SEED_IN_NAME = re.compile(r"-seed\d+$")
@@ -35,7 +35,7 @@ class Group:
     number: int
     name: str
     label: str
-    trainings: tuple[Training, ...]
+    trainings: tuple[TrackedTraining, ...]
 
     @property
     def title(self) -> str:
@@ -43,13 +43,13 @@ class Group:
         return f"{self.number}. {self.name}"
 
 
-def grouped(trainings: Sequence[Training]) -> tuple[list[Group], list[Training]]:
-    """Returns the groups in the order of their first trainings, and the trainings that are left out.
+def group_trainings(trainings: Sequence[TrackedTraining]) -> tuple[list[Group], list[TrackedTraining]]:
+    """Return the groups in the order of their first trainings, and the trainings that are left out.
 
     Of several trainings with the same configuration and seed only one counts, because the others say nothing new: one
     that has run to its end if there is any, and of these the last.
     """
-    of_key: dict[tuple[tuple[str, str], ...], list[Training]] = {}
+    of_key: dict[tuple[tuple[str, str], ...], list[TrackedTraining]] = {}
     for training in trainings:
         of_key.setdefault(tuple(sorted(_compared(training.params).items())), []).append(training)
     kept = [_one_for_each_seed(each) for each in of_key.values()]
@@ -61,13 +61,13 @@ def grouped(trainings: Sequence[Training]) -> tuple[list[Group], list[Training]]
 
 
 def differing_rules(groups: Sequence[Group]) -> list[str]:
-    """Returns the keys by which the groups' episodes differ, whoever plays them."""
+    """Return the keys by which the groups' episodes differ, independent of the agent."""
     keys = _differing([_compared(group.trainings[0].params) for group in groups])
     return [key for key in keys if key.startswith(RULES)]
 
 
-def _one_for_each_seed(trainings: Iterable[Training]) -> list[Training]:
-    of_seed: dict[str, Training] = {}
+def _one_for_each_seed(trainings: Iterable[TrackedTraining]) -> list[TrackedTraining]:
+    of_seed: dict[str, TrackedTraining] = {}
     for training in sorted(trainings, key=lambda each: (each.is_whole, each.started_ms)):
         of_seed[training.label] = training
     return sorted(of_seed.values(), key=lambda each: (len(each.label), each.label))
@@ -82,7 +82,7 @@ def _is_under(key: str, sections: Iterable[str]) -> bool:
 
 
 def _differing(of_groups: Sequence[Mapping[str, str]]) -> list[str]:
-    """Returns the keys whose values differ; of several that say the same, because one refers to another, the first."""
+    """Return the keys whose values differ; of several that say the same, because one refers to another, the first."""
     keys = sorted({key for each in of_groups for key in each}, key=lambda key: (key.count("."), key))
     first: dict[tuple[str, tuple[str | None, ...]], str] = {}
     for key in keys:
@@ -92,8 +92,8 @@ def _differing(of_groups: Sequence[Mapping[str, str]]) -> list[str]:
     return list(first.values())
 
 
-def _names(firsts: Sequence[Training]) -> list[str]:
-    """Returns the names of groups, by the first training of each."""
+def _names(firsts: Sequence[TrackedTraining]) -> list[str]:
+    """Return the names of groups, by the first training of each."""
     if len(firsts) == 1:
         return [SEED_IN_NAME.sub("", firsts[0].name)]
     params = [_compared(training.params) for training in firsts]
@@ -117,13 +117,13 @@ def _names(firsts: Sequence[Training]) -> list[str]:
 
 
 def _shortened(name: str) -> str:
-    """Returns a name with the last part of each key and four digits of long numbers, cut where it is still long."""
+    """Return a name with the last part of each key and four digits of long numbers, cut where it is still long."""
     short = LONG_NUMBER.sub(lambda number: f"{float(number[0]):.4g}", SECTIONS.sub("", name))
     return short if len(short) <= MAX_LABEL_CHARS else f"{short[: MAX_LABEL_CHARS - 1]}…"
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """Returns names of which those that occur several times have a number."""
+    """Return names of which those that occur several times have a number."""
     counts, seen, distinct = Counter(names), Counter[str](), []
     for name in names:
         seen[name] += 1

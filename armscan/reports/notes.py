@@ -1,4 +1,4 @@
-"""What whoever reads a comparison should know of it."""
+"""Notes on the validity of a comparison."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import html
 from collections.abc import Iterator, Sequence
 
 from armscan.reports.groups import Group, differing_rules
-from armscan.reports.trainings import Training
-from armscan.training.seeds import FEWEST_SEEDS
+from armscan.reports.load import TrackedTraining
+from armscan.stats.aggregation import FEWEST_SEEDS
 
 
-def notes_on(groups: Sequence[Group], left_out: Sequence[Training], *, has_other_volumes: bool) -> str:
-    """Returns the notes as a list, nothing where there are none.
+def notes_on(groups: Sequence[Group], left_out: Sequence[TrackedTraining], *, has_other_volumes: bool) -> str:
+    """Return the notes as a list, nothing where there are none.
 
     Args:
         groups: that are compared.
@@ -72,7 +72,7 @@ def _on_rules(groups: Sequence[Group], *, has_other_volumes: bool) -> Iterator[s
         )
 
 
-def _named(group: Group, training: Training) -> str:
+def _named(group: Group, training: TrackedTraining) -> str:
     return f"{training.id} (group {group.number}, {training.label})"
 
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from armscan.reports.comparison import write_comparison
-from armscan.reports.finding import find_trainings, label_of, read_runs
-from armscan.reports.groups import grouped
-from armscan.reports.trainings import read_training
+from armscan.reports.groups import group_trainings
+from armscan.reports.load import read_training
+from armscan.reports.select import find_trainings, label_of, read_runs
 from armscan.tracking import TrackingStore, open_existing_store
 
 REPORTS = Path("reports")
@@ -21,7 +21,7 @@ MAX_NAME_CHARS, SUM_CHARS = 60, 12
 
 
 def compare_runs(text: str, uri: str, out: str | None) -> Path:
-    """Writes the report of runs.
+    """Write the report of runs.
 
     Args:
         text: what names them; see `read_runs`.
@@ -42,7 +42,7 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
     print(f"reading   {len(found)} run{'s' if len(found) > 1 else ''}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         trainings = [read_training(store, each, Path(folder) / each.run.info.run_id) for each in found]
-    groups, left_out = grouped(trainings)
+    groups, left_out = group_trainings(trainings)
     title = f"Runs {', '.join(named)}" if len(", ".join(named)) <= MAX_NAME_CHARS else f"{len(trainings)} runs"
     return write_comparison(groups, left_out, title, Path(out) if out else REPORTS / _folder_name(store, named))
 

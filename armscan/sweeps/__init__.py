@@ -1,1 +1,1 @@
-"""Studies: many runs, searched by Optuna with workers that wait for nobody, and judged on seeds that chose nothing."""
+"""Studies: hyperparameter search by asynchronous Optuna workers, and a final evaluation with fresh seeds."""

@@ -1,4 +1,4 @@
-"""`python -m armscan.run -m sweeps=NAME`: a study is checked, its workers launched, its result told."""
+"""`python -m armscan.run -m sweep=NAME`: check a study, launch its workers, print its result."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
-from armscan.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher
-from armscan.mistakes import quieten_libraries
-from armscan.passwords import check_written
-from armscan.settings import TRACKING_URI, plain
-from armscan.sweeps.attempt import composed
-from armscan.sweeps.checking import check_space
-from armscan.sweeps.command_line import STORAGE, CommandLine
-from armscan.sweeps.launching import run_workers
-from armscan.sweeps.opening import open_for_work, read_settings
-from armscan.sweeps.planning import print_plan
-from armscan.sweeps.screen import print_result
-from armscan.sweeps.study import existing_study
+from armscan.config.credentials import check_address
+from armscan.config.defaults import TRACKING_URI, to_plain
+from armscan.config.error_messages import silence_library_warnings
+from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher
+from armscan.sweeps.results.progress import print_result
+from armscan.sweeps.study.arguments import STORAGE, StudyCommand
+from armscan.sweeps.study.check import check_space
+from armscan.sweeps.study.open import open_for_work, read_settings
+from armscan.sweeps.study.plan import print_plan
+from armscan.sweeps.study.study import existing_study
+from armscan.sweeps.tasks.attempt import composed
+from armscan.sweeps.workers.launch import run_workers
 
 
 def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:
-    """Runs a study, or shows what it would run.
+    """Run a study, or shows what it would run.
 
     Args:
         words: of the command line.
@@ -35,28 +35,28 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
         StudyError: see `open_for_work`.
         TrackingError: likewise.
     """
-    given = CommandLine.read(words)
-    quieten_libraries()
+    given = StudyCommand.read(words)
+    silence_library_warnings()
     settings, task, config = read_settings(given.of_trials)
     for key, uri in ((STORAGE, settings.storage), (TRACKING_URI, config.tracking.uri)):
-        check_written(key, uri)
+        check_address(key, uri)
     launcher = composed(given.launching)[1][LAUNCHER]
     if launcher in ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))
     check_space(settings, task, given.of_trials, config)
     # Before anything is made: a study or a storage that would be refused.
-    existing = existing_study(settings, plain(config))
-    if given.is_plan or settings.plan:
+    existing = existing_study(settings, to_plain(config))
+    if given.is_plan:
         print_plan(settings, existing)
         return 0
     check_launcher(launcher)
     opened = open_for_work(settings, task, config, given.of_trials)
-    for phase in opened.begun():
-        if n_failed := phase.ledger.forgive():
-            print(f"{phase.name}: {n_failed} trials have failed before, which count no more from now on")
+    for phase in opened.phases:
+        if n_failed := phase.scheduler.reset_failures():
+            print(f"{phase.name}: {n_failed} failures before this start are ignored")
     try:
         run_workers(opened, given, launcher, launch)
     except KeyboardInterrupt:
-        print("interrupted; the same command goes on with the study", file=sys.stderr)
+        print("interrupted; the same command resumes the study", file=sys.stderr)
         return 130
     return print_result(opened)

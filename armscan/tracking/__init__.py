@@ -2,27 +2,27 @@
 
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import environment_file, environment_tags
-from armscan.tracking.finding import (
+from armscan.tracking.git import source, source_tags
+from armscan.tracking.lookup import (
+    DOMAIN_TAG,
     EVALUATED_TAG,
-    FAMILIAR_TAG,
     VERSION_TAG,
     FoundRun,
     check_version,
     find_run,
-    found_run,
     jobs_of,
+    load_run,
 )
-from armscan.tracking.limits import flattened, tags_of
-from armscan.tracking.pictures import draw_learning_curve
+from armscan.tracking.outbox import take_over
+from armscan.tracking.plots import draw_learning_curve
 from armscan.tracking.run import TrackedRun
-from armscan.tracking.source import source, source_tags
-from armscan.tracking.spool import take_over
+from armscan.tracking.sanitize import flattened, tags_of
 from armscan.tracking.store import check_artifacts, open_existing_store, open_store
-from armscan.tracking.sync import abandon, deliver_leftovers, note_end, sync
+from armscan.tracking.sync import abandon, deliver_pending, note_end, sync
 
 __all__ = [
+    "DOMAIN_TAG",
     "EVALUATED_TAG",
-    "FAMILIAR_TAG",
     "VERSION_TAG",
     "FoundRun",
     "TrackedRun",
@@ -30,14 +30,14 @@ __all__ = [
     "abandon",
     "check_artifacts",
     "check_version",
-    "deliver_leftovers",
+    "deliver_pending",
     "draw_learning_curve",
     "environment_file",
     "environment_tags",
     "find_run",
     "flattened",
-    "found_run",
     "jobs_of",
+    "load_run",
     "note_end",
     "open_existing_store",
     "open_store",

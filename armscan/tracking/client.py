@@ -14,10 +14,10 @@ from mlflow.exceptions import MlflowException
 from requests import RequestException
 from sqlalchemy.exc import DBAPIError, OperationalError
 
+from armscan.config.credentials import mask_passwords
 from armscan.errors import TrackingAwayError
-from armscan.passwords import masked
-from armscan.patience import Patience
-from armscan.tracking.limits import tags_of
+from armscan.tracking.sanitize import tags_of
+from armscan.utils.retry import RetryPolicy
 
 T = TypeVar("T")
 # What MLflow says of a store that it cannot reach, of one that fails, and of what is not there.
@@ -37,7 +37,7 @@ class TrackingStore:
     Args:
         connect: opens the store.
         uri: of the store, as it may be shown.
-        patience_s: how long it is waited for; None for not at all.
+        retry_s: how long it is waited for; None for not at all.
         wait_s: how long a run waits for it at its end.
         system_metrics_s: seconds between two looks at the machine while a run trains; None for none.
     """
@@ -47,15 +47,15 @@ class TrackingStore:
         connect: Callable[[], MlflowClient],
         uri: str,
         *,
-        patience_s: float | None,
+        retry_s: float | None,
         wait_s: float,
         system_metrics_s: float | None = None,
     ) -> None:
         self.uri, self.wait_s, self.system_metrics_s = uri, wait_s, system_metrics_s
-        self._patience = None
-        if patience_s is not None:
+        self._retry_policy = None
+        if retry_s is not None:
             named = f"tracking.uri is {uri!r}"
-            self._patience = Patience("the tracking store", named, why_away, TrackingAwayError, patience_s=patience_s)
+            self._retry_policy = RetryPolicy("the tracking store", named, why_away, TrackingAwayError, retry_s=retry_s)
         # Which waits for nothing.
         self.mlflow = self._asked(connect)
 
@@ -65,7 +65,7 @@ class TrackingStore:
         return partial(self._asked, getattr(self.mlflow, name))
 
     def create_run(self, experiment_id: str, *, name: str, tags: Mapping[str, str]) -> Run:
-        """Makes a run, and only one, also where the store goes away before it has answered."""
+        """Make a run, and only one, also where the store goes away before it has answered."""
         made, n_asked = uuid.uuid4().hex, 0
 
         def create() -> Run:
@@ -79,8 +79,8 @@ class TrackingStore:
 
     def _asked(self, operate: Callable[..., T], *args: Any, **kwargs: Any) -> T:
         asked = partial(operate, *args, **kwargs)
-        if self._patience is not None:
-            return self._patience.through(asked)
+        if self._retry_policy is not None:
+            return self._retry_policy.call(asked)
         try:
             return asked()
         except Exception as error:
@@ -90,7 +90,7 @@ class TrackingStore:
 
 
 def why_away(error: BaseException) -> str | None:
-    """Returns why a store cannot be reached or written to for now; None where an error says anything else."""
+    """Return why a store cannot be reached or written to for now; None where an error says anything else."""
     match error:
         case MlflowException(error_code=code):
             is_away = code in AWAY
@@ -104,8 +104,8 @@ def why_away(error: BaseException) -> str | None:
 
 
 def reason_in(error: BaseException) -> str:
-    """Returns what an error says, short and without a password."""
-    text = masked(" ".join(str(error).split()))
+    """Return what an error says, short and without a password."""
+    text = mask_passwords(" ".join(str(error).split()))
     if told := SHORT.search(text):
         return next(part for part in told.groups() if part).strip()
     return text[:MAX_REASON_CHARS]

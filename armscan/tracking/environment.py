@@ -12,8 +12,8 @@ from typing import Any
 
 from packaging.utils import canonicalize_name
 
-from armscan.files import sum_of
-from armscan.tracking.source import UNKNOWN
+from armscan.tracking.git import UNKNOWN
+from armscan.utils.files import sha256
 
 # Those that a run's figures may depend on; of the others, the file has the versions.
 TOLD = ("torch", "tianshou", "gymnasium", "numpy", "numba", "scipy", "simpleitk", "optuna", "mlflow", "hydra-core")
@@ -22,7 +22,7 @@ PYTHON, CONSTRAINTS_SUM = "version.python", "constraints.sha256"
 
 @functools.cache
 def environment() -> Mapping[str, Any]:
-    """Returns Python, the machine and the packages of this process, once, as plain values."""
+    """Return Python, the machine and the packages of this process, once, as plain values."""
     found = [(each.metadata["Name"], each.version) for each in metadata.distributions()]
     packages = {canonicalize_name(name): version for name, version in found if name}
     return {
@@ -34,17 +34,17 @@ def environment() -> Mapping[str, Any]:
 
 
 def environment_file() -> bytes:
-    """Returns the contents of the file that a run keeps of its environment."""
+    """Return the contents of the file that a run keeps of its environment."""
     return json.dumps(environment(), indent=1).encode()
 
 
 def environment_tags() -> dict[str, str]:
-    """Returns the versions that figures may depend on, and the sum of the constraints that were to be installed."""
+    """Return the versions that figures may depend on, and the sum of the constraints that were to be installed."""
     packages = environment()["packages"]
     constraints = Path(__file__).parents[2] / "constraints.txt"
     return {
         PYTHON: environment()["python"],
         **{f"version.{name}": packages.get(name, "not installed") for name in TOLD},
         # Beside the code of a clone; a wheel has none.
-        CONSTRAINTS_SUM: sum_of(constraints.read_bytes()) if constraints.is_file() else UNKNOWN,
+        CONSTRAINTS_SUM: sha256(constraints.read_bytes()) if constraints.is_file() else UNKNOWN,
     }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -12,19 +11,20 @@ from typing import Any, Self
 
 from mlflow.entities import Run
 
+from armscan.config.command_hints import sync_command
 from armscan.errors import is_interruption
-from armscan.files import CURVE_FILE, EVALUATION_FILE, RESULTS, RESUMED_DIFF_FILE, write_whole
-from armscan.log import say
-from armscan.tracking import leftovers
+from armscan.tracking import pending
 from armscan.tracking.client import TrackingStore
-from armscan.tracking.courier import Courier
 from armscan.tracking.environment import environment_tags
-from armscan.tracking.limits import params_of, tags_of
-from armscan.tracking.pictures import draw_learning_curve
-from armscan.tracking.source import DIFF_SUM, source, source_tags
-from armscan.tracking.spool import Address, Spool, file_of, now_ms
-from armscan.tracking.system import PREFIX, SystemMetrics
+from armscan.tracking.git import DIFF_SUM, source, source_tags
+from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
+from armscan.tracking.plots import draw_learning_curve
+from armscan.tracking.sanitize import params_of, tags_of
+from armscan.tracking.system_metrics import PREFIX, SystemMetrics
+from armscan.tracking.uploader import Uploader
 from armscan.training import EpochReport, Evaluation, TrainingResult
+from armscan.utils.files import EVALUATION_FILE, LEARNING_CURVE_FILE, RESULTS, RESUMED_DIFF_FILE, atomic_write
+from armscan.utils.log import log
 
 MODEL_FILE = "MLmodel"
 # Why a run ended before its end.
@@ -37,26 +37,26 @@ SHORT_WAIT_S = 2.0
 class TrackedRun:
     """A run in MLflow, and the training callback that fills it.
 
-    What it is told is written into a file of its folder, and delivered from there in the background: whoever trains
-    waits for no store, and what a store that is away has not got, `python -m armscan.track sync FOLDER` delivers later.
+    Everything logged goes to the run's outbox and is uploaded in the background, so training never waits for the store.
+    `armscan runs sync FOLDER` uploads what a store that was away has missed.
 
     Args:
         store: that it is in.
-        spool: of the run.
+        outbox: of the run.
         name: what the UI calls the run.
         logged: the names and steps of the figures that are there already, which are not logged again.
     """
 
     def __init__(
-        self, store: TrackingStore, spool: Spool, *, name: str, logged: Collection[tuple[str, int]] = ()
+        self, store: TrackingStore, outbox: Outbox, *, name: str, logged: Collection[tuple[str, int]] = ()
     ) -> None:
-        self._store, self._spool = store, spool
-        leftovers.note(spool)
-        self._courier = Courier(spool, store)
+        self._store, self._outbox = store, outbox
+        pending.note(outbox)
+        self._uploader = Uploader(outbox, store)
         self._logged = frozenset(logged)
         self._is_closed, self._is_delivered, self._is_resumed = False, False, False
         self._system: SystemMetrics | None = None
-        self.run_id = spool.address.run_id
+        self.run_id = outbox.address.run_id
         self.name = name
 
     @classmethod
@@ -71,7 +71,7 @@ class TrackedRun:
         folder: Path,
         parent_id: str | None = None,
     ) -> Self:
-        """Makes a new run.
+        """Make a new run.
 
         Args:
             store: that it is made in.
@@ -90,14 +90,14 @@ class TrackedRun:
 
     @classmethod
     def joined(cls, store: TrackingStore, run_id: str, *, name: str, folder: Path) -> Self:
-        """Returns a run that is there, to add to it."""
-        return cls(store, Spool.begin(folder, Address(run_id, store.uri)), name=name)
+        """Return a run that is there, to add to it."""
+        return cls(store, Outbox.begin(folder, Address(run_id, store.uri)), name=name)
 
     @classmethod
-    def go_on(
+    def reopen(
         cls, store: TrackingStore, run_id: str, *, folder: Path, config: Mapping[str, Any], tags: Mapping[str, str]
     ) -> Self:
-        """Opens a run again that was interrupted, as if nothing had happened to it.
+        """Open a run again that was interrupted, as if nothing had happened to it.
 
         Args:
             store: that it is in.
@@ -110,10 +110,10 @@ class TrackedRun:
         n_resumed = int(run.data.tags.get("resumed", "0")) + 1
         now = {**source_tags(), **environment_tags()}
         changed = {f"resumed.{key}": value for key, value in now.items() if run.data.tags.get(key) != value}
-        is_spooled = file_of(folder, run_id).exists()
-        spool = Spool.begin(folder, Address(run_id, store.uri))
-        logged = _logged_in(spool) if is_spooled else _logged_of(store, run)
-        tracked = cls(store, spool, name=run.info.run_name or run_id, logged=logged)
+        had_outbox = file_of(folder, run_id).exists()
+        outbox = Outbox.begin(folder, Address(run_id, store.uri))
+        logged = _logged_in(outbox) if had_outbox else _logged_of(store, run)
+        tracked = cls(store, outbox, name=run.info.run_name or run_id, logged=logged)
         tracked._is_resumed = True
         tracked.set_status("RUNNING")
         tracked._add(untagged=FAILURE_TAG)
@@ -124,17 +124,17 @@ class TrackedRun:
         return tracked
 
     def set_tags(self, tags: Mapping[str, str]) -> None:
-        """Sets tags."""
+        """Set tags."""
         if tags:
             self._add(tags=tags_of(tags))
 
     def log_config(self, config: Mapping[str, Any]) -> None:
-        """Logs a configuration's leaves as parameters; those that are there already stay as they are."""
+        """Log a configuration's leaves as parameters; those that are there already stay as they are."""
         if params := params_of(config):
             self._add(params=params)
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Makes up for what was not logged any more when the run was killed; from now on the machine is watched."""
+        """Make up for what was not logged any more when the run was killed; from now on the machine is watched."""
         for report in earlier:
             self.on_epoch(report)
         if (every_s := self._store.system_metrics_s) is not None:
@@ -143,13 +143,13 @@ class TrackedRun:
             self._system = SystemMetrics(take, every_s=every_s, first=max(looks, default=-1) + 1)
 
     def on_epoch(self, report: EpochReport) -> None:
-        """Logs an epoch's figures by environment step."""
+        """Log an epoch's figures by environment step."""
         figures = {f"validation/{name}": value for name, value in report.evaluation.metrics().items()}
         figures |= report.metrics | {"wall_s": report.wall_s}
         self.log_figures(figures, n_env_steps=report.n_env_steps)
 
     def on_end(self) -> None:
-        """The run goes on: evaluation and artifacts come after the training."""
+        """Do nothing: evaluation and artifacts follow the training."""
         if self._system is not None:
             self._system.finish()
             self._system = None
@@ -158,7 +158,7 @@ class TrackedRun:
         self.log_figures(figures, n_env_steps=number)
 
     def log_figures(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
-        """Logs figures at an environment step; none twice."""
+        """Log figures at an environment step; none twice."""
         at_ms = now_ms()
         points = [
             (name, float(value), at_ms, n_env_steps)
@@ -170,26 +170,26 @@ class TrackedRun:
             self._add(metrics=points)
 
     def keep(self, name: str, contents: bytes) -> None:
-        """Keeps something as a file of the run's folder, and as an artifact."""
-        file = self._spool.folder / name
-        write_whole(file, lambda opened: opened.write(contents))
+        """Keep something as a file of the run's folder, and as an artifact."""
+        file = self._outbox.folder / name
+        atomic_write(file, lambda opened: opened.write(contents))
         self.log_files(file)
 
     def log_files(self, *files: Path) -> None:
-        """Keeps files as artifacts; they stay as they are until the run has ended."""
+        """Keep files as artifacts; they stay as they are until the run has ended."""
         for file in files:
-            self._add(file=os.path.relpath(file, self._spool.folder))
+            self._add(file=os.path.relpath(file, self._outbox.folder))
 
     def log_folder(self, folder: Path) -> None:
-        """Keeps a folder with all that is in it, under its own name; it stays as it is until the run has ended."""
+        """Keep a folder with all that is in it, under its own name; it stays as it is until the run has ended."""
         files = [file for file in folder.rglob("*") if file.is_file()]
         # Last what says of a folder that it is a model: who finds it finds all of it.
         for file in sorted(files, key=lambda file: (file.name == MODEL_FILE, file)):
-            name, place = os.path.relpath(file, self._spool.folder), file.parent.relative_to(folder.parent)
+            name, place = os.path.relpath(file, self._outbox.folder), file.parent.relative_to(folder.parent)
             self._add(file=[name, place.as_posix()])
 
     def keep_results(self, result: TrainingResult | None, evaluations: Mapping[str, Evaluation], folder: Path) -> None:
-        """Logs the final evaluations, and keeps what the run has made in its folder.
+        """Log the final evaluations, and keep what the run has made in its folder.
 
         Args:
             result: of the training; the evaluations are logged at the step of its best epoch, whose weights they judge.
@@ -203,13 +203,13 @@ class TrackedRun:
             self.log_figures(figures, n_env_steps=result.best.n_env_steps if result else 0)
         if result:
             self.log_figures({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
-            draw_learning_curve(result.reports, folder / CURVE_FILE, title=self.name)
+            draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=self.name)
         contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
         (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
         self.log_results(folder)
 
     def log_results(self, folder: Path) -> None:
-        """Keeps what the run has made in its folder; nothing else that is there."""
+        """Keep what the run has made in its folder; nothing else that is there."""
         self.log_files(*(folder / name for name in RESULTS if (folder / name).is_file()))
 
     def __enter__(self) -> Self:
@@ -218,7 +218,7 @@ class TrackedRun:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Closes the run: FINISHED, KILLED where it was interrupted, FAILED after any other error."""
+        """Close the run: FINISHED, KILLED where it was interrupted, FAILED after any other error."""
         if error is None:
             self.end("FINISHED")
         elif is_interruption(error):
@@ -227,11 +227,11 @@ class TrackedRun:
             self.end("FAILED", reason=repr(error))
 
     def set_status(self, status: str) -> None:
-        """Says how the run stands, such as RUNNING."""
+        """Say how the run stands, such as RUNNING."""
         self._add(status=(status, now_ms()))
 
     def end(self, status: str, *, reason: str | None = None, wait_s: float | None = None) -> bool:
-        """Closes the run as FINISHED, FAILED (with the reason) or KILLED, and waits until the store has all of it.
+        """Close the run as FINISHED, FAILED (with the reason) or KILLED, and wait until the store has all of it.
 
         Args:
             status: of the run.
@@ -250,27 +250,27 @@ class TrackedRun:
             # Who took the one before for dead may have said so since.
             self._add(untagged=FAILURE_TAG)
         self.set_status(status)
-        failure = self._courier.finish(self._store.wait_s if wait_s is None else wait_s)
+        failure = self._uploader.finish(self._store.wait_s if wait_s is None else wait_s)
         self._is_delivered = failure is None
         if self._is_delivered:
-            leftovers.forget(self.run_id)
-        self._spool.close()
+            pending.forget(self.run_id)
+        self._outbox.close()
         if failure is not None:
-            again = f"python -m armscan.track sync {shlex.quote(str(self._spool.folder))}"
-            how = "delivers the rest" if self._courier.is_away else "delivers the rest once the store takes it"
-            say(f"run {self.run_id}: {self._store.uri} has not got all of it ({failure}): {again} {how}")
+            again = sync_command(self._outbox.folder)
+            how = "delivers the rest" if self._uploader.is_away else "delivers the rest once the store takes it"
+            log(f"run {self.run_id}: {self._store.uri} has not got all of it ({failure}): {again} {how}")
         return self._is_delivered
 
     def _add(self, **entry: Any) -> None:
-        self._spool.add(**entry)
-        self._courier.wake()
+        self._outbox.add(**entry)
+        self._uploader.wake()
 
 
-def _logged_in(spool: Spool) -> set[tuple[str, int]]:
-    return {(name, step) for entry in spool.entries() for name, _, _, step in entry.get("metrics", ())}
+def _logged_in(outbox: Outbox) -> set[tuple[str, int]]:
+    return {(name, step) for entry in outbox.entries() for name, _, _, step in entry.get("metrics", ())}
 
 
 def _logged_of(store: TrackingStore, run: Run) -> set[tuple[str, int]]:
-    """Returns what the store has of a run whose folder has no spool: an older version has made it."""
+    """Return what the store has of a run whose folder has no outbox: an older version has made it."""
     run_id = run.info.run_id
     return {(name, point.step) for name in run.data.metrics for point in store.get_metric_history(run_id, name)}

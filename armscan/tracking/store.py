@@ -18,18 +18,17 @@ from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 from sqlalchemy.exc import SQLAlchemyError
 
-from armscan.checks import check_bool, check_float
-from armscan.errors import TrackingError
-from armscan.files import SQLITE_PREFIX, check_writable, sqlite_file
-from armscan.passwords import (
+from armscan.config.credentials import (
     SERVER_PASSWORD,
     TRACKING_PASSWORD,
+    check_address,
     database_url,
-    hand_over_tracking,
-    password_of,
-    without_password,
+    read_password,
 )
+from armscan.errors import TrackingError
 from armscan.tracking.client import TrackingStore, reason_in
+from armscan.utils.files import SQLITE_PREFIX, check_writable, sqlite_file
+from armscan.utils.validation import check_bool, check_float
 
 EXAMPLES = {"uri": "sqlite:///mlruns.db", "experiment": "armscan", "artifacts": "mlartifacts"}
 LOCK_TIMEOUT_S = 120
@@ -57,9 +56,9 @@ def open_store(
     wait_s: float,
     system_metrics_s: float | None = None,
     policy: bool = True,
-    patience_s: float | None = None,
+    retry_s: float | None = None,
 ) -> tuple[TrackingStore, str]:
-    """Opens a tracking store and makes the experiment where it does not exist yet.
+    """Open a tracking store and make the experiment where it does not exist yet.
 
     Args:
         uri: of the store, such as `sqlite:///mlruns.db` or the address of an MLflow server.
@@ -68,7 +67,7 @@ def open_store(
         wait_s: how long a run waits for it at its end.
         system_metrics_s: seconds between two looks at the machine while a run trains; None for none.
         policy: whether runs keep their policies in it; only checked here, with the rest of the section.
-        patience_s: how long it is waited for otherwise, already while it is opened; None for not at all.
+        retry_s: how long it is waited for otherwise, already while it is opened; None for not at all.
 
     Returns:
         The store, and the experiment's id.
@@ -81,15 +80,14 @@ def open_store(
     check_float("tracking.wait_s", wait_s, at_least=0.0)
     if system_metrics_s is not None:
         check_float("tracking.system_metrics_s", system_metrics_s, above=0.0)
-    connected = partial(_store, wait_s=wait_s, system_metrics_s=system_metrics_s, patience_s=patience_s)
+    connected = partial(_store, wait_s=wait_s, system_metrics_s=system_metrics_s, retry_s=retry_s)
     check_bool("tracking.policy", policy)
-    shown = hand_over_tracking(uri)
-    with usable_store(shown):
-        if not shown.startswith(SQLITE_PREFIX):
-            store = connected(shown)
-            return store, _experiment_in(store, experiment, None if shown.startswith("http") else artifacts)
+    with store_errors(uri):
+        if not uri.startswith(SQLITE_PREFIX):
+            store = connected(uri)
+            return store, _experiment_in(store, experiment, None if uri.startswith("http") else artifacts)
         # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
-        database = sqlite_file(shown)
+        database = sqlite_file(uri)
         database.parent.mkdir(parents=True, exist_ok=True)
         # MLflow would try for minutes to open what cannot be opened, and the lock for ever to be made.
         database.open("ab").close()
@@ -99,14 +97,13 @@ def open_store(
 
 
 def open_existing_store(uri: str) -> TrackingStore:
-    """Opens a tracking store to look for a run in it, and makes nothing.
+    """Open a tracking store to look for a run in it, and make nothing.
 
     Raises:
         TrackingError: if there is none, or it cannot be used.
     """
     _check_texts(uri=uri)
     _check_address(uri)
-    uri = hand_over_tracking(uri)
     if uri.startswith(SQLITE_PREFIX):
         database = sqlite_file(uri)
         if not database.is_file():
@@ -115,14 +112,14 @@ def open_existing_store(uri: str) -> TrackingStore:
             )
         _check_is_store(uri, database)
         uri = f"{SQLITE_PREFIX}{database}"
-    with usable_store(uri):
-        store = _store(uri, wait_s=USUAL_WAIT_S, system_metrics_s=None, patience_s=None)
+    with store_errors(uri):
+        store = _store(uri, wait_s=USUAL_WAIT_S, system_metrics_s=None, retry_s=None)
         store.search_experiments(max_results=1)
         return store
 
 
 def _check_is_store(uri: str, database: Path) -> None:
-    """Raises `TrackingError` where a database holds something else, into which MLflow would write its own tables."""
+    """Raise `TrackingError` where a database holds something else, into which MLflow would write its own tables."""
     wanted = "SELECT count(*) FROM sqlite_master WHERE name IN ('alembic_version', 'experiments', 'runs')"
     try:
         with contextlib.closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as connection:
@@ -135,18 +132,18 @@ def _check_is_store(uri: str, database: Path) -> None:
         )
 
 
-def _store(uri: str, *, wait_s: float, system_metrics_s: float | None, patience_s: float | None) -> TrackingStore:
+def _store(uri: str, *, wait_s: float, system_metrics_s: float | None, retry_s: float | None) -> TrackingStore:
     connect = partial(MlflowClient, tracking_uri=_address(uri))
-    return TrackingStore(connect, uri, patience_s=patience_s, wait_s=wait_s, system_metrics_s=system_metrics_s)
+    return TrackingStore(connect, uri, retry_s=retry_s, wait_s=wait_s, system_metrics_s=system_metrics_s)
 
 
 def absolute(uri: str) -> str:
-    """Returns the address of a store as it is understood from everywhere."""
+    """Return the address of a store as it is understood from everywhere."""
     return f"{SQLITE_PREFIX}{sqlite_file(uri)}" if uri.startswith(SQLITE_PREFIX) else uri
 
 
 def _address(uri: str) -> str:
-    """Returns the address of a store with its driver and password."""
+    """Return the address of a store with its driver and password."""
     if not uri.startswith("postgresql"):
         return uri
     return database_url(uri, TRACKING_PASSWORD).render_as_string(hide_password=False)
@@ -164,20 +161,21 @@ def _check_texts(**values: object) -> None:
 
 
 def _check_address(uri: str) -> None:
+    check_address("tracking.uri", uri)
     try:
         is_server = not uri.startswith("http") or (urlsplit(uri).port != 0 and bool(urlsplit(uri).hostname))
     except ValueError:
         is_server = False
     if not is_server:
-        raise TrackingError(f"tracking.uri is {without_password(uri)!r}, but that is no address of a server")
+        raise TrackingError(f"tracking.uri is {uri!r}, but that is no address of a server")
 
 
 @contextlib.contextmanager
-def usable_store(uri: str) -> Iterator[None]:
-    """What a store is used in: it answers in time and quietly, and what goes wrong is a `TrackingError` of one line."""
+def store_errors(uri: str) -> Iterator[None]:
+    """Turn the errors of a store into a `TrackingError` of one line, with short time-outs and no warnings."""
     for name, value in DEFAULTS.items():
         os.environ.setdefault(name, value)
-    if SERVER_PASSWORD not in os.environ and (password := password_of(SERVER_PASSWORD)):
+    if SERVER_PASSWORD not in os.environ and (password := read_password(SERVER_PASSWORD)):
         os.environ[SERVER_PASSWORD] = password
     # The making of a new database is told table by table.
     for library in ("alembic", "mlflow"):
@@ -191,13 +189,11 @@ def usable_store(uri: str) -> Iterator[None]:
             warnings.simplefilter("ignore")
             yield
     except (MlflowException, SQLAlchemyError, OSError, ModuleNotFoundError) as error:
-        raise TrackingError(
-            f"tracking.uri is {without_password(uri)!r}, but this store cannot be used: {reason_in(error)}"
-        ) from error
+        raise TrackingError(f"tracking.uri is {uri!r}, but this store cannot be used: {reason_in(error)}") from error
 
 
 def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> str:
-    """Returns the id of an experiment, which is made where there is none."""
+    """Return the id of an experiment, which is made where there is none."""
     location = Path(artifacts).absolute().as_uri() if artifacts else None
     found = store.get_experiment_by_name(name)
     if found is None:
@@ -216,12 +212,12 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
 
 
 def check_artifacts(store: TrackingStore, experiment_id: str) -> None:
-    """Raises `TrackingError` where the artifacts of an experiment cannot be written."""
+    """Raise `TrackingError` where the artifacts of an experiment cannot be written."""
     _check_writable(store.get_experiment(experiment_id).artifact_location)
 
 
 def _check_writable(location: str | None) -> None:
-    """Raises `TrackingError` where the artifacts are files of this machine, and cannot be written."""
+    """Raise `TrackingError` where the artifacts are files of this machine, and cannot be written."""
     # A server is asked when it is given the first file; what it does not take stays in the folder of the run.
     if location is None or not location.startswith("file:"):
         return

@@ -1,4 +1,4 @@
-"""Deliveries after the fact: what runs have left in their folders, because their store was away or they died."""
+"""Upload what past runs could not, because the store was away or their process died."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from armscan.errors import FolderInUseError, TrackingError
-from armscan.log import say
-from armscan.tracking import leftovers
+from armscan.tracking import pending
 from armscan.tracking.client import TrackingStore, reason_in
-from armscan.tracking.courier import deliver
-from armscan.tracking.limits import tags_of
+from armscan.tracking.outbox import CHANNELS, Address, Outbox, now_ms, outbox_files
 from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
-from armscan.tracking.spool import LANES, Address, Spool, now_ms, spool_files
+from armscan.tracking.sanitize import tags_of
 from armscan.tracking.store import absolute
+from armscan.tracking.uploader import deliver
+from armscan.utils.log import log
 
-# Of a run: how it ended, as its spool says it.
+# Of a run: how it ended, as its outbox says it.
 ENDED = ("FINISHED", "FAILED", "KILLED")
 IN_USE = "it is still going on"
-# Stores whose leftovers this process has looked for.
+# Stores whose pending entries this process has looked for.
 _looked_for: set[str] = set()
 
 
@@ -43,7 +43,7 @@ class Delivery:
 
 
 def sync(folder: Path, opened: Callable[[str], TrackingStore]) -> list[Delivery]:
-    """Delivers what the runs in a folder, and in the folders in it, have left.
+    """Deliver what the runs in a folder, and in the folders in it, have left.
 
     Args:
         folder: of a run, of a study, or above them.
@@ -54,9 +54,9 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore]) -> list[Delivery]
     """
     deliveries: list[Delivery] = []
     stores: dict[str, TrackingStore | TrackingError] = {}
-    for file in spool_files(folder):
+    for file in outbox_files(folder):
         try:
-            spool = Spool(file, timeout_s=0.0)
+            outbox = Outbox(file, timeout_s=0.0)
         except FileNotFoundError:
             # Its run was removed since.
             continue
@@ -64,18 +64,18 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore]) -> list[Delivery]
             left = IN_USE if isinstance(error, FolderInUseError) else str(error)
             deliveries.append(Delivery(file.parent.parent, None, 0, left))
             continue
-        with contextlib.closing(spool):
-            deliveries += _what_became_of(spool, opened, stores)
+        with contextlib.closing(outbox):
+            deliveries += _what_became_of(outbox, opened, stores)
     return deliveries
 
 
 def _what_became_of(
-    spool: Spool, opened: Callable[[str], TrackingStore], stores: dict[str, TrackingStore | TrackingError]
+    outbox: Outbox, opened: Callable[[str], TrackingStore], stores: dict[str, TrackingStore | TrackingError]
 ) -> list[Delivery]:
-    """Returns what became of a run's entries, nothing where none were left."""
-    run_id, uri = spool.address.run_id, spool.address.uri
+    """Return what became of a run's entries, nothing where none were left."""
+    run_id, uri = outbox.address.run_id, outbox.address.uri
     try:
-        if spool.is_delivered:
+        if outbox.is_delivered:
             return []
         if uri not in stores:
             try:
@@ -86,51 +86,51 @@ def _what_became_of(
         if isinstance(store := stores[uri], TrackingError):
             raise store
     except TrackingError as error:
-        return [Delivery(spool.folder, run_id, 0, str(error))]
-    return [_delivered(spool, store)]
+        return [Delivery(outbox.folder, run_id, 0, str(error))]
+    return [_delivered(outbox, store)]
 
 
-def _delivered(spool: Spool, store: TrackingStore) -> Delivery:
+def _delivered(outbox: Outbox, store: TrackingStore) -> Delivery:
     n_entries, left = 0, None
-    for lane in LANES:
+    for channel in CHANNELS:
         try:
-            n_entries += deliver(spool, store.mlflow, lane, is_whole=False)
-        # Whatever a store raises: what it does not take stays there, and the next lane may be taken.
+            n_entries += deliver(outbox, store.mlflow, channel, is_whole=False)
+        # Whatever a store raises: what it does not take stays there, and the next channel may be taken.
         except Exception as error:
             left = reason_in(error)
-    return Delivery(spool.folder, spool.address.run_id, n_entries, left)
+    return Delivery(outbox.folder, outbox.address.run_id, n_entries, left)
 
 
-def deliver_leftovers(store: TrackingStore) -> None:
-    """Delivers what earlier runs of a store have left on this machine; in the background, and once in a process."""
+def deliver_pending(store: TrackingStore) -> None:
+    """Deliver what earlier runs of a store have left on this machine; in the background, and once in a process."""
     if store.uri not in _looked_for:
         _looked_for.add(store.uri)
-        threading.Thread(target=_deliver_leftovers, args=(store,), name="leftovers", daemon=True).start()
+        threading.Thread(target=_deliver_pending, args=(store,), name="pending", daemon=True).start()
 
 
-def _deliver_leftovers(store: TrackingStore) -> None:
-    for note, file in leftovers.noted():
+def _deliver_pending(store: TrackingStore) -> None:
+    for note, file in pending.noted():
         try:
-            spool = Spool(file, timeout_s=0.0)
+            outbox = Outbox(file, timeout_s=0.0)
         except FolderInUseError:
             # Its run goes on, and delivers for itself.
             continue
         except (OSError, ValueError, TrackingError):
-            # Removed with its folder, or damaged, the note or the spool, which `armscan.track sync` tells whoever asks.
+            # Removed with its folder, or the note or the outbox is damaged, which `armscan runs sync` says.
             note.unlink(missing_ok=True)
             continue
-        with contextlib.closing(spool):
-            if spool.address.uri != store.uri:
+        with contextlib.closing(outbox):
+            if outbox.address.uri != store.uri:
                 continue
-            delivery = _delivered(spool, store)
+            delivery = _delivered(outbox, store)
             if delivery.left is None:
                 note.unlink(missing_ok=True)
             if delivery.n_entries:
-                say(f"run {delivery.run_id}: {delivery.n_entries} entries that it had left are delivered now")
+                log(f"run {delivery.run_id}: {delivery.n_entries} entries that it had left are delivered now")
 
 
 def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
-    """Ends the runs as failed whose process has died, in a folder and in the folders in it.
+    """Mark the runs of dead processes in a folder tree as FAILED.
 
     What the store does not get now is in their folders.
 
@@ -139,21 +139,21 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
         store: that they are in.
         reason: why they failed.
     """
-    for file in spool_files(folder):
+    for file in outbox_files(folder):
         try:
-            spool = Spool(file, timeout_s=0.0)
-            is_ended = spool.status in ENDED
+            outbox = Outbox(file, timeout_s=0.0)
+            is_ended = outbox.status in ENDED
         # Its process is alive, another has just taken it over, or it is damaged, which whoever delivers it is told.
         except (FolderInUseError, FileNotFoundError, TrackingError):
             continue
         if is_ended:
-            spool.close()
+            outbox.close()
         else:
-            TrackedRun(store, spool, name=spool.address.run_id).end("FAILED", reason=reason, wait_s=SHORT_WAIT_S)
+            TrackedRun(store, outbox, name=outbox.address.run_id).end("FAILED", reason=reason, wait_s=SHORT_WAIT_S)
 
 
 def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
-    """Notes how a run has ended, for `sync` to deliver, without asking its store.
+    """Note how a run has ended, for `sync` to deliver, without asking its store.
 
     Args:
         folder: of the run.
@@ -162,7 +162,7 @@ def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str
         status: as MLflow calls it.
         tags: to set.
     """
-    with contextlib.closing(Spool.begin(folder, Address(run_id, absolute(uri)))) as spool:
+    with contextlib.closing(Outbox.begin(folder, Address(run_id, absolute(uri)))) as outbox:
         if tags:
-            spool.add(tags=tags_of(tags))
-        spool.add(status=(status, now_ms()))
+            outbox.add(tags=tags_of(tags))
+        outbox.add(status=(status, now_ms()))

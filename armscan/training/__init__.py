@@ -1,16 +1,16 @@
-"""One run: which volumes, how long to train, how to judge, what to keep."""
+"""One training: splits, rollouts, checkpoints, callbacks, progress, video."""
 
-from armscan.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
-from armscan.training.course import Origin, take_up
-from armscan.training.data import PARTS, Split, mixed_data, nifti_data, phantom_data
-from armscan.training.evaluation import TEST, TRAINING, VALIDATION, Episode, Evaluation, evaluate
-from armscan.training.familiar import Familiar
-from armscan.training.figures import Figures
-from armscan.training.film import Film, film_episode, outcome
+from armscan.training.checkpointing import CheckpointProvenance, resume_from_checkpoint
+from armscan.training.domain import TrainingDomain
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint
+from armscan.training.metrics import MetricEstimates
+from armscan.training.rollout import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation, evaluate
+from armscan.training.splits import PARTS, Split, mixed_data, nifti_data, phantom_data
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
+from armscan.training.video import VideoRecorder, outcome, record_episode
+from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
 __all__ = [
     "BEST_CHECKPOINT",
@@ -21,20 +21,19 @@ __all__ = [
     "VALIDATION",
     "Budget",
     "Callback",
-    "Episode",
+    "CheckpointProvenance",
+    "EpisodeResult",
     "EpochReport",
     "Evaluation",
-    "Familiar",
-    "Figures",
-    "Film",
     "Fingerprints",
-    "Origin",
+    "MetricEstimates",
     "SolvedCriterion",
     "Split",
+    "TrainingDomain",
     "TrainingResult",
+    "VideoRecorder",
     "check_unchanged",
     "evaluate",
-    "film_episode",
     "fingerprint",
     "load_checkpoint",
     "load_weights",
@@ -42,7 +41,8 @@ __all__ = [
     "nifti_data",
     "outcome",
     "phantom_data",
+    "record_episode",
+    "resume_from_checkpoint",
     "save_checkpoint",
-    "take_up",
     "train",
 ]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from armscan.training.evaluation import Evaluation
+from armscan.training.rollout import Evaluation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,18 +31,18 @@ class EpochReport:
 
 
 class Callback(Protocol):
-    """Whoever wants to know how training goes."""
+    """Receives the events of a training."""
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Called once, before the first step.
+        """Handle the start, called once before the first step.
 
         Args:
             total_env_steps: that training may take.
-            earlier: the epochs before, where a training goes on; whoever was told of them may have been killed since.
+            earlier: epochs before the interruption of a resumed training; they may be reported a second time.
         """
 
     def on_epoch(self, report: EpochReport) -> None:
-        """Called at the end of every epoch."""
+        """Handle the end of an epoch."""
 
     def on_end(self) -> None:
-        """Called once, when training ends, also when it ends by an error."""
+        """Handle the end of training, called once, also after an error."""

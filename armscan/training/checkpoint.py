@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, NoReturn, cast
 import torch
 
 from armscan.errors import CheckpointError
-from armscan.files import write_whole
+from armscan.utils.files import atomic_write
 
 FORMAT = 1
 MAGIC = b"armscan checkpoint "
@@ -23,7 +23,7 @@ CHUNK_BYTES = 1 << 20
 
 
 def save_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> None:
-    """Writes a checkpoint; a reader sees the old one or the new one, never half of one.
+    """Write a checkpoint; a reader sees the old one or the new one, never half of one.
 
     Args:
         path: the file.
@@ -39,11 +39,11 @@ def save_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) ->
         file.seek(0)
         file.write(_header(summing.digest.hexdigest()))
 
-    write_whole(path, write)
+    atomic_write(path, write)
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Reads a checkpoint.
+    """Read a checkpoint.
 
     Returns:
         The learner's state, and the facts beside it.
@@ -61,7 +61,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from error
-    # Its sum is right, so nobody's disk is to blame; what torch refuses is told by whichever of its readers meets it.
+    # The checksum matches, so the file is not damaged; torch's readers raise exceptions of many types.
     except Exception as error:
         raise CheckpointError(
             f"{path}: is no checkpoint: it holds something else than tensors, numbers and texts"
@@ -69,7 +69,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def load_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Reads a checkpoint that holds weights alone, as `best.pt` does.
+    """Read a checkpoint that holds weights alone, as `best.pt` does.
 
     Returns:
         The weights by name, and the facts beside them.
@@ -93,7 +93,7 @@ def _header(digest: str) -> bytes:
 
 
 def _verified(file: io.BufferedReader, path: Path) -> BinaryIO:
-    """Returns the contents after the first line, whose sum is the one that the line names."""
+    """Return the contents after the first line, whose sum is the one that the line names."""
     header = file.readline(len(_header("0" * 64)) + 8)
     if (match := HEADER.fullmatch(header)) is None:
         _refuse(path, header)
@@ -126,12 +126,12 @@ class _Summing:
         self.digest = hashlib.sha256()
 
     def write(self, data: bytes) -> int:
-        """Writes, and adds to the sum."""
+        """Write, and adds to the sum."""
         self.digest.update(data)
         return self._file.write(data)
 
     def flush(self) -> None:
-        """Hands on what is waiting."""
+        """Hand on what is waiting."""
         self._file.flush()
 
 

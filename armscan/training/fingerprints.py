@@ -1,4 +1,4 @@
-"""Fingerprints of volumes: where they are the same, so are the volumes, whatever their files are called."""
+"""Fingerprints of volumes: equal for equal volumes, independent of file names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Fingerprints = dict[str, dict[str, str]]
 
 
 def fingerprint(volume: LabelVolume) -> str:
-    """Returns the SHA-256 of all that an agent can notice of a volume: voxels, spacing and labelled plane."""
+    """Return the SHA-256 of all that an agent can notice of a volume: voxels, spacing and labelled plane."""
     plane = volume.optimal_action
     rest = (volume.shape, volume.spacing, None if plane is None else plane.to_array().tolist())
     digest = hashlib.sha256(repr(rest).encode())
@@ -22,7 +22,7 @@ def fingerprint(volume: LabelVolume) -> str:
 
 
 def check_unchanged(then: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], those_of: str) -> None:
-    """Checks that volumes are what they were.
+    """Check that volumes are what they were.
 
     Args:
         then: the fingerprints as they were.

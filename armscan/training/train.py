@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from armscan.agents.protocols import Learner
-from armscan.checks import check_float, check_int
 from armscan.errors import InvalidValueError
-from armscan.files import BEST_CHECKPOINT
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint
-from armscan.training.course import Origin, keep
-from armscan.training.evaluation import Evaluation
+from armscan.training.checkpointing import CheckpointProvenance, save_checkpoints
+from armscan.training.rollout import Evaluation
+from armscan.utils.files import BEST_CHECKPOINT
+from armscan.utils.validation import check_float, check_int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,18 +51,18 @@ class Budget:
 
     Args:
         env_steps: environment steps to take at most, all of them counted; rounded up to what the agent takes at once.
-        epoch_env_steps: environment steps between two validations, rounded up likewise.
+        eval_every_env_steps: environment steps between two validations, rounded up likewise.
         validation_episodes: episodes of a validation.
         solved: stop as soon as this holds; None to spend the whole budget.
     """
 
     env_steps: int
-    epoch_env_steps: int
+    eval_every_env_steps: int
     validation_episodes: int
     solved: SolvedCriterion | None = None
 
     def __post_init__(self) -> None:
-        for name in ("env_steps", "epoch_env_steps", "validation_episodes"):
+        for name in ("env_steps", "eval_every_env_steps", "validation_episodes"):
             check_int(f"training.{name}", getattr(self, name), at_least=1)
         if self.solved is not None and not isinstance(self.solved, SolvedCriterion):
             raise InvalidValueError(f"training.solved is {self.solved!r}, but it must be a SolvedCriterion or null")
@@ -95,22 +95,22 @@ def train(
     folder: Path,
     callbacks: Sequence[Callback] = (),
     *,
-    origin: Origin | None = None,
+    provenance: CheckpointProvenance | None = None,
     earlier: Sequence[EpochReport] = (),
 ) -> TrainingResult:
-    """Trains a learner and leaves it with the weights of its best epoch.
+    """Train a learner; it ends with the weights of its best epoch.
 
     Args:
         learner: to train.
         budget: how long.
         validate: evaluates the learner on the validation volumes.
         folder: where `best.pt` and `last.pt` are kept.
-        callbacks: who is told.
-        origin: what the checkpoints say that they come from.
-        earlier: what `take_up` returned, where a training goes on.
+        callbacks: called at start, after each epoch and at the end.
+        provenance: what the checkpoints say that they come from.
+        earlier: what `resume_from_checkpoint` returned, for a resumed training.
 
     Returns:
-        The course of the training.
+        The reports of all epochs.
     """
     reports = list(earlier)
     start_s = time.perf_counter() - (reports[-1].wall_s if reports else 0.0)
@@ -121,7 +121,7 @@ def train(
         if not reports:
             learner.warm_up()
         while learner.n_env_steps < budget.env_steps and not is_solved:
-            metrics = learner.learn(min(budget.epoch_env_steps, budget.env_steps - learner.n_env_steps))
+            metrics = learner.learn(min(budget.eval_every_env_steps, budget.env_steps - learner.n_env_steps))
             evaluation = validate()
             report = EpochReport(
                 epoch=len(reports) + 1,
@@ -132,7 +132,7 @@ def train(
                 is_best=all(evaluation.score > before.evaluation.score for before in reports),
             )
             reports.append(report)
-            keep(learner, reports, folder, origin)
+            save_checkpoints(learner, reports, folder, provenance)
             for callback in callbacks:
                 callback.on_epoch(report)
             is_solved = budget.solved is not None and budget.solved.holds(reports)

@@ -5,10 +5,9 @@ from armscan.volumes.labelmap import LabelMap
 from armscan.volumes.manifest import MANIFEST_NAMES, record_planes
 from armscan.volumes.markups import read_markup, write_markup
 from armscan.volumes.phantom import load_phantom, load_phantoms, make_phantom
-from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance, slid_into
+from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance, shift_into
 from armscan.volumes.reading import read_volume
-from armscan.volumes.report import VolumeReport
-from armscan.volumes.sharing import shared_volumes
+from armscan.volumes.summary import VolumeReport
 from armscan.volumes.volume import LABEL_NAMES, LANDMARK_LABELS, LabelVolume
 
 __all__ = [
@@ -30,7 +29,6 @@ __all__ = [
     "read_markup",
     "read_volume",
     "record_planes",
-    "shared_volumes",
-    "slid_into",
+    "shift_into",
     "write_markup",
 ]

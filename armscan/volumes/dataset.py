@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from armscan.checks import check_choice, check_path
 from armscan.errors import InvalidValueError, ManifestError, listed
+from armscan.utils.validation import check_choice, check_path
 from armscan.volumes.manifest import MANIFEST_NAMES, find_manifest, read_manifest, volume_entries, volume_files
 from armscan.volumes.reading import ReadingOptions, read_stored
-from armscan.volumes.report import VolumeReport
-from armscan.volumes.resampling import finest_spacing, resampled
+from armscan.volumes.resampling import finest_spacing, resample
+from armscan.volumes.summary import VolumeReport
 from armscan.volumes.volume import LabelVolume
 
 if TYPE_CHECKING:
-    from armscan.volumes.schema import Splits
+    from armscan.volumes.manifest_schema import Splits
 
 SPLITS = ("train", "validation", "test")
 # What an entry and the whole manifest can say.
@@ -53,18 +53,18 @@ class Dataset:
                 check_choice("a split", split, SPLITS)
 
     def volumes_of(self, split: str) -> dict[str, LabelVolume]:
-        """Returns the volumes of `train`, `validation` or `test` by file name; none where there are no splits."""
+        """Return the volumes of `train`, `validation` or `test` by file name; none where there are no splits."""
         check_choice("split", split, SPLITS)
         return {name: volume for name, volume in self.volumes.items() if self.splits and self.splits[name] == split}
 
 
 def read_dataset(path: str | Path) -> dict[str, LabelVolume]:
-    """Reads every volume of a folder: the `volumes` of `open_dataset`."""
+    """Read every volume of a folder: the `volumes` of `open_dataset`."""
     return open_dataset(path).volumes
 
 
 def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
-    """Reads every volume of a folder as its manifest says.
+    """Read every volume of a folder as its manifest says.
 
     Args:
         path: the folder. Its manifest, `manifest.yaml`, `manifest.yml` or `manifest.json`, is described in
@@ -78,7 +78,7 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
         VolumeError: if the folder or a file cannot be used.
         ManifestError: if the manifest is missing or damaged, or does not name the folder's volumes.
     """
-    from armscan.volumes.schema import Manifest
+    from armscan.volumes.manifest_schema import Manifest
 
     folder = check_path("the folder of volumes", path)
     files = volume_files(folder)
@@ -99,7 +99,7 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
         )
     if manifest.spacing == "finest":
         spacing = finest_spacing(volumes.values())
-        volumes = {name: resampled(volume, spacing) for name, volume in volumes.items()}
+        volumes = {name: resample(volume, spacing) for name, volume in volumes.items()}
     subjects = {name: entry.subject or name for name, entry in entries.items()}
     splits = None if manifest.splits is None else _split_of(manifest.splits, subjects, used, f"{found}: splits")
     return Dataset(
@@ -112,7 +112,7 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
 
 
 def _check_mapping(name: str, value: Any, kind: type, volumes: dict[str, LabelVolume] | None) -> None:
-    """Raises `InvalidValueError` unless `value` holds one of a kind for each of the volumes, where they are given."""
+    """Raise `InvalidValueError` unless `value` holds one of a kind for each of the volumes, where they are given."""
     if not isinstance(value, dict) or not all(isinstance(each, kind) for each in value.values()):
         raise InvalidValueError(f"{name} is {value!r}, but it must be a dict with a {kind.__name__} by file name")
     if volumes is not None and value.keys() != volumes.keys():
@@ -120,7 +120,7 @@ def _check_mapping(name: str, value: Any, kind: type, volumes: dict[str, LabelVo
 
 
 def _split_of(splits: Splits, subjects: Mapping[str, str], used: Mapping[str, object], where: str) -> dict[str, str]:
-    """Returns the split of each volume; `subjects` also holds those whose volumes are all excluded."""
+    """Return the split of each volume; `subjects` also holds those whose volumes are all excluded."""
     split_of = {subject: split for split in SPLITS for subject in getattr(splits, split)}
     if unknown := [subject for subject in split_of if subject not in subjects.values()]:
         raise ManifestError(

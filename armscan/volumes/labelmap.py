@@ -11,8 +11,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.checks import check_choice
 from armscan.errors import InvalidValueError, VolumeError, listed
+from armscan.utils.validation import check_choice
 from armscan.volumes.volume import LABEL_NAMES
 
 TISSUE_LABELS = {name: label for label, name in LABEL_NAMES.items()}
@@ -73,7 +73,7 @@ class LabelMap:
 
     @classmethod
     def from_mapping(cls, mapping: Any) -> Self:
-        """Builds a label map from what a manifest says, {'bones': [1, 2], ...}.
+        """Build a label map from what a manifest says, {'bones': [1, 2], ...}.
 
         Raises:
             InvalidValueError: if it is no mapping, or a key is unknown or missing, and as the class says.
@@ -93,7 +93,7 @@ class LabelMap:
         return {source: label for tissue, label in TISSUE_LABELS.items() for source in getattr(self, tissue)}
 
     def label_of(self, source: Source) -> int | None:
-        """Returns the label, 0 to 4, of what a file holds; None where the map does not name it and refuses others."""
+        """Return the label, 0 to 4, of what a file holds; None where the map does not name it and refuses others."""
         unnamed = BACKGROUND if self.others == "background" or source == 0 else None
         return self.by_source.get(source, unnamed)
 
@@ -116,7 +116,7 @@ class Found:
 def map_values(
     values: NDArray[np.generic], labels: LabelMap | None, where: str
 ) -> tuple[NDArray[np.uint8], tuple[Found, ...]]:
-    """Maps a file's values to the labels 0 to 4.
+    """Map a file's values to the labels 0 to 4.
 
     Args:
         values: of the voxels, any shape that is not empty, whole numbers of any type.
@@ -148,7 +148,7 @@ def map_values(
 
 
 def count_values(values: NDArray[np.integer[Any]]) -> dict[int, int]:
-    """Returns how many voxels have each value that occurs, in ascending order."""
+    """Return how many voxels have each value that occurs, in ascending order."""
     low, high = int(values.min()), int(values.max())
     if high - low >= LARGEST_TABLE or high > LARGEST_INT64:
         present, n_voxels = np.unique(values, return_counts=True)
@@ -161,7 +161,7 @@ def count_values(values: NDArray[np.integer[Any]]) -> dict[int, int]:
 
 
 def replaced(values: NDArray[np.integer[Any]], table: Mapping[int, int]) -> NDArray[np.uint8]:
-    """Returns the label that `table` gives for each value; every value that occurs must be in it."""
+    """Return the label that `table` gives for each value; every value that occurs must be in it."""
     known = sorted(table)
     low, high = known[0], known[-1]
     labels = np.array([table[value] for value in known], dtype=np.uint8)
@@ -176,7 +176,7 @@ def replaced(values: NDArray[np.integer[Any]], table: Mapping[int, int]) -> NDAr
 
 
 def check_landmarks(found: tuple[Found, ...], labels: LabelMap, where: str) -> None:
-    """Raises `VolumeError` unless the file has voxels of every landmark."""
+    """Raise `VolumeError` unless the file has voxels of every landmark."""
     for tissue in ("bones", "tendons", "artery"):
         if not any(each.n_voxels for each in found if each.label == TISSUE_LABELS[tissue]):
             raise VolumeError(
@@ -186,13 +186,13 @@ def check_landmarks(found: tuple[Found, ...], labels: LabelMap, where: str) -> N
 
 
 def shown(sources: Iterable[Source]) -> str:
-    """Returns values or names as they are written in a message, the first few of them."""
+    """Return values or names as they are written in a message, the first few of them."""
     names = [repr(source) for source in sources]
     return ", ".join(names[:MAX_SHOWN]) + (f", ... ({len(names)} in all)" if len(names) > MAX_SHOWN else "")
 
 
 def _whole(values: NDArray[np.generic], where: str) -> NDArray[np.integer[Any]]:
-    """Returns the values as whole numbers of whichever type."""
+    """Return the values as integers."""
     if np.issubdtype(values.dtype, np.integer):
         return values  # type: ignore[return-value]
     if not np.issubdtype(values.dtype, np.floating):

@@ -8,22 +8,25 @@ import reprlib
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
 from filelock import FileLock
+from ruamel.yaml import YAML
+from yaml.representer import SafeRepresenter
 
-from armscan.checks import check_float, check_path
 from armscan.errors import InvalidValueError, ManifestError, VolumeError, listed
-from armscan.files import write_whole
-from armscan.volumes.headers import CHECKS
+from armscan.utils.files import atomic_write
+from armscan.utils.validation import check_float, check_path
+from armscan.volumes.header_checks import CHECKS
 from armscan.volumes.plane import ManipulatorAction
 
 if TYPE_CHECKING:
     from pydantic import BaseModel, ValidationError
 
-    from armscan.volumes.schema import Manifest, VolumeEntry
+    from armscan.volumes.manifest_schema import Manifest, VolumeEntry
 
 # The last one is of an older form: nothing but the entries of the volumes.
 MANIFEST_NAMES = ("manifest.yaml", "manifest.yml", "manifest.json", "optimal_actions.json")
@@ -34,7 +37,7 @@ Document = dict[str, Any]
 
 
 def volume_files(folder: Path) -> dict[str, Path]:
-    """Returns the volumes of a folder by file name, in the order of their names.
+    """Return the volumes of a folder by file name, in the order of their names.
 
     Raises:
         VolumeError: if the folder does not exist, cannot be read, or holds no volume.
@@ -55,7 +58,7 @@ def volume_files(folder: Path) -> dict[str, Path]:
 
 
 def find_manifest(folder: Path) -> Path | None:
-    """Returns the manifest of a folder, None where there is none.
+    """Return the manifest of a folder, None where there is none.
 
     Raises:
         ManifestError: if there are several.
@@ -67,7 +70,7 @@ def find_manifest(folder: Path) -> Path | None:
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Reads and checks a manifest.
+    """Read and check a manifest.
 
     Raises:
         ManifestError: naming the file, the entry, the key, the value received and what is allowed.
@@ -76,12 +79,12 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def volume_entries(manifest: Manifest, files: Mapping[str, Path], path: Path | None) -> dict[str, VolumeEntry]:
-    """Returns the entry of each volume file; empty ones where the manifest has no `volumes`.
+    """Return the entry of each volume file; empty ones where the manifest has no `volumes`.
 
     Raises:
         ManifestError: if an entry has no file, or a file no entry.
     """
-    from armscan.volumes.schema import VolumeEntry
+    from armscan.volumes.manifest_schema import VolumeEntry
 
     if manifest.volumes is None:
         return {name: VolumeEntry() for name in files}
@@ -93,10 +96,9 @@ def volume_entries(manifest: Manifest, files: Mapping[str, Path], path: Path | N
 
 
 def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorAction, float]]) -> Path:
-    """Writes optimal planes into the manifest of a folder, and leaves everything else that it says as it is.
+    """Write optimal planes into the manifest of a folder, leaving everything else in it unchanged.
 
-    Where the folder has no manifest, `manifest.yaml` is made. The file is there whole or not at all. A manifest in YAML
-    is written anew: what it says stays, its comments do not.
+    A folder without a manifest gets `manifest.yaml`. The file is written atomically; comments in YAML are kept.
 
     Args:
         folder: the folder of volumes.
@@ -121,7 +123,7 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
 
 @contextmanager
 def _alone_with(folder: Path) -> Iterator[None]:
-    """Keeps others that write planes of this folder waiting: what two write at the same time, one would lose."""
+    """Keep others that write planes of this folder waiting: what two write at the same time, one would lose."""
     digest = hashlib.sha256(str(folder.resolve()).encode(errors="surrogateescape")).hexdigest()[:16]
     # Not in the folder, where it would stay behind.
     with FileLock(Path(tempfile.gettempdir()) / f"armscan-{digest}.lock"):
@@ -129,21 +131,27 @@ def _alone_with(folder: Path) -> Iterator[None]:
 
 
 def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str, Path]) -> Path:
-    """Writes the keys of each volume's entry into the manifest, and returns it."""
+    """Write the keys of each volume's entry into the manifest; return its path."""
     found = find_manifest(folder)
     path = found or folder / NEW_MANIFEST
     document = _load(path) if found else {}
     _checked(document, path)
-    if document.get("volumes") is None:
-        document["volumes"] = {name: {} for name in files}
-    for name, keys in recorded.items():
-        # A new object: in YAML, two entries can be one and the same.
-        document["volumes"][name] = document["volumes"].get(name, {}) | keys
-    contents = document["volumes"] if path.name == ENTRIES_ONLY else document
     try:
-        text = _dumped(contents, path).encode()
-        write_whole(path, lambda file: file.write(text))
-    except (OSError, UnicodeError) as error:
+        if found and path.suffix != ".json":
+            document = _round_trip().load(path.read_text(encoding="utf-8-sig")) or {}
+        if document.get("volumes") is None:
+            document["volumes"] = {name: {} for name in files}
+        entries = document["volumes"]
+        for name, keys in recorded.items():
+            entry = entries.get(name, {})
+            # In YAML two entries can be one object.
+            is_shared = any(other is entry for key, other in entries.items() if key != name)
+            entries[name] = dict(entry) if is_shared else entry
+            entries[name].update(keys)
+        text = _dumped(entries if path.name == ENTRIES_ONLY else document, path).encode()
+        atomic_write(path, lambda file: file.write(text))
+    # ruamel.yaml refuses some odd texts that PyYAML reads, with exceptions of many types.
+    except Exception as error:
         raise ManifestError(f"{path}: the manifest cannot be written ({error})") from error
     return path
 
@@ -166,20 +174,20 @@ def _checked_planes(planes: Any) -> dict[str, Document]:
 
 
 def _problem(error: yaml.MarkedYAMLError) -> str:
-    """What is wrong in a YAML text, and where, without the drawing that PyYAML makes of it."""
+    """Return what is wrong in a YAML text, and where, without PyYAML's excerpt of it."""
     mark = error.problem_mark
     where = "" if mark is None else f" in line {mark.line + 1}, column {mark.column + 1}"
     return f"{error.problem or error.context}{where}"
 
 
 def _load(path: Path) -> Document:
-    """Reads the file as it is, whichever of the two languages it is in."""
+    """Read the file, JSON or YAML, without validation."""
     language, load = ("JSON", _load_json) if path.suffix == ".json" else ("YAML", _load_yaml)
     try:
         document = load(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ManifestError(f"{path}: the manifest cannot be read ({error.strerror or error})") from error
-    # PyYAML reports some damaged texts by whatever exception its constructors meet first: KeyError, AttributeError, ...
+    # On some damaged texts PyYAML raises exceptions of other types: KeyError, AttributeError, ...
     except Exception as error:
         reason = _problem(error) if isinstance(error, yaml.MarkedYAMLError) else " ".join(str(error).split())[:300]
         raise ManifestError(f"{path}: the manifest cannot be read as {language} ({reason})") from error
@@ -193,7 +201,7 @@ def _load(path: Path) -> Document:
 
 def _load_json(text: str) -> Any:
     def without_duplicates(pairs: list[tuple[str, Any]]) -> Document:
-        """Refuses what JSON allows and everybody regrets: a key that is there twice, the first one forgotten."""
+        """Refuse what JSON allows and everybody regrets: a key that is there twice, the first one forgotten."""
         _check_no_duplicates([key for key, _ in pairs])
         return dict(pairs)
 
@@ -221,17 +229,28 @@ def _check_no_duplicates(keys: list[str]) -> None:
         seen.add(key)
 
 
+def _round_trip() -> YAML:
+    """Return a reader and writer of YAML that keeps comments, order and quotes."""
+    editor = YAML()
+    editor.preserve_quotes, editor.width = True, 4096
+    # YAML 1.1, which manifests are read as, wants a dot in a number with an exponent.
+    editor.representer.add_representer(float, SafeRepresenter.represent_float)
+    return editor
+
+
 def _dumped(contents: Document, path: Path) -> str:
     if path.suffix == ".json":
         return json.dumps(contents, indent=1) + "\n"
-    return yaml.safe_dump(contents, sort_keys=False, allow_unicode=True)
+    text = StringIO()
+    _round_trip().dump(contents, text)
+    return text.getvalue()
 
 
 def _checked(document: Document, path: Path) -> Manifest:
     # Deferred: who steps through phantoms reads no manifest.
     from pydantic import ValidationError
 
-    from armscan.volumes.schema import Manifest
+    from armscan.volumes.manifest_schema import Manifest
 
     try:
         return Manifest.model_validate(document)
@@ -243,8 +262,8 @@ def _checked(document: Document, path: Path) -> Manifest:
 
 
 def _in_one_line(error: ValidationError, path: Path) -> str:
-    """Names the file, the entry, the key, the value received and what is allowed, of the first mistake."""
-    from armscan.volumes.schema import Manifest, Splits, VolumeEntry
+    """Name the file, the entry, the key, the value received and what is allowed, of the first mistake."""
+    from armscan.volumes.manifest_schema import Manifest, Splits, VolumeEntry
 
     mistake = error.errors(include_url=False)[0]
     kind, received, place = mistake["type"], reprlib.repr(mistake["input"]), list(mistake["loc"])

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from armscan.checks import check_path
 from armscan.errors import InvalidValueError, MarkupError
-from armscan.files import write_whole
-from armscan.volumes.plane import FloatArray, ManipulatorAction, slid_into
+from armscan.utils.files import atomic_write
+from armscan.utils.validation import check_path
+from armscan.volumes.plane import FloatArray, ManipulatorAction, shift_into
 from armscan.volumes.slicer_plane import SlicerPlane, read_slicer_plane
 from armscan.volumes.volume import LabelVolume
 
@@ -33,7 +33,7 @@ ROUNDING_MM = 1e-3
 
 
 def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorAction, name: str = "optimal plane") -> None:
-    """Writes a plane as the rectangle that its slice fills in the volume as Slicer shows it.
+    """Write a plane as the rectangle that its slice fills in the volume as Slicer shows it.
 
     The rectangle's x axis runs across and its y axis in depth; the normal makes them right-handed.
 
@@ -57,13 +57,13 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
         raise MarkupError(f"{path}: a markups file must end in {MARKUP_SUFFIX}, or Slicer does not know it as one")
     document = {"@schema": SCHEMA, "markups": [_markup(volume, action, name)]}
     try:
-        write_whole(path, lambda file: file.write((json.dumps(document, indent=2) + "\n").encode()))
+        atomic_write(path, lambda file: file.write((json.dumps(document, indent=2) + "\n").encode()))
     except OSError as error:
         raise MarkupError(f"{path}: the markups file cannot be written ({error.strerror or error})") from error
 
 
 def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
-    """Reads the plane of a markups file, written by `write_markup` or drawn in Slicer, in LPS or RAS.
+    """Read the plane of a markups file, written by `write_markup` or drawn in Slicer, in LPS or RAS.
 
     It is the same plane as a set of points. Where the file shows a rectangle of a slice's size, its middle stays the
     middle of the slice; otherwise the slice is placed about the volume's middle. How the rectangle is turned within its
@@ -103,7 +103,7 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     within_mm = np.clip(slice_origin_mm[:2], 0.0, volume.size_mm[:2])
     tx, ty = np.where(np.abs(within_mm - slice_origin_mm[:2]) < ROUNDING_MM, within_mm, slice_origin_mm[:2])
     action = ManipulatorAction(turned.rotation, (float(tx), float(ty)))
-    slid = slid_into(action, volume.size_mm[:2])
+    slid = shift_into(action, volume.size_mm[:2])
     if slid is None:
         raise MarkupError(
             f"{where} in {volume.name} at {action}, but its origin (tx, ty) must lie within (0, 0) and "
@@ -148,5 +148,5 @@ def _markup(volume: LabelVolume, action: ManipulatorAction, name: str) -> dict[s
 
 
 def _slice_centre(volume: LabelVolume) -> FloatArray:
-    """The middle of a slice in the plane's frame, which is also the middle of the rectangle that its pixels fill."""
+    """Return the centre of a slice in the plane's frame, which is also the centre of its rectangle of pixels."""
     return np.array([volume.centre_mm[0], 0.0, volume.centre_mm[2]])

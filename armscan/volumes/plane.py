@@ -11,8 +11,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.checks import check_numbers
 from armscan.errors import InvalidValueError
+from armscan.utils.validation import check_numbers
 
 FloatArray = NDArray[np.float64]
 LARGEST_SHIFT_MM = 1e6
@@ -20,7 +20,7 @@ LARGEST_SHIFT_MM = 1e6
 
 @numba.njit(cache=True)
 def rotation_matrix(rz_deg: float, rx_deg: float) -> FloatArray:
-    """Returns Rz(rz) Rx(rx), 3 x 3: a rotation about X, then one about Z."""
+    """Return Rz(rz) Rx(rx), 3 x 3: a rotation about X, then one about Z."""
     cos_z, sin_z = math.cos(math.radians(rz_deg)), math.sin(math.radians(rz_deg))
     cos_x, sin_x = math.cos(math.radians(rx_deg)), math.sin(math.radians(rx_deg))
     matrix = np.empty((3, 3))
@@ -34,7 +34,7 @@ def rotation_matrix(rz_deg: float, rx_deg: float) -> FloatArray:
 def _composed(
     outer: FloatArray, outer_mm: FloatArray, inner: FloatArray, inner_mm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Returns (M, b) of the affine map p -> outer (inner p + inner_mm) + outer_mm."""
+    """Return (M, b) of the affine map p -> outer (inner p + inner_mm) + outer_mm."""
     matrix, offset_mm = np.zeros((3, 3)), np.zeros(3)
     for i in range(3):
         for k in range(3):
@@ -70,12 +70,12 @@ class ManipulatorAction:
 
     @classmethod
     def from_array(cls, components: FloatArray) -> Self:
-        """Builds the action from its four components (rz, rx, tx, ty) in degrees and mm."""
+        """Build the action from its four components (rz, rx, tx, ty) in degrees and mm."""
         rz, rx, tx, ty = check_numbers("components", components, 4, "(rz, rx) in degrees and (tx, ty) in mm")
         return cls(rotation=(rz, rx), translation=(tx, ty))
 
     def to_array(self) -> FloatArray:
-        """Returns (rz, rx, tx, ty) in degrees and mm."""
+        """Return (rz, rx, tx, ty) in degrees and mm."""
         return np.array([*self.rotation, *self.translation])
 
     @cached_property
@@ -135,11 +135,11 @@ class RigidTransform:
         return offset_mm
 
     def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
-        """Returns (M, b) with T(plane(p)) = M p + b: from the plane's frame into the unmoved volume."""
+        """Return (M, b) with T(plane(p)) = M p + b: from the plane's frame into the unmoved volume."""
         return _composed(self.matrix, self.offset_mm, action.matrix, action.offset_mm)
 
     def inverse_plane(self, action: ManipulatorAction) -> ManipulatorAction:
-        """Returns the plane of the moved volume that shows what `action` shows of the unmoved one.
+        """Return the plane of the moved volume that shows what `action` shows of the unmoved one.
 
         The result is the same set of points. Where the motion turns about X as well, the picture may be turned and
         shifted within the plane, because a `ManipulatorAction` has neither a rotation about Y nor a shift in depth.
@@ -153,7 +153,7 @@ class RigidTransform:
         # The same plane has two descriptions; the one on the same side as `action` keeps the picture upright.
         if math.cos(math.radians(action.rotation[1])) < 0:
             rx, rz = math.pi - rx, math.atan2(n_x, -n_y)
-        rotation = wrapped_deg(math.degrees(rz)), wrapped_deg(math.degrees(rx))
+        rotation = wrap_deg(math.degrees(rz)), wrap_deg(math.degrees(rx))
         if z_mm != 0.0:
             in_depth_x, in_depth_y, in_depth_z = rotation_matrix(*rotation)[:, 2].tolist()
             if abs(in_depth_z) < 1e-9:
@@ -162,13 +162,13 @@ class RigidTransform:
         return ManipulatorAction(rotation, (x_mm, y_mm))
 
 
-def wrapped_deg(angle_deg: float) -> float:
-    """Returns the angle in (-180, 180]."""
+def wrap_deg(angle_deg: float) -> float:
+    """Return the angle in (-180, 180]."""
     return float(180.0 - (180.0 - angle_deg) % 360.0)
 
 
-def slid_into(action: ManipulatorAction, bounds_mm: tuple[float, float]) -> ManipulatorAction | None:
-    """Slides the plane's origin along the plane until (tx, ty) lies in [0, bounds_mm], by the shortest way.
+def shift_into(action: ManipulatorAction, bounds_mm: tuple[float, float]) -> ManipulatorAction | None:
+    """Slide the plane's origin along the plane until (tx, ty) lies in [0, bounds_mm], by the shortest way.
 
     Returns:
         The same plane with its picture shifted across, or None where the plane misses the box altogether.
@@ -195,7 +195,7 @@ def slid_into(action: ManipulatorAction, bounds_mm: tuple[float, float]) -> Mani
 def plane_distance(
     action: ManipulatorAction, optimum: ManipulatorAction, centre_mm: tuple[float, float]
 ) -> tuple[float, float]:
-    """Measures how far a plane is from the optimal one.
+    """Measure how far a plane is from the optimal one.
 
     Args:
         action: the plane.

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.checks import check_choice, check_path
 from armscan.errors import InvalidValueError, VolumeError, listed
-from armscan.volumes.frames import AXES, Crop, check_axes, check_crop, check_orientation, orientation_of
-from armscan.volumes.headers import CHECKS
+from armscan.utils.validation import check_choice, check_path
+from armscan.volumes.header_checks import CHECKS
 from armscan.volumes.labelmap import Found, LabelMap, check_landmarks, map_values
+from armscan.volumes.orientation import AXES, Crop, check_axes, check_crop, check_orientation, orientation_of
 from armscan.volumes.plane import FloatArray, ManipulatorAction
-from armscan.volumes.report import StoredFile, missing_sources
 from armscan.volumes.segmentation import OVERLAPS, SEGMENTATION_SUFFIX, read_segmentation
+from armscan.volumes.summary import StoredFile, missing_sources
 from armscan.volumes.volume import LabelVolume
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def is_text(name: str) -> bool:
 
 
 def volume_suffix(path: Path) -> str | None:
-    """Returns the ending that says a file is a volume ('.nii.gz', ...), None for any other file."""
+    """Return the ending that says a file is a volume ('.nii.gz', ...), None for any other file."""
     return next((suffix for suffix in CHECKS if path.name.endswith(suffix)), None)
 
 
@@ -70,7 +70,7 @@ def read_volume(
     crop_mm: Crop | None = None,
     overlap: str = "refuse",
 ) -> LabelVolume:
-    """Reads a labelmap from .nii, .nii.gz, .nrrd, .mha or .mhd, or a segmentation of 3D Slicer from .seg.nrrd.
+    """Read a labelmap from .nii, .nii.gz, .nrrd, .mha or .mhd, or a segmentation of 3D Slicer from .seg.nrrd.
 
     Where a voxel lies in the world stays as the file says, whichever way the array is turned and cropped.
 
@@ -110,7 +110,7 @@ def read_stored(
     name: str | None = None,
     optimal_action: ManipulatorAction | None = None,
 ) -> tuple[LabelVolume, StoredFile]:
-    """Reads a volume as `read_volume` does, and tells what it was read from."""
+    """Read a volume as `read_volume` does; also return details of its file."""
     image, found = _read_labels(path, options)
     if options.labels is not None:
         check_landmarks(found, options.labels, str(path))
@@ -135,7 +135,7 @@ def read_stored(
 
 
 def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, tuple[Found, ...]]:
-    """Returns the file as a SimpleITK image of the labels 0 to 4, and what was found in it."""
+    """Return the file as a SimpleITK image of the labels 0 to 4, and what was found in it."""
     # Deferred: it takes long to load, and who steps through phantoms never needs it.
     import SimpleITK
 
@@ -177,7 +177,7 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
 
 
 def _image(labels: NDArray[np.uint8], matrix: FloatArray, path: Path) -> SimpleITK.Image:
-    """Returns labels over (i, j, k) with their matrix to world coordinates as a SimpleITK image."""
+    """Return labels over (i, j, k) with their matrix to world coordinates as a SimpleITK image."""
     import SimpleITK
 
     spacing = np.linalg.norm(matrix[:3, :3], axis=0)
@@ -193,7 +193,7 @@ def _image(labels: NDArray[np.uint8], matrix: FloatArray, path: Path) -> SimpleI
 def _in_order(
     image: SimpleITK.Image, options: ReadingOptions, path: Path
 ) -> tuple[NDArray[np.uint8], FloatArray, FloatArray, FloatArray]:
-    """Orients an image, brings its axes into the arm's order and crops it: labels, spacing, origin and direction."""
+    """Orient an image, bring its axes into the arm's order and crop it: labels, spacing, origin and direction."""
     import SimpleITK
 
     if options.orientation is not None:
@@ -209,7 +209,7 @@ def _in_order(
 
 
 def _kept(crop_mm: Crop | None, axis: str, n_voxels: int, step_mm: float, path: Path) -> slice:
-    """Returns which voxels along an axis stay."""
+    """Return which voxels along an axis stay."""
     if crop_mm is None or axis not in crop_mm:
         return slice(0, n_voxels)
     low, high = crop_mm[axis]

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.checks import check_numbers
 from armscan.errors import InvalidValueError, VolumeError
+from armscan.utils.validation import check_numbers
 from armscan.volumes.volume import LabelVolume
 
 Spacing = tuple[float, float, float]
@@ -19,13 +19,13 @@ MAX_VOXELS = 2**30
 
 
 def finest_spacing(volumes: Iterable[LabelVolume]) -> Spacing:
-    """Returns the smallest spacing along each axis, in mm."""
+    """Return the smallest spacing along each axis, in mm."""
     s_x, s_y, s_z = (min(steps) for steps in zip(*(volume.spacing for volume in volumes), strict=True))
     return s_x, s_y, s_z
 
 
-def resampled(volume: LabelVolume, spacing: Spacing) -> LabelVolume:
-    """Resamples a volume by the nearest neighbour.
+def resample(volume: LabelVolume, spacing: Spacing) -> LabelVolume:
+    """Resample a volume by the nearest neighbour.
 
     The first voxel's centre stays where it is, so that the volume's frame, and with it every plane, stays the same.
 

@@ -30,7 +30,7 @@ class Segment:
 def read_segmentation(
     path: Path, labels: LabelMap | None, overlap: str
 ) -> tuple[NDArray[np.uint8], FloatArray, tuple[Found, ...]]:
-    """Reads a segmentation and maps its segments to the labels 0 to 4 by their names.
+    """Read a segmentation and map its segments to the labels 0 to 4 by their names.
 
     Segments of one tissue may overlap, and so may any segment and one that is background. Where segments of different
     tissues share a voxel, `overlap` decides.
@@ -74,7 +74,7 @@ def _contents(path: Path) -> dict[str, Any]:
 
     try:
         contents: dict[str, Any] = slicerio.read_segmentation(str(path))
-    # slicerio and pynrrd report a damaged file by whatever exception they meet first.
+    # slicerio and pynrrd raise exceptions of many types on a damaged file.
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise VolumeError(f"{path}: the file is truncated or damaged, or no segmentation ({reason})") from error
@@ -84,7 +84,7 @@ def _contents(path: Path) -> dict[str, Any]:
 
 
 def _segments(stored: list[dict[str, Any]], n_layers: int, labels: LabelMap | None, path: Path) -> list[Segment]:
-    """Returns the segments in the order of the file; all of them must be mapped, and each lie in a layer alone."""
+    """Return the segments in the order of the file; all of them must be mapped, and each lie in a layer alone."""
     segments, unnamed, places = [], [], set()
     for position, each in enumerate(stored):
         name = str(each.get("name", each["id"]))
@@ -115,7 +115,7 @@ def _segments(stored: list[dict[str, Any]], n_layers: int, labels: LabelMap | No
 
 
 def _check_strays(segments: list[Segment], counts: list[dict[int, int]], labels: LabelMap | None, path: Path) -> None:
-    """Raises `VolumeError` if voxels belong to no segment, unless all that is not named is to be background."""
+    """Raise `VolumeError` if voxels belong to no segment, unless all that is not named is to be background."""
     if labels is not None and labels.others == "background":
         return
     for layer, present in enumerate(counts):

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from armscan.checks import check_numbers
 from armscan.errors import InvalidValueError, MarkupError, listed
+from armscan.utils.validation import check_numbers
 from armscan.volumes.plane import FloatArray
 
 # From the file's coordinates to LPS.
@@ -51,7 +51,7 @@ class SlicerPlane:
 
 
 def read_slicer_plane(path: Path) -> SlicerPlane:
-    """Reads the one plane of a markups file.
+    """Read the one plane of a markups file.
 
     Raises:
         MarkupError: naming the file and the key, if the file cannot be read, holds no plane or several, is in other
@@ -94,7 +94,7 @@ def _only_plane(document: Any, path: Path) -> dict[str, Any]:
 
 
 def _shown(markup: dict[str, Any], path: Path) -> Plane | None:
-    """The plane that Slicer shows; None where what it takes for that is not there."""
+    """Return the plane that Slicer shows; None where what it takes for that is not there."""
     # Files without a type are from before there were several.
     kind = markup.get("planeType", "threePoints")
     if not isinstance(kind, str) or kind.lower() not in PLANE_TYPES:
@@ -113,7 +113,7 @@ def _shown(markup: dict[str, Any], path: Path) -> Plane | None:
 
 
 def _stated(markup: dict[str, Any], path: Path) -> Plane | None:
-    """The plane by its centre and normal, None where the file has no such keys."""
+    """Return the plane by its centre and normal, None where the file has no such keys."""
     if "center" not in markup or "normal" not in markup:
         return None
     return _numbers(markup, "center", 3, path), _unit(_numbers(markup, "normal", 3, path), "normal", path)
@@ -139,7 +139,7 @@ def _agreed(shown: Plane | None, stated: Plane | None, path: Path) -> Plane:
 
 
 def _control_points(markup: dict[str, Any], path: Path) -> FloatArray:
-    """The positions of the control points that have been placed, shape (n, 3)."""
+    """Return the positions of the control points that have been placed, shape (n, 3)."""
     points = markup.get("controlPoints", [])
     if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
         raise _error(path, "controlPoints", points, "a list of objects")
@@ -148,7 +148,7 @@ def _control_points(markup: dict[str, Any], path: Path) -> FloatArray:
 
 
 def _fitted(points: FloatArray, path: Path) -> Plane:
-    """The plane with the least squared distance from points, shape (n, 3)."""
+    """Return the plane with the least squared distance from points, shape (n, 3)."""
     middle = points.mean(axis=0)
     _, extents, directions = np.linalg.svd(points - middle)
     if extents[1] < 1e-6 * max(1.0, extents[0]):

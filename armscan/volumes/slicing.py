@@ -20,7 +20,7 @@ def sample_plane(
     offset_mm: NDArray[np.float64],
     slice_xz: NDArray[np.uint8],
 ) -> int:
-    """Fills a slice with the voxels nearest to its points.
+    """Fill a slice with the voxels nearest to its points.
 
     Pixel (i, k) is p = (i sx, 0, k sz) and takes the voxel floor(q / s + 0.5) of q = matrix p + offset, 0 outside.
 
@@ -54,7 +54,7 @@ def _voxel_places(
     offset_mm: NDArray[np.float64],
     slice_shape: tuple[int, int],
 ) -> NDArray[np.int64]:
-    """Returns for each pixel, in order, the place of its voxel in the flat volume, `OUTSIDE` where there is none."""
+    """Return for each pixel, in order, the place of its voxel in the flat volume, `OUTSIDE` where there is none."""
     n_x, n_y, n_z = shape
     s_x, s_y, s_z = spacing_mm
     n_across, n_depth = slice_shape

@@ -9,8 +9,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.checks import check_int, check_numbers
 from armscan.errors import InvalidValueError, VolumeError
+from armscan.utils.validation import check_int, check_numbers
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
 from armscan.volumes.slicing import sample_plane
 
@@ -114,7 +114,7 @@ class LabelVolume:
         *,
         transform: RigidTransform | None = None,
     ) -> NDArray[np.uint8]:
-        """Looks up the labels on a plane; nothing is resampled.
+        """Look up the labels on a plane; nothing is resampled.
 
         Args:
             action: the plane.

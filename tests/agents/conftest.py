@@ -5,17 +5,17 @@ from functools import partial
 import pytest
 
 from armscan.agents import MLP, PPO, SAC, AgentSetup, Compute, Multimodal, Regression
-from armscan.envs import EnvMaker, SliceChannelsObservation
+from armscan.envs import EnvFactory, SliceChannelsObservation
 
 SMALL_MULTIMODAL = Multimodal(filters=(2, 2, 2), vector_sizes=(8,), head_sizes=(8,))
-SMALL_SAC = {"num_envs": 2, "random_env_steps": 20, "batch_size": 16, "env_steps_per_collection": 4}
-SMALL_PPO = {"num_envs": 2, "env_steps_per_collection": 20, "batch_size": 10, "passes_per_collection": 2}
-SMALL_REGRESSION = {"num_envs": 2, "batch_size": 16, "updates_per_env_step": 0.5, "own_planes_share": 0.5}
+SMALL_SAC = {"num_envs": 2, "learning_starts": 20, "batch_size": 16, "env_steps_per_collection": 4, "utd_ratio": 0.5}
+SMALL_PPO = {"num_envs": 2, "env_steps_per_collection": 20, "batch_size": 10, "n_epochs": 2}
+SMALL_REGRESSION = {"num_envs": 2, "batch_size": 16, "utd_ratio": 0.5, "own_planes_share": 0.5}
 ALGORITHMS = {"sac": (SAC, SMALL_SAC), "ppo": (PPO, SMALL_PPO), "regression": (Regression, SMALL_REGRESSION)}
 MAKERS = {
-    "vector": (EnvMaker(projection="zy"), MLP((8,))),
+    "vector": (EnvFactory(projection="zy"), MLP((8,))),
     "images": (
-        EnvMaker(projection="zy", observation=SliceChannelsObservation(shape=(36, 36)), stack=2, memory=2),
+        EnvFactory(projection="zy", observation=SliceChannelsObservation(shape=(36, 36)), stack=2, memory=2),
         SMALL_MULTIMODAL,
     ),
 }

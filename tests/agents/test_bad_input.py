@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 
 from armscan.agents import MLP, SAC, Exhaustive, OptunaSearch, Regression
-
-from ..junk import SETTINGS, junk, refuses
+from tests.support.junk import SETTINGS, junk, refuses
 
 
 @pytest.mark.parametrize("changed", [field.name for field in fields(SAC)])

@@ -8,8 +8,7 @@ from armscan.envs import ArmscanEnv
 from armscan.envs.actions import ActionBounds
 from armscan.errors import InvalidValueError
 from armscan.training import evaluate
-
-from .conftest import MAKERS, setup_for
+from tests.agents.conftest import MAKERS, setup_for
 
 BOUNDS = ActionBounds((90.0, 45.0), (97.2, 216.0))
 FREE = {"y": ("ty",), "x": ("tx",), "zy": ("rz", "ty"), "xy": ("tx", "ty"), "full": ("rz", "rx", "tx", "ty")}
@@ -57,7 +56,7 @@ def test_random_draws_nothing_that_the_environment_draws_from_the_same_seed(phan
 
 def test_sweep_visits_every_plane_once_from_the_middle_outward(phantom):
     swept = planes(agent_of(Exhaustive(), phantom), 43)
-    ty_mm = [BOUNDS.denormalised((0, 0, 0, ty)).translation[1] for (ty,) in swept]
+    ty_mm = [BOUNDS.denormalise((0, 0, 0, ty)).translation[1] for (ty,) in swept]
     np.testing.assert_allclose(ty_mm[:5], [108, 103, 113, 98, 118])
     offsets_mm = np.abs(np.array(ty_mm) - 108.0)
     assert (np.diff(offsets_mm) > -1e-9).all()
@@ -73,7 +72,7 @@ def test_sweep_whose_last_step_ends_on_the_ends_reaches_them(phantom, bound_mm, 
     assert len(swept) == 2 * n_steps + 1
     assert swept.min() == -1.0
     assert swept.max() == 1.0
-    ends = [bounds.denormalised((0, 0, 0, ty)).translation[1] for ty in (swept.min(), swept.max())]
+    ends = [bounds.denormalise((0, 0, 0, ty)).translation[1] for ty in (swept.min(), swept.max())]
     assert ends == [0.0, bound_mm]
 
 
@@ -88,7 +87,7 @@ def test_sweep_stays_at_the_best_plane_after_all_were_seen(phantom):
 
 def test_sweep_holds_the_other_free_components_at_the_plane_straight_across(phantom):
     swept = planes(agent_of(Exhaustive(), phantom, "full"), 20)
-    plane = BOUNDS.denormalised(swept[7])
+    plane = BOUNDS.denormalise(swept[7])
     assert plane.rotation == (0.0, 0.0)
     assert plane.translation[0] == 0.0
     assert len(np.unique(swept[:, 3])) == 20

@@ -7,8 +7,7 @@ import torch
 from armscan.agents import PPO, SAC, Learner, Regression
 from armscan.errors import CheckpointError, DivergedError, InvalidValueError
 from armscan.training import load_checkpoint, save_checkpoint
-
-from .conftest import ALGORITHMS, MAKERS, SMALL_SAC, setup_for
+from tests.agents.conftest import ALGORITHMS, MAKERS, SMALL_SAC, setup_for
 
 by_reinforcement = pytest.mark.parametrize("algorithm", ["sac", "ppo"], indirect=True)
 
@@ -46,7 +45,7 @@ def test_learner_counts_every_environment_step(make_learner):
 
 @pytest.mark.parametrize("algorithm", ["sac"], indirect=True)
 def test_learner_of_many_updates_a_collection_shows_no_bars_of_its_own(make_learner, capfd):
-    learner = make_learner(env_steps_per_collection=20, updates_per_env_step=2.0)
+    learner = make_learner(env_steps_per_collection=20, utd_ratio=2.0)
     learner.warm_up()
     learner.learn(40)
     assert "".join(capfd.readouterr()) == ""
@@ -70,7 +69,7 @@ def test_learner_reports_episodes_losses_and_speed(make_learner):
 @pytest.mark.parametrize("share", [0.1, 0.26, 0.7, 2.0])
 def test_learner_takes_as_many_gradient_steps_as_are_asked_for_also_after_going_on(algorithm, phantom, share):
     maker, network = MAKERS["vector"]
-    learners = [algorithm(network, updates_per_env_step=share).agent(setup_for(maker, phantom)) for _ in range(2)]
+    learners = [algorithm(network, utd_ratio=share).agent(setup_for(maker, phantom)) for _ in range(2)]
     learners[0].warm_up()
     first, last = learners
     n_random = first.n_env_steps
@@ -101,8 +100,8 @@ def test_learner_acts_without_exploration(make_learner, env):
 
 
 @by_reinforcement
-def test_learner_judged_by_sampling_draws_from_the_episodes_seed(make_learner, env):
-    learner = make_learner(judged_by_sampling=True)
+def test_learner_with_stochastic_evaluation_samples_from_the_episodes_seed(make_learner, env):
+    learner = make_learner(deterministic_eval=False)
     observation, reward = begun(learner, env)
     first, second = learner.act(observation, reward), learner.act(observation, reward)
     assert not np.array_equal(first, second)
@@ -185,24 +184,24 @@ def test_algorithm_refuses_impossible_parameters(algorithm, changes, message):
     ("kind", "changes", "message"),
     [
         (SAC, {"gamma": 1.5}, r"agent\.gamma is 1\.5"),
-        (SAC, {"judged_by_sampling": "yes"}, r"agent\.judged_by_sampling is 'yes'"),
-        (SAC, {"updates_per_env_step": -1}, r"agent\.updates_per_env_step is -1"),
-        (SAC, {"random_env_steps": 100}, r"agent\.random_env_steps is 100, .* must be below"),
-        (SAC, {"random_env_steps": 1, "num_envs": 100}, r"agent\.random_env_steps is 1, 100 for 100 environments"),
-        (SAC, {"updates_per_env_step": 0.01}, r"agent\.updates_per_env_step is 0\.01, .* at least 0\.0125, or not one"),
+        (SAC, {"deterministic_eval": "yes"}, r"agent\.deterministic_eval is 'yes'"),
+        (SAC, {"utd_ratio": -1}, r"agent\.utd_ratio is -1"),
+        (SAC, {"learning_starts": 100}, r"agent\.learning_starts is 100, .* must be below"),
+        (SAC, {"learning_starts": 1, "num_envs": 100}, r"agent\.learning_starts is 1, 100 for 100 environments"),
+        (SAC, {"utd_ratio": 0.01}, r"agent\.utd_ratio is 0\.01, .* at least 0\.0125, or not one"),
         (
             SAC,
             {"env_steps_per_collection": 10**4},
             r"agent\.env_steps_per_collection is 10000, 10000 for 2 env.* at most 80 = training\.env_steps - 20",
         ),
-        (SAC, {"random_env_steps": 1, "num_envs": 60}, r"collection is 4, 60 for 60 environments, .* at most 40 = "),
+        (SAC, {"learning_starts": 1, "num_envs": 60}, r"collection is 4, 60 for 60 environments, .* at most 40 = "),
         (SAC, {"batch_size": 200}, r"agent\.batch_size is 200, but it must be at most 102, which is all"),
         (SAC, {"buffer_size": 10}, r"agent\.batch_size is 16, but it must be at most agent\.buffer_size = 10"),
         (PPO, {"gamma": 1.5}, r"agent\.gamma is 1\.5"),
-        (PPO, {"judged_by_sampling": "yes"}, r"agent\.judged_by_sampling is 'yes'"),
+        (PPO, {"deterministic_eval": "yes"}, r"agent\.deterministic_eval is 'yes'"),
         (PPO, {"clip_range": -0.1}, r"agent\.clip_range is -0\.1"),
-        (PPO, {"initial_log_sigma": 5}, r"agent\.initial_log_sigma is 5"),
-        (PPO, {"passes_per_collection": 0}, r"agent\.passes_per_collection is 0"),
+        (PPO, {"log_std_init": 5}, r"agent\.log_std_init is 5"),
+        (PPO, {"n_epochs": 0}, r"agent\.n_epochs is 0"),
         (PPO, {"conditioned_sigma": 1}, r"agent\.conditioned_sigma is 1"),
         (
             PPO,
@@ -214,13 +213,13 @@ def test_algorithm_refuses_impossible_parameters(algorithm, changes, message):
             {"batch_size": 21},
             r"agent\.batch_size is 21, but it must be at most 20, the environment steps of a coll",
         ),
-        (PPO, {"batch_size": 1}, r"agent\.batch_size is 1, .* at least 2 with agent\.normalise_advantage"),
+        (PPO, {"batch_size": 1}, r"agent\.batch_size is 1, .* at least 2 with agent\.normalize_advantage"),
         (Regression, {"num_envs": 101}, r"agent\.num_envs is 101, but it must be at most training\.env_steps = 100"),
         (Regression, {"batch_size": 103}, r"agent\.batch_size is 103, but it must be at most 102, which is all"),
         (
             Regression,
-            {"updates_per_env_step": 0.001},
-            r"agent\.updates_per_env_step is 0\.001, .* at least 0\.01, or not",
+            {"utd_ratio": 0.001},
+            r"agent\.utd_ratio is 0\.001, .* at least 0\.01, or not",
         ),
     ],
 )
@@ -232,7 +231,7 @@ def test_algorithm_refuses_its_own_impossible_parameters(phantom, kind, changes,
 
 
 def test_learning_rates_come_down_to_their_final_share(make_learner):
-    learner = make_learner(final_lr_share=0.25)
+    learner = make_learner(lr_end_factor=0.25)
     rates = []
     for _ in range(8):
         rates.append({round(group["lr"] / 1e-3, 6) for group in learner._lr_groups()})
@@ -255,4 +254,4 @@ def test_learner_says_that_it_has_diverged(make_learner, part):
         weights.data.fill_(float("nan"))
     with pytest.raises(DivergedError, match=r"learning has diverged: after \d+ environment steps") as raised:
         learner.learn(60)
-    assert ("agent.entropy_lr" in str(raised.value)) == hasattr(learner._algorithm, "alpha")
+    assert ("agent.ent_coef_lr" in str(raised.value)) == hasattr(learner._algorithm, "alpha")

@@ -7,16 +7,15 @@ from gymnasium import spaces
 
 from armscan.agents import MLP, SAC, Compute, Multimodal, NetworkByObservation
 from armscan.agents.multimodal import MultimodalBody, smallest_side_px
-from armscan.envs import EnvMaker, SliceChannelsObservation, SliceObservation
+from armscan.envs import EnvFactory, SliceChannelsObservation, SliceObservation
 from armscan.errors import InvalidValueError
-
-from .conftest import SMALL_MULTIMODAL, SMALL_SAC, setup_for
+from tests.agents.conftest import SMALL_MULTIMODAL, SMALL_SAC, setup_for
 
 BY_OBSERVATION = NetworkByObservation(vector=MLP((8,)), images=SMALL_MULTIMODAL)
 
 
 def space_of(phantom, observation, **rules):
-    return EnvMaker(observation=observation, projection="zy", **rules).one([phantom]).observation_space
+    return EnvFactory(observation=observation, projection="zy", **rules).one([phantom]).observation_space
 
 
 @pytest.mark.parametrize(
@@ -146,7 +145,7 @@ def test_compute_without_a_gpu_takes_the_cpu_and_says_so_where_one_was_asked_for
     "compute", [Compute("cpu", "bfloat16"), pytest.param(Compute("cpu", compile=True), marks=pytest.mark.slow)]
 )
 def test_learner_learns_with_every_way_of_computing(phantom, compute):
-    maker = EnvMaker(projection="zy", observation=SliceChannelsObservation(shape=(36, 36)))
+    maker = EnvFactory(projection="zy", observation=SliceChannelsObservation(shape=(36, 36)))
     learner = SAC(network=SMALL_MULTIMODAL, **SMALL_SAC).agent(setup_for(maker, phantom, compute=compute))
     learner.warm_up()
     metrics = learner.learn(40)

@@ -11,8 +11,7 @@ from armscan.agents import Learner, OptunaSearch, Random
 from armscan.agents.optuna_search import SAMPLERS
 from armscan.envs.actions import ActionBounds
 from armscan.errors import InvalidValueError
-
-from .conftest import MAKERS, setup_for
+from tests.agents.conftest import MAKERS, setup_for
 
 BOUNDS = ActionBounds((90.0, 45.0), (97.2, 216.0))
 NAMES = ("rz", "rx", "tx", "ty")
@@ -46,7 +45,9 @@ def test_search_repeats_an_episode_and_stays_within_bounds(phantom, sampler, n_f
     np.testing.assert_array_equal(played(agent, 14, seed=3_000_000)[0], planes)
 
 
-@pytest.mark.parametrize(("sampler", "n_episodes"), [("tpe", 20), ("cmaes", 20), ("gp", 2)])
+@pytest.mark.parametrize(
+    ("sampler", "n_episodes"), [("tpe", 20), ("cmaes", 20), pytest.param("gp", 2, marks=pytest.mark.full)]
+)
 @pytest.mark.parametrize("n_free", [1, 2])
 def test_search_beats_random_planes_where_the_reward_is_smooth(phantom, sampler, n_episodes, n_free):
     # The later planes show whether the search has learned from the first ones, with one component as with two.
@@ -66,7 +67,7 @@ def test_search_is_told_every_reward_but_the_starts(phantom):
 def test_search_begins_with_as_many_random_planes_as_wanted(phantom):
     # TPE and the Gaussian process draw their first planes alike, until the model takes over.
     few, many = (
-        played(agent_of(OptunaSearch(startup_planes=n), phantom, 1), 10, seed=1)[0].ravel().tolist() for n in (2, 10)
+        played(agent_of(OptunaSearch(n_startup_trials=n), phantom, 1), 10, seed=1)[0].ravel().tolist() for n in (2, 10)
     )
     assert few[:2] == many[:2]
     assert few[2] != many[2]
@@ -90,7 +91,7 @@ def test_optuna_is_loaded_only_where_it_searches():
     [
         ({"sampler": "grid"}, r"agent\.sampler is 'grid', but it must be tpe, cmaes or gp"),
         ({"sampler": None}, r"agent\.sampler is None"),
-        ({"startup_planes": 0}, r"agent\.startup_planes is 0, but it must be a whole number of at least 1"),
+        ({"n_startup_trials": 0}, r"agent\.n_startup_trials is 0, but it must be a whole number of at least 1"),
     ],
 )
 def test_search_refuses_what_there_is_not(arguments, message):

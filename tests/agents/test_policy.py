@@ -7,12 +7,11 @@ import torch
 from torch import nn
 
 from armscan.agents import Compute
-from armscan.agents.export import NEXT_ACTION, OBSERVATION, exported, save_onnx
 from armscan.agents.policy import Policy, batch_of
+from armscan.agents.torch_export import NEXT_ACTION, OBSERVATION, export_program, save_onnx
 from armscan.envs.history import FLAT, parts_of
 from armscan.errors import ExportError
-
-from .conftest import MAKERS, setup_for
+from tests.agents.conftest import MAKERS, setup_for
 
 N_OBSERVED = 7
 
@@ -48,7 +47,7 @@ def test_policy_answers_as_the_learner_acts_and_stays_as_it_is(make_learner, env
 def test_policy_is_written_as_onnx_for_batches_of_every_size(make_learner, env, tmp_path):
     policy, observations = taught(make_learner()).policy(), observed(env)
     batch = batch_of(observations)
-    save_onnx(exported(policy, batch_of(observations[:2])), batch, tmp_path / "policy.onnx")
+    save_onnx(export_program(policy, batch_of(observations[:2])), batch, tmp_path / "policy.onnx")
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
     names = {OBSERVATION if name == FLAT else name for name in parts_of(observations[0])}
     assert {each.name for each in session.get_inputs()} == names
@@ -60,8 +59,8 @@ def test_policy_is_written_as_onnx_for_batches_of_every_size(make_learner, env, 
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "ppo"], indirect=True)
-def test_policy_of_a_learner_that_is_judged_by_sampling_is_its_most_likely_action(make_learner, env):
-    learner = taught(make_learner(judged_by_sampling=True))
+def test_policy_of_a_learner_with_stochastic_evaluation_is_its_most_likely_action(make_learner, env):
+    learner = taught(make_learner(deterministic_eval=False))
     other = make_learner()
     other.load_weights(learner.weights())
     (observation,) = observed(env, 1)
@@ -91,13 +90,13 @@ def test_policy_of_a_compiled_network_is_a_plain_one(phantom):
 
     maker, network = MAKERS["vector"]
     setup = setup_for(maker, phantom, compute=Compute("cpu", compile=True))
-    learner = SAC(network=network, num_envs=2, random_env_steps=20, batch_size=16).agent(setup)
+    learner = SAC(network=network, num_envs=2, learning_starts=20, batch_size=16).agent(setup)
     observations = observed(maker.one([phantom]))
     acted = [learner.act(each, 0.0) for each in observations]
     policy = learner.policy()
     assert policy.actor._compiled_call_impl is None
     np.testing.assert_allclose(policy(batch_of(observations)).numpy(), acted, rtol=0, atol=1e-6)
-    exported(policy, batch_of(observations))
+    export_program(policy, batch_of(observations))
 
 
 class Fussy(nn.Module):
@@ -115,6 +114,6 @@ class Fussy(nn.Module):
 def test_network_that_cannot_be_written_down_is_named_in_one_line():
     policy = Policy(Fussy(), torch.tanh, Compute("cpu"))
     with pytest.raises(ExportError, match=r"^torch\.export cannot take the agent's network: ") as raised:
-        exported(policy, torch.zeros(2, 15))
+        export_program(policy, torch.zeros(2, 15))
     assert "\n" not in str(raised.value)
     assert len(str(raised.value)) < 400

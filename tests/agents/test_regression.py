@@ -7,14 +7,13 @@ import pytest
 import torch
 
 from armscan.agents import MLP, Regression
-from armscan.agents.examples import Examples
-from armscan.envs import ArmscanVectorEnv, EnvMaker
+from armscan.agents.supervised_buffer import SupervisedBuffer
+from armscan.envs import ArmscanVectorEnv, EnvFactory
 from armscan.envs.spaces import MultiBoxSpace
 from armscan.errors import DivergedError, InvalidValueError
 from armscan.training import evaluate
 from armscan.volumes import load_phantoms
-
-from .conftest import MAKERS, SMALL_REGRESSION, setup_for
+from tests.agents.conftest import MAKERS, SMALL_REGRESSION, setup_for
 
 
 def test_optimal_actions_are_those_of_each_environments_episode(phantom):
@@ -62,14 +61,14 @@ def test_regression_keeps_what_it_sees_with_the_optimum_of_that_episode(phantom)
 
 def test_examples_make_way_for_new_ones_and_come_back_from_their_state(phantom):
     space = MultiBoxSpace({"a": MAKERS["vector"][0].one([phantom]).action_space})
-    examples = Examples(5, space, 1)
+    examples = SupervisedBuffer(5, space, 1)
     for i in range(4):
         examples.add({"a": np.full((2, 2), i, np.float32)}, np.full((2, 1), float(i)))
     assert len(examples) == 5
     observations, optima = examples.draw(300, np.random.default_rng(0))
     assert sorted(set(optima.ravel())) == [1, 2, 3]
     np.testing.assert_array_equal(observations["a"][:, :1], optima)
-    other = Examples(5, space, 1)
+    other = SupervisedBuffer(5, space, 1)
     other.load_state(examples.state())
     for each in (examples, other):
         each.add({"a": np.full((1, 2), 9, np.float32)}, np.full((1, 1), 9.0))
@@ -78,9 +77,10 @@ def test_examples_make_way_for_new_ones_and_come_back_from_their_state(phantom):
     assert 9 in drawn[0]
 
 
+@pytest.mark.full
 def test_regression_learns_where_the_plane_lies_on_two_phantoms():
     volumes = list(load_phantoms(range(2)).values())
-    maker = EnvMaker(projection="zy", rotation_bounds_deg=(90.0, 45.0))
+    maker = EnvFactory(projection="zy", rotation_bounds_deg=(90.0, 45.0))
     env = maker.one(volumes)
     setup = setup_for(
         maker,
@@ -137,9 +137,7 @@ def test_regression_says_that_it_has_diverged(phantom):
 
 def test_regression_without_an_update_in_an_epoch_reports_no_loss(phantom):
     maker, network = MAKERS["vector"]
-    learner = Regression(network=network, num_envs=2, batch_size=16, updates_per_env_step=0.01).agent(
-        setup_for(maker, phantom)
-    )
+    learner = Regression(network=network, num_envs=2, batch_size=16, utd_ratio=0.01).agent(setup_for(maker, phantom))
     metrics = learner.learn(10)
     assert "update/loss" not in metrics
     assert metrics["speed/updates_per_s"] == 0
@@ -151,7 +149,7 @@ def test_regression_without_an_update_in_an_epoch_reports_no_loss(phantom):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"updates_per_env_step": 0}, r"agent\.updates_per_env_step is 0"),
+        ({"utd_ratio": 0}, r"agent\.utd_ratio is 0"),
         ({"buffer_size": 0}, r"agent\.buffer_size is 0"),
         ({"buffer_size": 3, "num_envs": 4}, r"agent\.num_envs is 4, but it must be at most agent\.buffer_size = 3"),
     ],

@@ -5,24 +5,23 @@ import pytest
 from tianshou.data import Batch
 from tianshou.env import BaseVectorEnv
 
-from armscan.agents.tianshou_envs import SideBySide
-from armscan.envs import ArmscanEnv, EnvMaker
-
-from .conftest import setup_for
+from armscan.agents.tianshou_envs import TianshouVectorEnv
+from armscan.envs import ArmscanEnv, EnvFactory
+from tests.agents.conftest import setup_for
 
 
 @pytest.fixture
 def make(phantom):
     def make(**rules):
-        maker = EnvMaker(projection="zy", max_steps=4, **rules)
-        envs = SideBySide(maker.many(3, [phantom], autoreset_mode="Disabled"))
+        maker = EnvFactory(projection="zy", max_steps=4, **rules)
+        envs = TianshouVectorEnv(maker.many(3, [phantom], autoreset_mode="Disabled"))
         envs.seed([7, 8, 9])
         return envs
 
     return make
 
 
-def test_side_by_side_steps_as_single_environments_do(make, phantom):
+def test_tianshou_vector_env_steps_as_single_environments_do(make, phantom):
     envs = make()
     assert isinstance(envs, BaseVectorEnv)
     assert len(envs) == 3
@@ -37,7 +36,7 @@ def test_side_by_side_steps_as_single_environments_do(make, phantom):
     assert [each["env_id"] for each in info] == [0, 1, 2]
 
 
-def test_side_by_side_resets_only_those_it_is_asked_for(make):
+def test_tianshou_vector_env_resets_only_those_it_is_asked_for(make):
     envs = make()
     envs.reset()
     before, *_ = envs.step(np.zeros((3, 2)))
@@ -48,8 +47,8 @@ def test_side_by_side_resets_only_those_it_is_asked_for(make):
     np.testing.assert_array_equal(observed[0, -3:-1], [0, 0])
 
 
-def test_side_by_side_counts_episodes_and_those_that_succeed(make, phantom):
-    envs = make(delta=0.6)
+def test_tianshou_vector_env_counts_episodes_and_those_that_succeed(make, phantom):
+    envs = make(success_threshold=0.6)
     envs.reset()
     rng, n_ended, n_successes = np.random.default_rng(0), 0, 0
     for _ in range(12):
@@ -63,7 +62,7 @@ def test_side_by_side_counts_episodes_and_those_that_succeed(make, phantom):
     assert 0 < envs.n_successes < envs.n_ended
 
 
-def test_side_by_side_gives_images_as_batches(make):
+def test_tianshou_vector_env_gives_images_as_batches(make):
     envs = make(observation="slice", stack=2)
     envs.reset()
     observed, _ = envs.reset([0, 1])
@@ -76,8 +75,8 @@ def test_collector_steps_the_vector_environment(make, phantom, monkeypatch):
     from armscan.agents import MLP, SAC
     from armscan.anatomy import Scanner
 
-    maker = EnvMaker(projection="zy", max_steps=4)
-    algorithm = SAC(network=MLP((8,)), num_envs=4, random_env_steps=20, batch_size=8)
+    maker = EnvFactory(projection="zy", max_steps=4)
+    algorithm = SAC(network=MLP((8,)), num_envs=4, learning_starts=20, batch_size=8)
     learner = algorithm.agent(setup_for(maker, phantom))
     looked_at = []
     look_all = Scanner.look_all

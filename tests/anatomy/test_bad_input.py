@@ -15,12 +15,11 @@ from armscan.anatomy import (
     PixelTissue,
     TissueClusters,
     Tissues,
-    checked_tissues,
+    check_tissues,
     landmark_reward,
 )
 from armscan.errors import InvalidValueError
-
-from ..junk import SETTINGS, junk, refuses
+from tests.support.junk import SETTINGS, junk, refuses
 
 SLICE = np.ones((9, 7), np.uint8)
 
@@ -62,8 +61,8 @@ def test_clusters_of_junk(slice_xz):
 def test_clusters_by_junk(tissue):
     refuses(lambda: TissueClusters.from_slice(SLICE, tendons=tissue))
     refuses(lambda: Clusters.of_tissue(SLICE, tissue))
-    refuses(lambda: checked_tissues(tissue))
-    refuses(lambda: checked_tissues(Tissues(BONES, tissue, BONES)))
+    refuses(lambda: check_tissues(tissue))
+    refuses(lambda: check_tissues(Tissues(BONES, tissue, BONES)))
 
 
 @pytest.mark.parametrize("shape", [(0, 5), (5, 0), (0, 0), (1, 1)])

@@ -8,7 +8,7 @@ from armscan.anatomy import (
     MetricTissue,
     PixelTissue,
     TissueClusters,
-    checked_tissues,
+    check_tissues,
     landmark_reward,
 )
 from armscan.errors import InvalidValueError
@@ -46,9 +46,9 @@ def test_metric_clusters_score_labelled_planes_at_every_spacing(dataset):
             assert landmark_reward(clusters) > -0.05, (volume.name, pixel_mm, clusters.counts)
 
 
-def test_checked_tissues_takes_names_and_tissues():
-    assert checked_tissues("pixels") is PIXEL_TISSUES
-    assert checked_tissues(METRIC_TISSUES) is METRIC_TISSUES
+def test_check_tissues_takes_names_and_tissues():
+    assert check_tissues("pixels") is PIXEL_TISSUES
+    assert check_tissues(METRIC_TISSUES) is METRIC_TISSUES
     for wrong in ("mm", 3, None, [1, 2, 3]):
         with pytest.raises(InvalidValueError, match="clustering is"):
-            checked_tissues(wrong)
+            check_tissues(wrong)

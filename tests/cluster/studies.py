@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,31 +17,36 @@ from mlflow import MlflowClient
 from mlflow.entities import Run
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.passwords import STORAGE_PASSWORD, without_password
-from armscan.sweeps.storage import open_storage
-from armscan.sweeps.tally import LEASE, RETRY_OF
-from tests.postgres import PASSWORD
+from armscan.config.credentials import STORAGE_PASSWORD
+from armscan.sweeps.scheduling.state import LEASE, RETRY_OF
+from armscan.sweeps.storage.storage import open_storage
+from tests.support.postgres import PASSWORD
+from tests.support.waiting import HANG_S, wait_until
 
 REPOSITORY = Path(__file__).parents[2]
 FEW_VOLUMES = ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
 # Trials that only wait, each one to five seconds.
 WAITING = [
-    *("sweeps=sac_y", "study.task._target_=benchmarks.sleeping.Sleeping", "study/pruner=none", "study.max_retries=3"),
+    *(
+        "sweep=sac_y",
+        "study.task._target_=benchmarks.sweeps.sleeping.Sleeping",
+        "study/pruner=none",
+        "study.max_retries=3",
+    ),
     *("+study.space={training.env_steps:{low:100,high:200},agent.lr:{low:1.0e-4,high:1.0e-2}}", *FEW_VOLUMES),
 ]
 # Trials that train, in epochs of a second or less.
 TRAINING = [
-    *("sweeps=sac_y", "study/pruner=none", "study.max_retries=3", "training.epoch_env_steps=200", *FEW_VOLUMES),
+    *("sweep=sac_y", "study/pruner=none", "study.max_retries=3", "training.eval_every_env_steps=200", *FEW_VOLUMES),
     *(
         "training.validation_episodes=2",
         "evaluation.episodes=3",
         "env.max_steps=8",
-        "agent.random_env_steps=100",
+        "agent.learning_starts=100",
         "tracking.policy=false",
     ),
     *("agent.batch_size=32", "network.vector.hidden_sizes=[16]"),
 ]
-WAIT_S, END_S = 120.0, 180.0
 
 
 class StartedStudy:
@@ -51,7 +55,7 @@ class StartedStudy:
     Args:
         folder: empty, that it is started in.
         words: of its command line, without where it is kept.
-        storage: address of an empty database, with its password.
+        storage: address of an empty database.
         tracking: address of the tracking server.
         environment: what the command has beside that of this process.
     """
@@ -62,7 +66,7 @@ class StartedStudy:
         self.folder, self._storage = folder, open_storage(storage).optuna
         self._client, self._experiment = MlflowClient(tracking), folder.name
         own = {"PYTHONPATH": str(REPOSITORY), "MLFLOW_TRACKING_URI": tracking, STORAGE_PASSWORD: PASSWORD}
-        kept = [f"study.storage={without_password(storage)}", f"tracking.experiment={self._experiment}"]
+        kept = [f"study.storage={storage}", f"tracking.experiment={self._experiment}"]
         self.printed = folder / "printed"
         with self.printed.open("ab") as printed:
             self.process = subprocess.Popen(
@@ -105,16 +109,12 @@ class StartedStudy:
 
     def wait(self, is_there: Callable[[], bool]) -> None:
         """Waits for a moment while it is at work."""
-        until_s = time.monotonic() + WAIT_S
-        while not is_there():
-            assert self.process.poll() is None, self.told()
-            assert time.monotonic() < until_s, self.told()
-            time.sleep(0.1)
+        wait_until(is_there, process=self.process, log=self.told, poll_s=0.1)
 
     def end(self) -> int:
         """Waits for its end; returns the exit code."""
         try:
-            return self.process.wait(END_S)
+            return self.process.wait(HANG_S)
         except subprocess.TimeoutExpired:
             raise AssertionError(self.told()) from None
 

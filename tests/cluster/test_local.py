@@ -4,7 +4,7 @@ from tests.cluster.studies import WAITING
 
 
 def test_study_outlives_a_killed_worker_and_judges_its_best(start):
-    study = start(*WAITING, "study.workers=2", "study.n_trials=4", "study.judging.best=1", environment={})
+    study = start(*WAITING, "study.workers=2", "study.n_trials=4", "study.final_eval.top_k=1", environment={})
     study.kill_worker(1)
     assert study.end() == 0, study.told()
     study.check_complete(4)

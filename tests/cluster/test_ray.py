@@ -2,18 +2,19 @@
 
 import pytest
 
-from armscan.passwords import STORAGE_PASSWORD
+from armscan.config.credentials import STORAGE_PASSWORD
 from tests.cluster.studies import REPOSITORY, TRAINING, WAITING
-from tests.mlflow_server import mlflow_server
-from tests.postgres import PASSWORD, postgres_server
-from tests.ray_cluster import ray_cluster, why_not_here
+from tests.support.mlflow_server import mlflow_server
+from tests.support.postgres import PASSWORD, postgres_server
+from tests.support.ray_cluster import ray_cluster, why_not_here
+from tests.support.requirements import unavailable
 
 
 @pytest.fixture(scope="module")
 def cluster():
     """It is entered, too: all that follows is on its first machine."""
     if (reason := why_not_here()) is not None:
-        pytest.skip(reason)
+        unavailable(reason)
     with (
         ray_cluster({"PYTHONPATH": str(REPOSITORY), STORAGE_PASSWORD: PASSWORD}) as started,
         started.head.entered(),
@@ -34,7 +35,7 @@ def tracking_server(cluster, postgres, tmp_path_factory):
 
 
 def test_study_that_is_told_to_end_hands_its_trials_back(cluster, start):
-    words = ["study.workers=2", "study.n_trials=50", "study.judging.best=0"]
+    words = ["study.workers=2", "study.n_trials=50", "study.final_eval.top_k=0"]
     study = start(*WAITING, "hydra/launcher=ray", *words, environment=cluster.environment)
     study.holder(0)
     study.holder(1)
@@ -42,14 +43,14 @@ def test_study_that_is_told_to_end_hands_its_trials_back(cluster, start):
     study.process.terminate()
     assert study.end() == 130, study.told()
     printed = study.printed.read_text()
-    assert printed.endswith("interrupted; the same command goes on with the study\n")
+    assert printed.endswith("interrupted; the same command resumes the study\n")
     assert "SIGTERM" not in printed
     assert {trial.state.name for trial in study.trials()} <= {"COMPLETE", "WAITING"}
     assert {run.info.status for run in study.runs()} <= {"FINISHED", "KILLED"}
 
 
 def test_study_outlives_a_killed_worker_and_a_machine_that_is_gone(cluster, start):
-    words = ["study.workers=2", "study.n_trials=3", "study.judging.best=0", "training.env_steps=2000"]
+    words = ["study.workers=2", "study.n_trials=3", "study.final_eval.top_k=0", "training.env_steps=2000"]
     study = start(*TRAINING, "hydra/launcher=ray", *words, environment=cluster.environment)
     numbers = {study.holder(number)["host"]: number for number in (0, 1)}
     assert numbers.keys() == {cluster.head.name, cluster.other.name}

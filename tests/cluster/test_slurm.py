@@ -6,7 +6,8 @@ import signal
 import pytest
 
 from tests.cluster.studies import TRAINING, WAITING, parent_of
-from tests.slurm import missing_program, slurm
+from tests.support.requirements import unavailable
+from tests.support.slurm import missing_program, slurm
 
 SLURM = ["hydra/launcher=submitit_slurm", "hydra.launcher.mem_gb=null", "study.workers=2"]
 
@@ -20,7 +21,7 @@ scontrol show job --oneliner | sed -nE \
 @pytest.fixture(scope="module")
 def cluster():
     if (missing := missing_program()) is not None:
-        pytest.skip(f"Slurm's {missing} is not installed: apt-get install slurmctld slurmd slurm-client munge")
+        unavailable(f"Slurm's {missing} is not installed: apt-get install slurmctld slurmd slurm-client munge")
     with slurm() as started:
         yield started
 
@@ -32,7 +33,7 @@ def job_of(cluster, number):
 
 
 def test_study_outlives_a_killed_worker_and_a_killed_job_that_slurm_says_nothing_of(cluster, start):
-    study = start(*WAITING, *SLURM, "study.n_trials=4", "study.judging.best=0", environment=cluster.environment)
+    study = start(*WAITING, *SLURM, "study.n_trials=4", "study.final_eval.top_k=0", environment=cluster.environment)
     study.kill_worker(0)
     # That of submitit, above the worker: without it, there is no result that the launcher could wait for.
     above = parent_of(study.holder(1)["pid"])
@@ -43,7 +44,7 @@ def test_study_outlives_a_killed_worker_and_a_killed_job_that_slurm_says_nothing
     (lost,) = [trial.user_attrs["failure"] for trial in study.trials() if trial.state.name == "FAIL"]
     assert "its worker died" in lost
     # The other worker was still there to see that it was alone.
-    assert "is handed back" in (study.workers_folder / "worker-1.log").read_text()
+    assert "is requeued" in (study.workers_folder / "worker-1.log").read_text()
 
 
 @pytest.mark.slow
@@ -54,7 +55,7 @@ def test_study_goes_on_when_the_launcher_gives_up_for_one_job_that_was_killed(cl
     accounting.write_text(ACCOUNTING)
     accounting.chmod(0o755)
     environment = cluster.environment | {"PATH": f"{programs}:{os.environ['PATH']}"}
-    study = start(*WAITING, *SLURM, "study.n_trials=20", "study.judging.best=0", environment=environment)
+    study = start(*WAITING, *SLURM, "study.n_trials=20", "study.final_eval.top_k=0", environment=environment)
     os.kill(parent_of(study.holder(0)["pid"]), signal.SIGKILL)
     assert study.end() == 0, study.told()
     study.check_complete(20)
@@ -64,7 +65,7 @@ def test_study_goes_on_when_the_launcher_gives_up_for_one_job_that_was_killed(cl
 
 
 def test_jobs_that_are_to_end_hand_their_trials_back_and_go_on_with_them_when_they_are_queued_again(cluster, start):
-    words = ["study.n_trials=2", "study.judging.best=0", "training.env_steps=4000"]
+    words = ["study.n_trials=2", "study.final_eval.top_k=0", "training.env_steps=4000"]
     study = start(*TRAINING, *SLURM, *words, environment=cluster.environment)
     study.holder(0)
     study.holder(1)
@@ -76,21 +77,21 @@ def test_jobs_that_are_to_end_hand_their_trials_back_and_go_on_with_them_when_th
     assert len(study.trials()) == 2
     for number in (0, 1):
         log = (study.workers_folder / f"worker-{number}.log").read_text()
-        assert "is handed back" in log
-        assert "is gone on with" in log
+        assert "is requeued" in log
+        assert "is resumed" in log
 
 
 def test_a_cancelled_job_ends_its_worker_alone_and_an_interrupt_ends_all(cluster, start):
-    words = ["study.n_trials=50", "study.judging.best=0"]
+    words = ["study.n_trials=50", "study.final_eval.top_k=0"]
     study = start(*WAITING, *SLURM, *words, environment=cluster.environment)
     study.holder(0)
     cluster.told("scancel", job_of(cluster, 0))
-    study.wait(lambda: "is handed back" in (study.workers_folder / "worker-0.log").read_text())
+    study.wait(lambda: "is requeued" in (study.workers_folder / "worker-0.log").read_text())
     study.wait(lambda: len(cluster.jobs()) == 1)
     study.holder(1)
     os.kill(study.process.pid, signal.SIGINT)
     assert study.end() == 130, study.told()
-    assert study.printed.read_text().endswith("interrupted; the same command goes on with the study\n")
+    assert study.printed.read_text().endswith("interrupted; the same command resumes the study\n")
     assert {trial.state.name for trial in study.trials()} <= {"COMPLETE", "WAITING"}
     assert {run.info.status for run in study.runs()} <= {"FINISHED", "KILLED"}
 

@@ -11,14 +11,14 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from tests.docker.files import REPOSITORY, read_compose, read_image
+from tests.support.waiting import wait_until
 
-START_S, STOP_S, SECRETS = 120.0, 20.0, "/run/secrets"
+STOP_S, SECRETS = 20.0, "/run/secrets"
 # What the commands call beside Python's own programs; git, for one, is not in the image.
 IN_THE_IMAGE = ("sh", "cat")
 
@@ -99,12 +99,12 @@ class Containers:
 
     def wait_until_healthy(self, name: str) -> None:
         """Waits until the health check of a service says that it is there."""
-        until_s = time.monotonic() + START_S
-        while not self.is_healthy(name):
-            process = self._processes.get(name)
-            assert process is None or process.poll() is None, self.log(name)
-            assert time.monotonic() < until_s, self.log(name)
-            time.sleep(0.5)
+        wait_until(
+            lambda: self.is_healthy(name),
+            process=self._processes.get(name),
+            log=lambda: self.log(name),
+            poll_s=0.5,
+        )
 
     def stop(self, name: str) -> int:
         """Stops a service as an engine does, which waits for as long as the file says; returns its exit code."""

@@ -51,7 +51,7 @@ def _interpolated(value: Any, given: Mapping[str, str]) -> Any:
 
 @dataclass
 class Image:
-    """What the last stage of the Dockerfile makes.
+    """What the last setup of the Dockerfile makes.
 
     Args:
         environment: variables.

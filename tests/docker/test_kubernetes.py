@@ -1,5 +1,6 @@
 """The manifest for workers in Kubernetes: by the schemas of its API, and by what is expected of ours."""
 
+import kubernetes_validate
 import pytest
 import yaml
 
@@ -26,7 +27,6 @@ def pod(job):
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_manifest_is_by_the_schemas(objects, version):
-    kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate")
     assert list(objects) == ["ConfigMap", "PersistentVolumeClaim", "Job"]
     for each in objects.values():
         assert kubernetes_validate.validate(each, version, strict=True) == version

@@ -5,7 +5,6 @@ import os
 import shlex
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
 from contextlib import suppress
@@ -15,15 +14,17 @@ import psycopg
 import pytest
 from mlflow import MlflowClient
 
-from armscan.sweeps.supervising import LEFT
+from armscan.sweeps.workers.supervisor import LEFT
 from tests.docker.containers import Containers
 from tests.docker.files import FOLDER
-from tests.postgres import PASSWORD, postgres_server
+from tests.support.postgres import PASSWORD, postgres_server
+from tests.support.waiting import HANG_S, wait_until
 
 # Trials that only wait, between one and five seconds, and of which only one key is searched.
 TRIALS = (
-    "study.task._target_=benchmarks.sleeping.Sleeping study/pruner=none study.n_trials=2 study.judging.best=0 "
-    "agent.gamma=0.5 agent.updates_per_env_step=0.1 agent.batch_size=64 'study.space.agent.lr={low: 0.001, high: 0.01}'"
+    "study.task._target_=benchmarks.sweeps.sleeping.Sleeping study/pruner=none "
+    "study.n_trials=2 study.final_eval.top_k=0 "
+    "agent.gamma=0.5 agent.utd_ratio=0.1 agent.batch_size=64 'study.space.agent.lr={low: 0.001, high: 0.01}'"
 )
 # A worker's database connections, beside which others have a place: see POSTGRES_CONNECTIONS.
 MOST_CONNECTIONS = 6
@@ -51,7 +52,7 @@ def containers(postgres_programs, postgres_there, tmp_path):
 def asked(url, **headers):
     """Returns the status and the body of an answer."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as answer:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=HANG_S) as answer:
             return answer.status, answer.read()
     except urllib.error.HTTPError as error:
         return error.code, error.read()
@@ -84,13 +85,6 @@ def n_connections(server):
     return n_all - 1
 
 
-def wait_for(come_true, within_s=60.0):
-    until_s = time.monotonic() + within_s
-    while not come_true():
-        assert time.monotonic() < until_s
-        time.sleep(0.1)
-
-
 def test_postgres_understands_its_words_and_says_when_it_is_away(containers, postgres_there, postgres_programs):
     words = shlex.split(containers.services["postgres"]["command"])
     (data,) = selected(postgres_there, "SHOW data_directory")
@@ -120,7 +114,7 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     containers.start("worker")
     containers.wait_until_healthy("worker")
     # Until the trial knows its tracked run, with which it is gone on.
-    wait_for(lambda: "mlflow_run" in selected(postgres_there, "SELECT key FROM trial_user_attributes"))
+    wait_until(lambda: "mlflow_run" in selected(postgres_there, "SELECT key FROM trial_user_attributes"))
     assert states(postgres_there) == ["RUNNING"]
     assert n_connections(postgres_there) - n_before <= MOST_CONNECTIONS
     words = command_lines(f"ARMSCAN_STORAGE_PASSWORD_FILE={containers.secret}")
@@ -130,7 +124,7 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     assert states(postgres_there) == ["WAITING"]
     assert not containers.is_healthy("worker")
 
-    assert containers.start("worker").wait(300) == 0, containers.log("worker")
+    assert containers.start("worker").wait(HANG_S) == 0, containers.log("worker")
     assert states(postgres_there) == ["COMPLETE"] * 2
     shown = json.loads(asked(f"{dashboard}/api/studies")[1])
     assert [study["study_name"] for study in shown["study_summaries"]] == ["sac_y"]

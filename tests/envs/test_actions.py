@@ -21,17 +21,17 @@ BOUNDS = ActionBounds((90.0, 45.0), (100.0, 200.0))
     ],
 )
 def test_bounds_turn_normalised_vectors_into_planes(normalised, action):
-    assert BOUNDS.denormalised(np.array(normalised, float)) == action
+    assert BOUNDS.denormalise(np.array(normalised, float)) == action
 
 
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4))
 def test_normalised_is_the_inverse_of_denormalised(normalised):
-    np.testing.assert_allclose(BOUNDS.normalised(BOUNDS.denormalised(np.array(normalised))), normalised, atol=1e-12)
+    np.testing.assert_allclose(BOUNDS.normalised(BOUNDS.denormalise(np.array(normalised))), normalised, atol=1e-12)
 
 
 def test_zero_bounds_fix_their_components_at_zero():
     bounds = ActionBounds((0.0, 10.0), (0.0, 50.0))
-    action = bounds.denormalised(np.ones(4))
+    action = bounds.denormalise(np.ones(4))
     assert action == ManipulatorAction((0, 10), (0, 50))
     np.testing.assert_array_equal(bounds.normalised(action), [0, 1, -1, 1])
 

@@ -14,7 +14,7 @@ from armscan.envs import (
     ArmscanVectorEnv,
     BestActionMemory,
     ClusterObservation,
-    EnvMaker,
+    EnvFactory,
     FrameStack,
     ManipulatorAction,
     MergedObservation,
@@ -30,8 +30,7 @@ from armscan.envs import (
 from armscan.envs.actions import free_components
 from armscan.errors import ArmscanError, InvalidValueError, OptimalPlaneError
 from armscan.volumes import LabelVolume, RigidTransform
-
-from ..junk import SETTINGS, junk, refuses
+from tests.support.junk import SETTINGS, junk, refuses
 
 RULES = [
     "volumes",
@@ -41,7 +40,7 @@ RULES = [
     "reward",
     "targets",
     "clustering",
-    "delta",
+    "success_threshold",
     "max_steps",
     "start",
     "rotation_bounds_deg",
@@ -75,14 +74,16 @@ def test_env_with_junk(wrist, rule, value):
 @given(value=junk)
 def test_made_env_with_junk(wrist, others, rule, value):
     arguments = others | {rule: value}
-    maker = EnvMaker(**arguments)
+    maker = EnvFactory(**arguments)
     try_out(refuses(lambda: make_armscan_env([wrist], **arguments)))
     try_out(refuses(lambda: maker.one([wrist])))
     try_out(refuses(lambda: make_armscan_vector_env(2, [wrist], **arguments)))
     try_out(refuses(lambda: maker.many(2, [wrist])))
 
 
-@pytest.mark.parametrize("argument", ["num_envs", "volumes", "autoreset_mode", "render_mode", "projection", "delta"])
+@pytest.mark.parametrize(
+    "argument", ["num_envs", "volumes", "autoreset_mode", "render_mode", "projection", "success_threshold"]
+)
 @SETTINGS
 @given(value=junk)
 def test_vector_env_with_junk(wrist, argument, value):

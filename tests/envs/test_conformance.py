@@ -1,6 +1,7 @@
 """The environment as strangers use it: Gymnasium's checker, its registry and wrappers, another training library."""
 
 import gc
+import itertools
 import pickle
 import warnings
 
@@ -74,11 +75,15 @@ class Presented(gym.Env):
         self.env.close()
 
 
-@pytest.fixture(autouse=True)
-def no_warnings():
-    """Every warning is an error, Gymnasium's own, which go through `warnings`, included."""
-    # What other tests have left open is told when it is collected, and would be told in the middle of these.
+@pytest.fixture(scope="module")
+def nothing_left_open():
+    """Collects what tests of other modules have left open, whose warnings would be raised in the middle of these."""
     gc.collect()
+
+
+@pytest.fixture(autouse=True)
+def no_warnings(nothing_left_open):
+    """Turns every warning into an error, Gymnasium's own included."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
@@ -96,15 +101,27 @@ def play(env, n_steps=4):
     return shown
 
 
-@pytest.mark.parametrize("memory", MEMORIES)
-@pytest.mark.parametrize(
-    ("form", "stack"), [(form, stack) for form in FORMS for stack in STACKS if (form, stack) != ("dict_part", "one")]
-)
-@pytest.mark.parametrize("projection", PROJECTIONS, ids=str)
-@pytest.mark.parametrize("observation", OBSERVATIONS)
+# An excluded part of a stack requires a stack.
+LAYOUTS = [(form, stack) for form in FORMS for stack in STACKS if (form, stack) != ("dict_part", "one")]
+CHOICES = (list(OBSERVATIONS), PROJECTIONS, LAYOUTS, list(MEMORIES))
+# A covering array: of any two choices, every pair of values is in one of its 72 rows.
+COVERING = [
+    (observation, projection, LAYOUTS[(i + j) % len(LAYOUTS)], CHOICES[3][(i + 2 * j) % len(MEMORIES)])
+    for (i, observation), (j, projection) in itertools.product(enumerate(OBSERVATIONS), enumerate(PROJECTIONS))
+]
+
+
+@pytest.mark.parametrize(("first", "second"), list(itertools.combinations(range(len(CHOICES)), 2)))
+def test_every_pair_of_choices_is_covered(first, second):
+    pairs = [(row[first], row[second]) for row in COVERING]
+    assert all(pair in pairs for pair in itertools.product(CHOICES[first], CHOICES[second]))
+
+
+@pytest.mark.parametrize(("observation", "projection", "layout", "memory"), COVERING, ids=str)
 @pytest.mark.parametrize("env_id", ENV_IDS)
-def test_env_conforms(wrist, env_id, observation, projection, form, stack, memory):
+def test_env_conforms(wrist, env_id, observation, projection, layout, memory):
     """The checker has nothing to say; pickled, or made again from its spec, it plays the same episodes."""
+    form, stack = layout
     rules = {"observation": OBSERVATIONS[observation], "projection": projection, "max_steps": 3}
     env = gym.make(env_id, volumes=[wrist], **rules, **FORMS[form], **STACKS[stack], **MEMORIES[memory])
     assert isinstance(env.observation_space, gym.spaces.Box if form == "flat" else gym.spaces.Dict)

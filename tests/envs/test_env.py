@@ -172,8 +172,8 @@ def test_reset_takes_the_volume_as_an_option(dataset):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"delta": 0}, "delta is 0"),
-        ({"delta": "a"}, "delta is 'a'"),
+        ({"success_threshold": 0}, "success_threshold is 0"),
+        ({"success_threshold": "a"}, "success_threshold is 'a'"),
         ({"max_steps": 0}, "max_steps is 0"),
         ({"max_steps": 2.5}, "max_steps is 2.5"),
         ({"start": "end"}, "start is 'end', but it must be middle or random"),
@@ -289,17 +289,17 @@ def test_env_takes_rewards_as_objects(wrist, given, expected):
 
 def test_env_fits_a_reward_to_its_volumes_and_leaves_the_one_given_as_it_is(wrist):
     given = AgreementReward()
-    fitted = ArmscanEnv([wrist], reward=given).task.reward
+    fitted = ArmscanEnv([wrist], reward=given).rules.reward
     assert isinstance(fitted, AgreementReward)
     with pytest.raises(InvalidValueError, match="fitted_to"):
         given.score(np.zeros((3, 4)), wrist.pixel_mm)
-    assert ArmscanEnv([wrist], reward=fitted).task.reward is fitted
+    assert ArmscanEnv([wrist], reward=fitted).rules.reward is fitted
 
 
 def test_env_refuses_volumes_that_do_not_show_the_other_published_targets(wrist):
     with pytest.raises(OptimalPlaneError, match=r"wrist: the labelled optimal plane scores -0\.\d+"):
         ArmscanEnv([wrist], targets=(7, 5, 1))
-    assert ArmscanEnv([wrist], targets=(7, 5, 1), delta=0.2).reset(seed=0)
+    assert ArmscanEnv([wrist], targets=(7, 5, 1), success_threshold=0.2).reset(seed=0)
 
 
 @pytest.mark.parametrize("clustering", ["metric", METRIC_TISSUES], ids=["name", "tissues"])

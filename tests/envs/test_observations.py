@@ -16,8 +16,8 @@ from armscan.envs import (
     SliceObservation,
     View,
 )
-from armscan.envs.observations import with_action_reward
-from armscan.envs.spaces import flat_space, flattened
+from armscan.envs.observation_registry import with_action_reward
+from armscan.envs.spaces import flat_space, flatten
 from armscan.errors import InvalidValueError
 
 GEOMETRY = SliceGeometry((361, 81), (0.27, 0.55))
@@ -76,7 +76,7 @@ def test_cluster_observation_space_holds_the_extremes_of_every_geometry(normalis
 def test_flat_space_has_its_bounds_in_the_order_of_the_data():
     observation = with_action_reward("cluster")
     space = flat_space(observation.spaces([GEOMETRY], 1))
-    flat = flattened(observation.observe(view_of([], [], [])))
+    flat = flatten(observation.observe(view_of([], [], [])))
     np.testing.assert_array_equal(flat[-2:], [0.25, -0.5])
     np.testing.assert_array_equal(space.low[-2:], [-1, -1])
     np.testing.assert_array_equal(space.high[-2:], [1, 0])
@@ -170,7 +170,7 @@ class Careless:
 
 
 def test_own_observation_may_give_its_parts_in_any_order(phantom):
-    for make in (lambda e: e, lambda e: ArmscanVectorEnv(2, [phantom], observation=e.task._observation)):
+    for make in (lambda e: e, lambda e: ArmscanVectorEnv(2, [phantom], observation=e.rules._observation)):
         env = make(ArmscanEnv([phantom], observation=Careless({"b": [150, 160], "a": [0.5]})))
         observed, _ = env.reset(seed=0)
         assert env.observation_space.contains(observed)
@@ -193,7 +193,7 @@ def test_own_observation_that_gives_other_parts_is_refused(phantom, parts, messa
 
 
 def test_cluster_observation_by_name_divides_by_the_rewards_targets(phantom):
-    env = ArmscanEnv([phantom], observation=["cluster"], targets=(7, 5, 1), delta=0.9, projection="full")
+    env = ArmscanEnv([phantom], observation=["cluster"], targets=(7, 5, 1), success_threshold=0.9, projection="full")
     env.reset(seed=0)
     observed, *_, info = env.step(env.scene.optimum_normalised)
     np.testing.assert_allclose(observed[[0, 4, 8]], info["counts"] / (7, 5, 1), rtol=1e-6)

@@ -5,21 +5,20 @@ import pytest
 
 from armscan.anatomy import TissueClusters, landmark_reward
 from armscan.envs import ManipulatorAction, RandomTransform
-from armscan.envs.task import Task
+from armscan.envs.rules import Rules
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.volumes import LabelVolume
+from tests.conftest import make_tiny_volume
 
-from ..conftest import make_tiny_volume
 
-
-def task(volume, **changes):
-    return Task([volume], **({"rotation_bounds_deg": (90.0, 45.0)} | changes))
+def make_rules(volume, **changes):
+    return Rules([volume], **({"rotation_bounds_deg": (90.0, 45.0)} | changes))
 
 
 def draw(volume, rng, n_scenes=1, **changes):
     """Draws scenes of a volume, one after another."""
-    rules = task(volume, **changes)
-    return [rules.draw_scenes([volume.name], [rng])[0] for _ in range(n_scenes)]
+    made = make_rules(volume, **changes)
+    return [made.draw_scenes([volume.name], [rng])[0] for _ in range(n_scenes)]
 
 
 def test_scene_optimum_is_rewarded_and_within_the_bounds(dataset, phantom):
@@ -50,7 +49,7 @@ def test_scene_optimum_stays_within_tight_rotation_bounds(phantom):
         200,
         rotation_bounds_deg=(abs(rz) + 10.0, abs(rx) + 20.0),
         transform=RandomTransform(rz_deg=10.0, rx_deg=20.0, tx_mm=0.0, ty_mm=0.0),
-        delta=1.0,
+        success_threshold=1.0,
     )
     assert max(np.abs(scene.optimum_normalised).max() for scene in tight) <= 1
 
@@ -87,26 +86,26 @@ def test_random_transform_refuses_impossible_limits(bad):
 
 def test_task_refuses_a_volume_without_a_labelled_plane():
     with pytest.raises(OptimalPlaneError, match="tiny: has no labelled optimal plane"):
-        task(make_tiny_volume())
+        make_rules(make_tiny_volume())
 
 
 def test_task_refuses_a_plane_that_does_not_score():
     volume = make_tiny_volume(optimal_action=ManipulatorAction((0, 0), (0, 5)))
     with pytest.raises(OptimalPlaneError, match=r"tiny: the labelled optimal plane scores -0\.\d+"):
-        task(volume)
+        make_rules(volume)
 
 
 def test_task_refuses_bounds_that_do_not_hold_the_turned_plane(phantom):
     rz = phantom.optimal_action.rotation[0]
     with pytest.raises(OptimalPlaneError, match=r"phantom-0: the optimal plane has rz = .* it must be at least"):
-        task(phantom, rotation_bounds_deg=(abs(rz) + 9.0, 45.0))
-    task(phantom, rotation_bounds_deg=(abs(rz) + 10.1, 45.0))
+        make_rules(phantom, rotation_bounds_deg=(abs(rz) + 9.0, 45.0))
+    make_rules(phantom, rotation_bounds_deg=(abs(rz) + 10.1, 45.0))
 
 
 def test_task_refuses_a_plane_outside_the_volume(phantom):
     moved = LabelVolume(phantom.labels, phantom.spacing, "moved", ManipulatorAction((0, 0), (0, 5000)))
     with pytest.raises(OptimalPlaneError, match=r"moved: the optimal plane, .* misses the volume"):
-        task(moved)
+        make_rules(moved)
 
 
 def test_task_gives_up_where_no_transform_keeps_the_plane_in_view(phantom):
@@ -115,7 +114,7 @@ def test_task_gives_up_where_no_transform_keeps_the_plane_in_view(phantom):
             phantom,
             _OutOfView(),
             translation_bounds_mm=(97.0, phantom.optimal_action.translation[1] + 0.01),
-            delta=1e-9,
+            success_threshold=1e-9,
         )
 
 

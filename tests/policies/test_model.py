@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -19,14 +18,17 @@ from mlflow.exceptions import MlflowException
 
 from armscan.agents.policy import batch_of
 from armscan.errors import ExportError
-from armscan.policies.making import FIRST_SEED, keep_policy, make_model, onnx_answers
-from armscan.policies.model import FILES, arrays_of, is_model, others_in, sum_of_model
+from armscan.policies.build import FIRST_SEED, make_model, onnx_answers, save_policy
+from armscan.policies.model import FILES, arrays_of, is_model, model_sha256, others_in
 from armscan.tracking import TrackedRun, open_store
+from tests.agents.conftest import ALGORITHMS, MAKERS, setup_for
+from tests.agents.test_policy import observed, taught
+from tests.support.waiting import HANG_S, wait_until
 
-from ..agents.conftest import ALGORITHMS, MAKERS, setup_for
-from ..agents.test_policy import observed, taught
+# They export six policies and serve them.
+pytestmark = pytest.mark.full
 
-LOOPBACK, START_S = "127.0.0.1", 120.0
+LOOPBACK = "127.0.0.1"
 VARIANTS = [(algorithm, made_of) for algorithm in ALGORITHMS for made_of in MAKERS]
 # Loads each model that it is given and asks it, for a batch of one and for all; what it has loaded is said at its end.
 ASK = """
@@ -108,7 +110,7 @@ def test_model_is_served_and_answers_over_http_as_the_learner_acts(made):
     finally:
         for server, _, _ in servers:
             os.killpg(server.pid, signal.SIGTERM)
-            server.wait(30)
+            server.wait(HANG_S)
 
 
 def serve(model):
@@ -131,22 +133,21 @@ def serve(model):
 
 
 def wait_for(server, port, log):
-    until_s = time.monotonic() + START_S
-    while True:
+    def answers():
         try:
             with urllib.request.urlopen(f"http://{LOOPBACK}:{port}/ping", timeout=5):
-                return
+                return True
         except (urllib.error.URLError, OSError):
-            assert server.poll() is None, log.read_text()
-            assert time.monotonic() < until_s, log.read_text()
-            time.sleep(0.1)
+            return False
+
+    wait_until(answers, process=server, log=log.read_text, poll_s=0.1)
 
 
 def invoke(port, given):
     request = urllib.request.Request(
         f"http://{LOOPBACK}:{port}/invocations", json.dumps(given).encode(), {"Content-Type": "application/json"}
     )
-    with urllib.request.urlopen(request, timeout=30) as answer:
+    with urllib.request.urlopen(request, timeout=HANG_S) as answer:
         return np.array(json.loads(answer.read())["predictions"])
 
 
@@ -234,11 +235,11 @@ def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path,
     config["env"] = {"rotation_bounds_deg": [90.0, 45.0], "translation_bounds_mm": [40.0, 300.0]}
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     with TrackedRun.start(store, experiment_id, name="n", config={}, tags={}, folder=folder) as tracked:
-        keep_policy(Otherwise(learner, shift), env, tracked, folder, print)
+        save_policy(Otherwise(learner, shift), env, tracked, folder, print)
     run = store.get_run(tracked.run_id)
     assert run.info.status == "FINISHED"
     assert run.data.tags["policy"].startswith(tag)
-    assert (run.data.tags.get("policy.sha256") == sum_of_model(folder / "policy")) == (tag == "kept")
+    assert (run.data.tags.get("policy.sha256") == model_sha256(folder / "policy")) == (tag == "kept")
     is_kept = tag == "kept"
     assert (folder / "policy").exists() == is_kept
     assert ("the policy is not kept as a model: the model answers" in capsys.readouterr().out) != is_kept
@@ -254,7 +255,7 @@ def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path,
 def test_run_keeps_no_policy_where_its_configuration_says_so(regression, tmp_path):
     (tmp_path / "config.yaml").write_text("tracking: {policy: false}")
     # Nothing is asked of the tracked run.
-    keep_policy(*regression, None, tmp_path, print)
+    save_policy(*regression, None, tmp_path, print)
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
 
 

@@ -1,27 +1,28 @@
 """Real tracked runs of two agents with three seeds each, made once, and trainings that nobody has run."""
 
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 from mlflow import MlflowClient
 
-from armscan import report, run
-from armscan.reports.trainings import Series, Training
-from armscan.training import Episode, Evaluation
+from armscan import run
+from armscan.reports.load import Series, TrackedTraining
+from armscan.training import EpisodeResult, Evaluation
 
 SMALL = [
     *("data.n_training=1", "data.n_validation=1", "data.n_test=2", "training.env_steps=400", "env.max_steps=6"),
     *(
-        "training.epoch_env_steps=100",
+        "training.eval_every_env_steps=100",
         "training.validation_episodes=2",
         "evaluation.episodes=6",
         "tracking.policy=false",
     ),
     *("agent.num_envs=4", "agent.batch_size=16", "network=mlp", "network.hidden_sizes=[8]"),
 ]
-AGENTS = {"sac": ["agent.random_env_steps=60"], "ppo": ["agent.env_steps_per_collection=100"]}
+AGENTS = {"sac": ["agent.learning_starts=60"], "ppo": ["agent.env_steps_per_collection=100"]}
 
 
 class Runs:
@@ -60,16 +61,10 @@ def runs(tmp_path_factory):
 
 
 @pytest.fixture
-def answer(runs, tmp_path, monkeypatch, capsys):
-    """Runs the command in an empty folder; returns its exit code and what it printed."""
-
-    def command(*words):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setenv("MLFLOW_TRACKING_URI", runs.uri)
-        code = report.main(words)
-        return code, *capsys.readouterr()
-
-    return command
+def answer(armscan, runs, monkeypatch):
+    """Runs `armscan report` in an empty folder; returns its exit code and what it printed."""
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", runs.uri)
+    return partial(armscan, "report")
 
 
 @pytest.fixture
@@ -89,15 +84,15 @@ def make_training():
             "series": {"validation/success_rate": series, "validation/mean_steps": series} if len(steps) else {},
             "evaluation": Evaluation(tuple(make_episode(f"v{i % 2}", mean_steps) for i in range(4))),
             "volumes": {"v0": "a", "v1": "b"},
-            "film": b"GIF89a",
+            "video": b"GIF89a",
         }
-        return Training(**facts | changes)
+        return TrackedTraining(**facts | changes)
 
     return make
 
 
 def make_episode(volume, n_steps):
-    return Episode(
+    return EpisodeResult(
         volume=volume,
         seed=0,
         n_steps=n_steps,

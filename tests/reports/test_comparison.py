@@ -5,8 +5,8 @@ import csv
 import pytest
 
 from armscan.reports.comparison import write_comparison
-from armscan.reports.groups import grouped
-from armscan.reports.outcomes import compared, final_figures
+from armscan.reports.groups import group_trainings
+from armscan.reports.significance import compare_groups, final_metrics
 
 
 @pytest.fixture
@@ -14,7 +14,7 @@ def written(tmp_path):
     """Writes the report of trainings; returns the page, and a file's rows by its name."""
 
     def write(*trainings):
-        file = write_comparison(*grouped(trainings), "runs", tmp_path)
+        file = write_comparison(*group_trainings(trainings), "runs", tmp_path)
 
         def rows(name):
             with (tmp_path / f"{name}.csv").open() as opened:
@@ -31,7 +31,7 @@ def test_twenty_groups_have_a_report(written, make_training):
     )
     assert "40 runs in 20 groups" in page
     assert len(rows("improvement")) == 3 * 20 * 19 / 2
-    assert page.count("data-film") == 20
+    assert page.count("data-video") == 20
     steps = {row["group"]: float(row["value"]) for row in rows("final") if row["figure"] == "mean_steps"}
     assert steps == {f"agent.lr={lr}": lr for lr in range(1, 21)}
 
@@ -42,7 +42,10 @@ def test_fewer_steps_are_better_and_equal_ones_are_no_difference(make_training):
         for lr, steps in ((1, 2), (2, 5), (3, 2))
         for seed in range(3)
     ]
-    pairs = {(pair.ours, pair.theirs): pair.probability for pair in compared(grouped(trainings)[0], "mean_steps")}
+    pairs = {
+        (pair.ours, pair.theirs): pair.probability
+        for pair in compare_groups(group_trainings(trainings)[0], "mean_steps")
+    }
     assert pairs == {(0, 1): (1.0, 1.0, 1.0), (0, 2): (0.5, 0.5, 0.5), (1, 2): (0.0, 0.0, 0.0)}
 
 
@@ -60,8 +63,8 @@ def test_groups_judged_on_other_volumes_are_not_compared(written, make_training,
 
 
 def test_final_figures_are_of_all_seeds_volumes_and_episodes(make_training):
-    (group,), _ = grouped([make_training(seed, mean_steps=steps) for seed, steps in enumerate((2, 4, 9))])
-    figures = final_figures(group)
+    (group,), _ = group_trainings([make_training(seed, mean_steps=steps) for seed, steps in enumerate((2, 4, 9))])
+    figures = final_metrics(group)
     assert (figures.n_volumes, figures.n_episodes) == (2, 12)
     assert figures.estimates["mean_steps"] == (5.0, 2.0, 9.0)
 
@@ -73,7 +76,7 @@ def test_success_without_a_failure_has_the_interval_of_wilson(written, make_trai
 
 def test_the_film_is_of_the_median_training(written, make_training):
     trainings = [make_training(seed, mean_steps=steps) for seed, steps in enumerate((9, 5, 2))]
-    page, _ = written(*trainings, make_training(3, evaluation=None), make_training(4, film=None, mean_steps=1))
+    page, _ = written(*trainings, make_training(3, evaluation=None), make_training(4, video=None, mean_steps=1))
     assert "<figcaption>1. sac: seed 1</figcaption>" in page
 
 
@@ -85,9 +88,9 @@ def test_what_is_shown_is_no_markup(written, make_training):
 
 def test_runs_that_were_left_out_and_rules_that_differ_are_said(written, make_training):
     page, _ = written(
-        make_training(0, params={"env.delta": "0.05"}, run_id="a" * 32),
-        make_training(0, params={"env.delta": "0.05"}, run_id="b" * 32, started_ms=9),
-        make_training(0, params={"env.delta": "0.01"}),
+        make_training(0, params={"env.success_threshold": "0.05"}, run_id="a" * 32),
+        make_training(0, params={"env.success_threshold": "0.05"}, run_id="b" * 32, started_ms=9),
+        make_training(0, params={"env.success_threshold": "0.01"}),
     )
     assert "another run has the same configuration and seed: aaaaaaaa (seed 0)." in page
-    assert "have other rules (env.delta)" in page
+    assert "have other rules (env.success_threshold)" in page

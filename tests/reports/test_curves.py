@@ -3,13 +3,13 @@
 import numpy as np
 
 from armscan.reports.curves import MAX_POINTS, curve_of
-from armscan.reports.groups import grouped
+from armscan.reports.groups import group_trainings
 
 FIGURE, STEPS, SECONDS = "validation/mean_steps", "environment steps", "seconds of training"
 
 
 def curve(*trainings, axis=STEPS):
-    (group,), _ = grouped(trainings)
+    (group,), _ = group_trainings(trainings)
     return curve_of(group, FIGURE, axis)
 
 

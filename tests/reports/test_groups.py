@@ -2,11 +2,11 @@
 
 import pytest
 
-from armscan.reports.groups import differing_rules, grouped
+from armscan.reports.groups import differing_rules, group_trainings
 
 
 def names(*trainings):
-    return [group.name for group in grouped(trainings)[0]]
+    return [group.name for group in group_trainings(trainings)[0]]
 
 
 def test_groups_differ_by_more_than_the_seed_and_what_has_no_effect(make_training):
@@ -15,7 +15,7 @@ def test_groups_differ_by_more_than_the_seed_and_what_has_no_effect(make_trainin
     trainings = [
         make_training(seed, params=each) for seed, each in enumerate((same, other, same | {"agent.lr": "0.2"}))
     ]
-    groups, left_out = grouped(trainings)
+    groups, left_out = group_trainings(trainings)
     assert [[each.seed for each in group.trainings] for group in groups] == [["0", "1"], ["2"]]
     assert [(group.name, group.label) for group in groups] == [
         ("agent.lr=0.1", "1. lr=0.1"),
@@ -26,7 +26,7 @@ def test_groups_differ_by_more_than_the_seed_and_what_has_no_effect(make_trainin
 
 def test_labels_are_short(make_training):
     values = ("0.0011781448719376517", "1.1781448719376517e-07", "0.5")
-    groups, _ = grouped([make_training(params={"agent.lr": value}) for value in values])
+    groups, _ = group_trainings([make_training(params={"agent.lr": value}) for value in values])
     assert [group.label for group in groups] == ["1. lr=0.001178", "2. lr=1.178e-07", "3. lr=0.5"]
     assert groups[0].title == "1. agent.lr=0.0011781448719376517"
 
@@ -55,7 +55,7 @@ def test_groups_that_no_key_tells_apart_have_numbers(make_training):
         *("sac", "a=1", "b=1")
     ]
     long = [make_training(params={"data.path": "x" * 200 + end}) for end in "ab"]
-    labels = [group.label for group in grouped(long)[0]]
+    labels = [group.label for group in group_trainings(long)[0]]
     assert len(set(labels)) == 2
     assert max(map(len, labels)) < 80
 
@@ -63,12 +63,14 @@ def test_groups_that_no_key_tells_apart_have_numbers(make_training):
 def test_of_several_runs_with_the_same_seed_one_counts(make_training):
     old, new, cut = (make_training(0, run_id=run_id, started_ms=at) for run_id, at in (("a", 1), ("b", 2), ("c", 3)))
     cut = make_training(0, run_id="c", started_ms=3, is_whole=False)
-    (group,), left_out = grouped([old, new, cut, make_training(1)])
+    (group,), left_out = group_trainings([old, new, cut, make_training(1)])
     assert [each.run_id for each in group.trainings] == ["b", f"{1:032x}"]
     assert [each.run_id for each in left_out] == ["a", "c"]
 
 
-@pytest.mark.parametrize(("key", "is_rule"), [("env.delta", True), ("projection", True), ("agent.lr", False)])
+@pytest.mark.parametrize(
+    ("key", "is_rule"), [("env.success_threshold", True), ("projection", True), ("agent.lr", False)]
+)
 def test_rules_that_differ_are_known(make_training, key, is_rule):
-    groups, _ = grouped([make_training(params={key: value}) for value in "12"])
+    groups, _ = group_trainings([make_training(params={key: value}) for value in "12"])
     assert differing_rules(groups) == ([key] if is_rule else [])

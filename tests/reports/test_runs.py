@@ -9,8 +9,6 @@ from pathlib import Path
 import pytest
 from mlflow.entities import Metric, Param
 
-from tests.browser import chromium, programs
-
 SECTIONS = ["Learning curves", "On the test volumes", "Which is likely to be better", "Episodes", "Runs", "Numbers"]
 
 
@@ -48,7 +46,7 @@ def artifacts(runs):
 
 
 def test_report_of_a_multirun_groups_its_jobs_and_has_every_number_beside_it(answer, runs, parent, tmp_path):
-    code, printed, errors = answer(f"runs={parent[:12]}")
+    code, printed, errors = answer(f"--runs={parent[:12]}")
     folder = tmp_path / "reports" / f"runs-{parent[:8]}"
     assert (code, errors) == (0, "")
     assert printed.splitlines() == ["reading   6 runs", f"look at   {folder.relative_to(tmp_path)}/report.html"]
@@ -84,7 +82,7 @@ def test_report_of_a_multirun_groups_its_jobs_and_has_every_number_beside_it(ans
 def test_the_same_runs_give_the_same_report_however_they_are_named(answer, runs, parent, tmp_path):
     ids = [each.info.run_id for each in runs.all]
     for name, words in {"a": parent, "b": ",".join([*ids, ids[0][:30]]), "c": "experiment:armscan"}.items():
-        assert answer(f"runs={words}", f"out={name}")[0] == 0
+        assert answer(f"--runs={words}", f"--out={name}")[0] == 0
     files = [file.name for file in (tmp_path / "a").glob("*.csv")]
     assert len(files) == 6
     for name in files:
@@ -92,7 +90,7 @@ def test_the_same_runs_give_the_same_report_however_they_are_named(answer, runs,
 
 
 def test_one_training_has_a_report_without_bands(answer, runs, tmp_path):
-    assert answer(f"runs={runs.ids('sac')[1]}", "out=one")[0] == 0
+    assert answer(f"--runs={runs.ids('sac')[1]}", "--out=one")[0] == 0
     shown = page(tmp_path / "one")
     assert "1 runs in 1 group:" in shown
     assert "sac-cluster-y-phantom<" in shown
@@ -111,7 +109,7 @@ def test_trainings_of_a_pruned_trial_are_cut_off_unless_they_took_all_their_step
         runs.client.set_terminated(run_id)
         ids.append(run_id)
     for name, words in {"a": study, "b": trial, "c": ",".join(ids)}.items():
-        assert answer(f"runs={words}", f"out={name}")[0] == 0
+        assert answer(f"--runs={words}", f"--out={name}")[0] == 0
         assert [row["status"] for row in rows(tmp_path / name / "runs.csv")] == ["finished", "pruned"]
         assert f"with what they have: {ids[1][:8]} (group 1, seed 1): pruned." in page(tmp_path / name)
     for each in (study, trial, *ids):
@@ -126,7 +124,7 @@ def test_a_run_that_has_not_finished_takes_part_with_what_it_has(answer, runs, t
     ids = runs.ids("sac")
     runs.client.update_run(ids[2], status="RUNNING")
     try:
-        assert answer(f"runs={','.join(ids)}", "out=here")[0] == 0
+        assert answer(f"--runs={','.join(ids)}", "--out=here")[0] == 0
     finally:
         runs.client.update_run(ids[2], status="FINISHED")
     assert f"Not run to the end, and here with what they have: {ids[2][:8]} (group 1, seed 2): running." in page(
@@ -138,13 +136,13 @@ def test_what_a_run_has_not_kept_is_said(answer, runs, artifacts, tmp_path):
     for name in ("evaluation.json", "episode.gif", "volumes.json"):
         (artifacts / name).unlink()
     run_id = artifacts.parent.name
-    assert answer(f"runs={run_id}", "out=alone")[0] == 0
+    assert answer(f"--runs={run_id}", "--out=alone")[0] == 0
     shown = page(tmp_path / "alone")
     for name in ("evaluation.json", "episode.gif"):
         assert f"No {name} is among the artifacts of {run_id[:8]} (group 1, seed 0)." in shown
     assert "None of these runs has kept a final evaluation." in shown
-    assert "None of these runs has kept a film." in shown
-    assert answer(f"runs={','.join(runs.ids('sac'))}", "out=all")[0] == 0
+    assert "None of these runs has kept a video." in shown
+    assert answer(f"--runs={','.join(runs.ids('sac'))}", "--out=all")[0] == 0
     assert rows(tmp_path / "all" / "final.csv")[0]["seeds"] == "2"
 
 
@@ -167,8 +165,8 @@ def without_test(text):
 def test_a_damaged_evaluation_is_refused_in_one_line(answer, artifacts, tmp_path, damage):
     file = artifacts / "evaluation.json"
     file.write_text(damage(file.read_text()))
-    code, _, errors = answer(f"runs={artifacts.parent.name}")
-    line = f"error: run {artifacts.parent.name}: its evaluation.json is damaged; put it back, or leave the run out\n"
+    code, _, errors = answer(f"--runs={artifacts.parent.name}")
+    line = f"error: run {artifacts.parent.name}: its evaluation.json is damaged; put it back, or leave the run out"
     assert (code, errors) == (2, line)
     assert not list(tmp_path.iterdir())
 
@@ -178,22 +176,22 @@ def test_report_of_runs_answers_mistakes_in_one_line(answer, runs, tmp_path):
     other = runs.made("other")
     beginning = next(each for each in "0123456789abcdef" if sum(run.info.run_id[0] == each for run in runs.all) == 0)
     words_and_lines = [
-        (["runs="], "runs is empty, but it must have a value"),
-        (["runs=,"], "runs is ',', but it must be ids of runs, or experiment:NAME, with commas between"),
-        (["runs=experiment:"], "runs is 'experiment:', but it must be ids of runs"),
-        (["runs=a", "study=b"], "study and runs are both given, but a report is of one of them"),
-        (["runs=a", "storage=b"], "storage is given, but it is for study=, and this report is of runs="),
-        (["runs=xyz"], "the run is 'xyz', but it must be an id as MLflow shows it"),
-        (["runs=" + beginning * 30], f"the run is '{beginning * 30}', but no run of sqlite:///"),
-        (["runs=experiment:nobody"], "the experiment is 'nobody', but in 'sqlite:///"),
-        (["runs=experiment:Default"], "the experiment is 'Default', but in 'sqlite:///"),
+        (["--runs="], "--runs is '', but it must be ids of runs"),
+        (["--runs=,"], "--runs is ',', but it must be ids of runs, or experiment:NAME, with commas between"),
+        (["--runs=experiment:"], "--runs is 'experiment:', but it must be ids of runs"),
+        (["--runs=a", "--study=b"], "--study and --runs are both given, but a report is of one of them"),
+        (["--runs=a", "--storage=b"], "--storage is given, but it is for --study, and this report is of --runs"),
+        (["--runs=xyz"], "the run is 'xyz', but it must be an id as MLflow shows it"),
+        (["--runs=" + beginning * 30], f"the run is '{beginning * 30}', but no run of sqlite:///"),
+        (["--runs=experiment:nobody"], "the experiment is 'nobody', but in 'sqlite:///"),
+        (["--runs=experiment:Default"], "the experiment is 'Default', but in 'sqlite:///"),
         (
-            [f"runs={evaluation}"],
+            [f"--runs={evaluation}"],
             f"run {evaluation} is an evaluation, but runs are compared: give the run that it is of",
         ),
-        ([f"runs={other}"], f"run {other} (other) is no training of armscan, and has none below it"),
-        (["runs=a", "tracking=sqlite:///nowhere.db"], "tracking.uri is 'sqlite:///nowhere.db', but there is no "),
-        (["runs=a", "out=/dev/null/a"], "out is '/dev/null/a', but /dev/null is no folder: name one, or what can"),
+        ([f"--runs={other}"], f"run {other} (other) is no training of armscan, and has none below it"),
+        (["--runs=a", "--tracking=sqlite:///nowhere.db"], "tracking.uri is 'sqlite:///nowhere.db', but there is no "),
+        (["--runs=a", "--out=/dev/null/a"], "--out is '/dev/null/a', but /dev/null is no folder: name one, or a new"),
     ]
     for words, line in words_and_lines:
         code, _, errors = answer(*words)
@@ -202,8 +200,8 @@ def test_report_of_runs_answers_mistakes_in_one_line(answer, runs, tmp_path):
         assert len(errors.splitlines()) == 1, errors
     file = tmp_path / "there.txt"
     file.write_text("mine")
-    assert answer(f"runs={runs.ids('sac')[0]}", f"out={file}")[2].startswith(
-        f"error: out is '{file}', but {file} is no "
+    assert answer(f"--runs={runs.ids('sac')[0]}", f"--out={file}")[2].startswith(
+        f"error: --out is '{file}', but {file} is no "
     )
     assert [each.read_text() for each in tmp_path.iterdir()] == ["mine"]
 
@@ -211,31 +209,27 @@ def test_report_of_runs_answers_mistakes_in_one_line(answer, runs, tmp_path):
 def test_a_beginning_that_several_runs_have_is_refused(answer, runs):
     ids = [each.info.run_id for each in runs.all] + [runs.made(f"made {number}") for number in range(17)]
     beginning = next(each for each in "0123456789abcdef" if sum(run_id[0] == each for run_id in ids) > 1)
-    assert "but that may be " in answer(f"runs={beginning}")[2]
+    assert "but that may be " in answer(f"--runs={beginning}")[2]
 
 
-@pytest.mark.skipif(
-    programs() is None, reason="Chromium or its driver is not installed: apt-get install chromium chromium-driver"
-)
-def test_report_needs_no_server_and_no_network(answer, runs, tmp_path):
+def test_report_needs_no_server_and_no_network(answer, runs, tmp_path, browser):
     pictures = Path(os.environ.get("ARMSCAN_SCREENSHOTS", tmp_path / "screenshots")).absolute()
-    assert answer(f"runs={','.join(run.info.run_id for run in runs.all)}", "out=here")[0] == 0
-    with chromium(tmp_path / "profile") as browser:
-        browser.open((tmp_path / "here" / "report.html").as_uri())
-        # Bands and lines of two groups with three seeds in three figures, and beside them those of the training.
-        assert browser.count(".js-plotly-plot", at_least=3) == 3
-        browser.count(".js-plotly-plot:first-of-type .scatterlayer .trace", at_least=2 * 3 * 6)
-        lines = "return document.querySelector('.js-plotly-plot').data.map((line) => line.x[line.x.length - 1])"
-        steps = browser.driver.execute_script(lines)
-        browser.click("body > .chart .updatemenu-button", text="by seconds of training")
-        assert browser.driver.execute_script(lines) != steps
-        assert min(steps) >= 100
-        browser.keep(pictures / "report.png")
-        browser.click("#start")
-        assert browser.picture(".films figure:last-of-type img") > 0
-        browser.click("summary")
-        assert browser.find("details .main-svg").size["width"] > 500
-        requests = "return performance.getEntriesByType('resource').map((each) => each.name)"
-        addresses = browser.driver.execute_script(requests)
-        assert not [address for address in addresses if not address.startswith(("blob:", "data:"))]
-        assert not [entry for entry in browser.driver.get_log("browser") if entry["level"] == "SEVERE"]
+    assert answer(f"--runs={','.join(run.info.run_id for run in runs.all)}", "--out=here")[0] == 0
+    browser.open((tmp_path / "here" / "report.html").as_uri())
+    # Bands and lines of two groups with three seeds in three figures, and beside them those of the training.
+    assert browser.count(".js-plotly-plot", at_least=3) == 3
+    browser.count(".js-plotly-plot:first-of-type .scatterlayer .trace", at_least=2 * 3 * 6)
+    lines = "return document.querySelector('.js-plotly-plot').data.map((line) => line.x[line.x.length - 1])"
+    steps = browser.driver.execute_script(lines)
+    browser.click("body > .chart .updatemenu-button", text="by seconds of training")
+    assert browser.driver.execute_script(lines) != steps
+    assert min(steps) >= 100
+    browser.keep(pictures / "report.png")
+    browser.click("#start")
+    assert browser.picture(".videos figure:last-of-type img") > 0
+    browser.click("summary")
+    assert browser.find("details .main-svg").size["width"] > 500
+    requests = "return performance.getEntriesByType('resource').map((each) => each.name)"
+    addresses = browser.driver.execute_script(requests)
+    assert not [address for address in addresses if not address.startswith(("blob:", "data:"))]
+    assert not [entry for entry in browser.driver.get_log("browser") if entry["level"] == "SEVERE"]

@@ -4,14 +4,13 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.ledger import Ledger
-from armscan.sweeps.limits import Limits
-from armscan.sweeps.outcome import Notes, Outcome
-from armscan.sweeps.storage import open_storage
-from armscan.sweeps.tally import FAILURE
+from armscan.sweeps.scheduling.outcome import PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.scheduler import Limits, TrialScheduler
+from armscan.sweeps.scheduling.state import FAILURE
+from armscan.sweeps.storage.storage import open_storage
 
 
-@pytest.fixture(params=["journal", "sqlite", "postgresql"])
+@pytest.fixture(params=["journal", *(pytest.param(each, marks=pytest.mark.full) for each in ("sqlite", "postgresql"))])
 def storage_uri(request, tmp_path):
     match request.param:
         case "journal":
@@ -23,20 +22,20 @@ def storage_uri(request, tmp_path):
 
 
 @pytest.fixture
-def make_ledger(storage_uri):
+def make_scheduler(storage_uri):
     """Opens the same study again and again, as workers do."""
 
     def make(**limits):
         storage = open_storage(storage_uri)
         study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
         is_open = limits.pop("is_open", True)
-        return Ledger(study, storage, Limits(**{"n_trials": 5} | limits), is_open=is_open)
+        return TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits), is_open=is_open)
 
     return make
 
 
-def fail(ledger, trial, reason):
+def fail(scheduler, trial, reason):
     """Ends a trial as failed, as its worker does with its next claim."""
-    outcome = Outcome(trial, TrialState.FAIL, Notes(), attributes={FAILURE: reason})
-    ledger._storage.alone(lambda: ledger._tell(outcome, is_repeated=False))
+    outcome = TrialOutcome(trial, TrialState.FAIL, PendingWrites(), attributes={FAILURE: reason})
+    scheduler._storage.exclusive(lambda: scheduler._tell(outcome, is_repeated=False))
     assert outcome.is_told

@@ -5,7 +5,6 @@ import json
 import sqlite3
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -17,17 +16,17 @@ from armscan.tracking import (
     TrackedRun,
     draw_learning_curve,
     find_run,
-    found_run,
+    load_run,
     open_existing_store,
     open_store,
     source_tags,
 )
-from armscan.tracking.courier import deliver
-from armscan.tracking.limits import flattened
-from armscan.tracking.spool import Address, Spool, file_of
+from armscan.tracking.outbox import Address, Outbox, file_of
+from armscan.tracking.sanitize import flattened
+from armscan.tracking.uploader import deliver
 from armscan.training import EpochReport, TrainingResult
-
-from ..training.test_train import evaluation_of
+from tests.support.waiting import wait_until
+from tests.training.test_train import evaluation_of
 
 REPORTS = [
     EpochReport(
@@ -43,18 +42,14 @@ REPORTS = [
 
 
 @pytest.fixture
-def store(tmp_path):
-    uri, artifacts = f"sqlite:///{tmp_path}/runs.db", str(tmp_path / "artifacts")
-    return open_store(uri, experiment="test", artifacts=artifacts, wait_s=60.0)
+def store(tmp_path, database):
+    return open_store(database, experiment="test", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
 
 
 def eventually(look, is_there):
     """Returns what is seen as soon as it is what it must become."""
-    until_s = time.monotonic() + 30
-    while not is_there(seen := look()):
-        assert time.monotonic() < until_s, seen
-        time.sleep(0.05)
-    return seen
+    wait_until(lambda: is_there(look()), log=look)
+    return look()
 
 
 def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
@@ -98,8 +93,8 @@ def test_tracked_run_keeps_a_folder_with_all_in_it_and_what_makes_it_a_model_las
     (tmp_path / "run" / "beside").write_text("not in it")
     with TrackedRun.start(client, experiment_id, name="n", config={}, tags={}, folder=tmp_path / "run") as tracked:
         tracked.log_folder(model)
-    spooled = [json.loads(line) for line in file_of(tmp_path / "run", tracked.run_id).read_text().splitlines()]
-    files = [entry["file"] for entry in spooled if "file" in entry]
+    entries = [json.loads(line) for line in file_of(tmp_path / "run", tracked.run_id).read_text().splitlines()]
+    files = [entry["file"] for entry in entries if "file" in entry]
     assert files[-1] == ["policy/MLmodel", "policy"]
     assert ["policy/artifacts/more/a", "policy/artifacts/more"] in files
     assert [file.path for file in client.list_artifacts(tracked.run_id)] == ["policy"]
@@ -111,14 +106,14 @@ def test_tracked_run_keeps_a_folder_with_all_in_it_and_what_makes_it_a_model_las
 def test_folder_that_was_removed_before_it_was_delivered_is_told(store, tmp_path, capsys):
     client, experiment_id = store
     run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id
-    spool = Spool.begin(tmp_path, Address(run_id, client.uri))
-    spool.add(file=["policy/MLmodel", "policy"])
-    spool.add(file="best.pt")
+    outbox = Outbox.begin(tmp_path, Address(run_id, client.uri))
+    outbox.add(file=["policy/MLmodel", "policy"])
+    outbox.add(file="best.pt")
     # Of a folder that was copied, the file may be elsewhere.
     with pytest.raises(FileNotFoundError, match="policy/MLmodel is not there"):
-        deliver(spool, client.mlflow, "files", is_whole=False)
-    assert deliver(spool, client.mlflow, "files") == 2
-    spool.close()
+        deliver(outbox, client.mlflow, "files", is_whole=False)
+    assert deliver(outbox, client.mlflow, "files") == 2
+    outbox.close()
     said = capsys.readouterr().out
     assert "policy/MLmodel was removed before the store could keep it" in said
     assert "best.pt was removed" in said
@@ -161,7 +156,7 @@ def test_run_that_goes_on_logs_what_is_missing_and_nothing_twice(store, tmp_path
     first.on_epoch(REPORTS[0])
     first.end("KILLED", reason="interrupted")
     config = {"seed": 3, "more": 4}
-    second = TrackedRun.go_on(client, first.run_id, folder=tmp_path, config=config, tags={"folder": "there"})
+    second = TrackedRun.reopen(client, first.run_id, folder=tmp_path, config=config, tags={"folder": "there"})
     run = eventually(lambda: client.get_run(first.run_id), lambda run: "more" in run.data.params)
     assert run.info.status == "RUNNING"
     assert "failure" not in run.data.tags
@@ -223,7 +218,7 @@ def test_found_run_refuses_one_of_a_newer_version(store):
     with pytest.raises(
         TrackingError, match=f"made by armscan 99.1.0, but this is {armscan.__version__}: it needs that"
     ):
-        found_run(client.uri, run.info.run_id)
+        load_run(client.uri, run.info.run_id)
 
 
 def test_find_run_takes_the_beginning_of_an_id_and_names_what_is_wrong(store):
@@ -249,6 +244,7 @@ def test_open_existing_store_makes_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.full
 def test_many_processes_may_open_a_fresh_store_at_once(tmp_path):
     script = (
         "import sys; from armscan.tracking import open_store\n"

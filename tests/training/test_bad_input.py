@@ -3,16 +3,16 @@
 import pytest
 from hypothesis import given
 
-from armscan.training import Budget, SolvedCriterion, data, phantom_data
+from armscan.training import Budget, SolvedCriterion, phantom_data
+from armscan.training import splits as data
+from tests.support.junk import SETTINGS, junk, refuses
 
-from ..junk import SETTINGS, junk, refuses
 
-
-@pytest.mark.parametrize("changed", ["env_steps", "epoch_env_steps", "validation_episodes", "solved"])
+@pytest.mark.parametrize("changed", ["env_steps", "eval_every_env_steps", "validation_episodes", "solved"])
 @SETTINGS
 @given(value=junk)
 def test_budget_with_junk(changed, value):
-    figures = {"env_steps": 9, "epoch_env_steps": 3, "validation_episodes": 2}
+    figures = {"env_steps": 9, "eval_every_env_steps": 3, "validation_episodes": 2}
     budget = refuses(lambda: Budget(**figures | {changed: value}))
     assert budget is None or changed != "solved" or value is None
 

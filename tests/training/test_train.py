@@ -10,13 +10,13 @@ from armscan.training import (
     BEST_CHECKPOINT,
     LAST_CHECKPOINT,
     Budget,
-    Episode,
+    CheckpointProvenance,
+    EpisodeResult,
     Evaluation,
-    Origin,
     SolvedCriterion,
-    course,
+    checkpointing,
     load_checkpoint,
-    take_up,
+    resume_from_checkpoint,
     train,
 )
 
@@ -24,7 +24,7 @@ from armscan.training import (
 def evaluation_of(*lengths, success=True):
     return Evaluation(
         tuple(
-            Episode(
+            EpisodeResult(
                 volume="v",
                 seed=0,
                 n_steps=length,
@@ -99,7 +99,7 @@ class Recorder:
 def run(tmp_path, evaluations, **budget):
     learner, recorder = ScriptedLearner(), Recorder()
     script = iter(evaluations)
-    arguments = {"env_steps": 100, "epoch_env_steps": 40, "validation_episodes": 1} | budget
+    arguments = {"env_steps": 100, "eval_every_env_steps": 40, "validation_episodes": 1} | budget
     result = train(learner, Budget(**arguments), lambda: next(script), tmp_path, [recorder])
     return learner, recorder, result
 
@@ -140,7 +140,7 @@ def test_train_tells_its_callbacks_when_it_fails(tmp_path):
     with pytest.raises(ZeroDivisionError):
         train(
             ScriptedLearner(),
-            Budget(env_steps=100, epoch_env_steps=40, validation_episodes=1),
+            Budget(env_steps=100, eval_every_env_steps=40, validation_episodes=1),
             lambda: 1 / 0,
             tmp_path,
             [recorder],
@@ -149,8 +149,10 @@ def test_train_tells_its_callbacks_when_it_fails(tmp_path):
 
 
 SCRIPT = [evaluation_of(9), evaluation_of(3, 4), evaluation_of(5), evaluation_of(2), evaluation_of(6)]
-BUDGET = Budget(env_steps=210, epoch_env_steps=40, validation_episodes=1)
-ORIGIN = Origin(run_id="r", volumes={"training": {"a": "1"}, "validation": {"b": "2"}, "test": {"c": "3"}})
+BUDGET = Budget(env_steps=210, eval_every_env_steps=40, validation_episodes=1)
+PROVENANCE = CheckpointProvenance(
+    run_id="r", volumes={"training": {"a": "1"}, "validation": {"b": "2"}, "test": {"c": "3"}}
+)
 
 
 class Killed(BaseException):
@@ -159,7 +161,7 @@ class Killed(BaseException):
 
 def cut_off(folder, monkeypatch, n_writes):
     """Trains until so many checkpoints were written, and is killed then."""
-    save, written = course.save_checkpoint, []
+    save, written = checkpointing.save_checkpoint, []
 
     def save_or_die(*arguments):
         if len(written) == n_writes:
@@ -167,20 +169,22 @@ def cut_off(folder, monkeypatch, n_writes):
         written.append(arguments)
         save(*arguments)
 
-    monkeypatch.setattr(course, "save_checkpoint", save_or_die)
+    monkeypatch.setattr(checkpointing, "save_checkpoint", save_or_die)
     recorder, script = Recorder(), iter(SCRIPT)
     with pytest.raises(Killed):
-        train(ScriptedLearner(), BUDGET, lambda: next(script), folder, [recorder], origin=ORIGIN)
-    monkeypatch.setattr(course, "save_checkpoint", save)
+        train(ScriptedLearner(), BUDGET, lambda: next(script), folder, [recorder], provenance=PROVENANCE)
+    monkeypatch.setattr(checkpointing, "save_checkpoint", save)
     return recorder
 
 
 def gone_on(folder):
     """Goes on with a training; returns its callback and its result."""
     learner, recorder = ScriptedLearner(), Recorder()
-    earlier = take_up(learner, folder, ORIGIN)
+    earlier = resume_from_checkpoint(learner, folder, PROVENANCE)
     script = iter(SCRIPT[len(earlier) :])
-    return recorder, train(learner, BUDGET, lambda: next(script), folder, [recorder], origin=ORIGIN, earlier=earlier)
+    return recorder, train(
+        learner, BUDGET, lambda: next(script), folder, [recorder], provenance=PROVENANCE, earlier=earlier
+    )
 
 
 def course_of(reports):
@@ -216,27 +220,27 @@ def test_training_that_goes_on_counts_epochs_that_had_solved_the_task(tmp_path, 
     monkeypatch.setattr("tests.training.test_train.SCRIPT", [evaluation_of(9), *[evaluation_of(1)] * 4])
     cut_off(tmp_path, monkeypatch, 4)
     learner = ScriptedLearner()
-    earlier = take_up(learner, tmp_path, ORIGIN)
+    earlier = resume_from_checkpoint(learner, tmp_path, PROVENANCE)
     assert len(earlier) == 2
     budget = dataclasses.replace(BUDGET, solved=SolvedCriterion(n_epochs=2))
-    result = train(learner, budget, lambda: evaluation_of(1), tmp_path, origin=ORIGIN, earlier=earlier)
+    result = train(learner, budget, lambda: evaluation_of(1), tmp_path, provenance=PROVENANCE, earlier=earlier)
     assert result.is_solved
     assert len(result.reports) == 3
 
 
 def test_wall_time_goes_on_without_the_time_in_between(tmp_path, monkeypatch):
     cut_off(tmp_path, monkeypatch, 4)
-    earlier = take_up(ScriptedLearner(), tmp_path, ORIGIN)
+    earlier = resume_from_checkpoint(ScriptedLearner(), tmp_path, PROVENANCE)
     long_ago = [dataclasses.replace(report, wall_s=1000.0 * report.epoch) for report in earlier]
     learner, script = ScriptedLearner(), iter(SCRIPT[2:])
     learner.n_env_steps = earlier[-1].n_env_steps
-    result = train(learner, BUDGET, lambda: next(script), tmp_path, origin=ORIGIN, earlier=long_ago)
+    result = train(learner, BUDGET, lambda: next(script), tmp_path, provenance=PROVENANCE, earlier=long_ago)
     assert 2000.0 < result.reports[2].wall_s < 2100.0
     assert 2000.0 < result.wall_s < 2100.0
 
 
 @pytest.mark.parametrize(
-    ("origin", "message"),
+    ("provenance", "message"),
     [
         ({"run_id": "other"}, r"last\.pt: is a checkpoint of run 'r', but this is 'other'"),
         ({"volumes": {"training": {"a": "9"}}}, r"the training volumes are not those .*: a is changed"),
@@ -244,40 +248,40 @@ def test_wall_time_goes_on_without_the_time_in_between(tmp_path, monkeypatch):
         ({"volumes": {"test": {}}}, r"the test volumes are not those .*: c is not there any more"),
     ],
 )
-def test_take_up_refuses_what_comes_from_something_else(tmp_path, origin, message):
+def test_take_up_refuses_what_comes_from_something_else(tmp_path, provenance, message):
     gone_on(tmp_path)
     with pytest.raises((CheckpointError, ChangedVolumesError), match=message):
-        take_up(ScriptedLearner(), tmp_path, dataclasses.replace(ORIGIN, **origin))
+        resume_from_checkpoint(ScriptedLearner(), tmp_path, dataclasses.replace(PROVENANCE, **provenance))
 
 
 def test_take_up_refuses_a_best_checkpoint_that_is_missing_or_not_the_best(tmp_path):
     gone_on(tmp_path)
     (tmp_path / BEST_CHECKPOINT).unlink()
     with pytest.raises(CheckpointError, match=r"best\.pt: there is no such checkpoint"):
-        take_up(ScriptedLearner(), tmp_path, ORIGIN)
+        resume_from_checkpoint(ScriptedLearner(), tmp_path, PROVENANCE)
     shutil.copy(tmp_path / LAST_CHECKPOINT, tmp_path / BEST_CHECKPOINT)
     with pytest.raises(CheckpointError, match=r"best\.pt: is of epoch 5, but the best epoch of .*last\.pt is 4"):
-        take_up(ScriptedLearner(), tmp_path, ORIGIN)
+        resume_from_checkpoint(ScriptedLearner(), tmp_path, PROVENANCE)
 
 
 @pytest.mark.parametrize("text", [None, "", "[]", "[1]", '[{"epoch": 1}]', '{"a": 1}'])
 def test_take_up_refuses_a_checkpoint_without_its_course(tmp_path, text):
-    course.save_checkpoint(tmp_path / LAST_CHECKPOINT, {}, ORIGIN.facts() | {"reports": text})
+    checkpointing.save_checkpoint(tmp_path / LAST_CHECKPOINT, {}, PROVENANCE.facts() | {"reports": text})
     with pytest.raises(CheckpointError, match="holds no reports of the epochs so far"):
-        take_up(ScriptedLearner(), tmp_path, ORIGIN)
+        resume_from_checkpoint(ScriptedLearner(), tmp_path, PROVENANCE)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"env_steps": 0}, r"training\.env_steps is 0"),
-        ({"epoch_env_steps": "a"}, r"training\.epoch_env_steps is 'a'"),
+        ({"eval_every_env_steps": "a"}, r"training\.eval_every_env_steps is 'a'"),
         ({"validation_episodes": 0}, r"training\.validation_episodes is 0"),
     ],
 )
 def test_budget_refuses_impossible_figures(changes, message):
     with pytest.raises(InvalidValueError, match=message):
-        Budget(**({"env_steps": 100, "epoch_env_steps": 40, "validation_episodes": 1} | changes))
+        Budget(**({"env_steps": 100, "eval_every_env_steps": 40, "validation_episodes": 1} | changes))
 
 
 @pytest.mark.parametrize("changes", [{"success_rate": 2}, {"mean_steps": 0.5}, {"n_epochs": 0}])

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from armscan.errors import ArmscanError
 from armscan.volumes import LabelMap, LabelVolume, ManipulatorAction, open_dataset, read_volume, record_planes
 from armscan.volumes.dataset import Dataset
-from armscan.volumes.resampling import resampled
-
-from ..conftest import make_tiny_volume
-from .test_segmentation import NAMES, write_segmentation
+from armscan.volumes.resampling import resample
+from tests.conftest import make_tiny_volume
+from tests.volumes.test_segmentation import NAMES, write_segmentation
 
 PLAIN = ["wrist.nii", "wrist.nii.gz", "wrist.nrrd", "wrist.mha", "wrist.mhd"]
 FILES = [*PLAIN, "wrist.seg.nrrd", "layers.seg.nrrd"]
@@ -208,4 +207,4 @@ def test_dataset_answers_any_argument(changes):
 @SETTINGS
 @given(anything)
 def test_resampled_answers_any_spacing(spacing):
-    check_sound(refuses(lambda: resampled(make_tiny_volume(), spacing)))
+    check_sound(refuses(lambda: resample(make_tiny_volume(), spacing)))

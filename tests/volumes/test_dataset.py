@@ -4,7 +4,7 @@ import pytest
 
 from armscan.errors import InvalidValueError, ManifestError, VolumeError
 from armscan.volumes import Dataset, read_dataset
-from armscan.volumes.report import StoredFile, VolumeReport
+from armscan.volumes.summary import StoredFile, VolumeReport
 
 PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
 

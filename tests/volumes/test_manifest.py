@@ -180,6 +180,14 @@ def test_record_planes_tells_entries_apart_that_yaml_has_as_one(folder):
     assert dataset.subjects == {"a.nii.gz": "S1", "b.nrrd": "S1"}
 
 
+def test_record_planes_keeps_comments_and_small_numbers(folder):
+    written(folder, "# ours\nvolumes:\n  a.nii.gz:\n    subject: 'S1'  # left\n    score: -0.5\n  b.nrrd: {}\n")
+    action = ManipulatorAction((0.0, 0.0), (1e-05, 2.0))
+    text = record_planes(folder, {"a.nii.gz": (action, -1e-05)}).read_text()
+    assert text.startswith("# ours\nvolumes:\n  a.nii.gz:\n    subject: 'S1'  # left\n    score: -1.0e-05\n")
+    assert open_dataset(folder).volumes["a.nii.gz"].optimal_action == action
+
+
 @pytest.mark.parametrize("contents", [None, "axes: xyz", ""])
 def test_record_planes_makes_what_is_missing(folder, contents):
     if contents is not None:
@@ -215,7 +223,7 @@ def test_record_planes_leaves_a_damaged_manifest_alone(folder):
 
 def test_manifest_page_names_every_key_and_its_example_is_one(tmp_path):
     from armscan.volumes.manifest import read_manifest
-    from armscan.volumes.schema import Manifest, Splits, VolumeEntry
+    from armscan.volumes.manifest_schema import Manifest, Splits, VolumeEntry
 
     page = (Path(__file__).parents[2] / "docs" / "manifest.md").read_text()
     keys = [

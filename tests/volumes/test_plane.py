@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from armscan.errors import InvalidValueError
-from armscan.volumes import ManipulatorAction, RigidTransform, plane_distance, slid_into
-from armscan.volumes.plane import wrapped_deg
+from armscan.volumes import ManipulatorAction, RigidTransform, plane_distance, shift_into
+from armscan.volumes.plane import wrap_deg
 
 moderate_deg = st.floats(-80, 80)
 any_mm = st.floats(-100, 100)
@@ -66,7 +66,7 @@ def test_inverse_plane_of_a_turn_about_z_shows_the_same_picture(action, moved):
 
 @given(actions, st.tuples(st.floats(0, 100), st.floats(0, 100)))
 def test_slid_into_keeps_the_plane_and_enters_the_bounds(action, bounds_mm):
-    slid = slid_into(action, bounds_mm)
+    slid = shift_into(action, bounds_mm)
     if slid is None:
         direction = action.matrix[:2, 0]
         steps = np.linspace(-1000, 1000, 20001)[:, None]
@@ -81,12 +81,12 @@ def test_slid_into_keeps_the_plane_and_enters_the_bounds(action, bounds_mm):
 
 def test_slid_into_leaves_a_plane_within_the_bounds_where_it_is():
     action = ManipulatorAction((12.0, 3.0), (4.0, 5.0))
-    assert slid_into(action, (10.0, 10.0)) == action
+    assert shift_into(action, (10.0, 10.0)) == action
 
 
 @pytest.mark.parametrize(("angle", "wrapped"), [(0, 0), (180, 180), (-180, 180), (190, -170), (-361, -1), (540, 180)])
 def test_wrapped_deg(angle, wrapped):
-    assert wrapped_deg(angle) == pytest.approx(wrapped)
+    assert wrap_deg(angle) == pytest.approx(wrapped)
 
 
 def test_plane_distance_of_parallel_planes_is_their_offset():

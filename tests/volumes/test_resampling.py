@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 
 from armscan.errors import VolumeError
 from armscan.volumes import LabelVolume, ManipulatorAction, open_dataset
-from armscan.volumes.resampling import finest_spacing, resampled
-
-from ..conftest import make_tiny_volume
+from armscan.volumes.resampling import finest_spacing, resample
+from tests.conftest import make_tiny_volume
 
 
 def random_volume(shape, spacing, seed=0):
@@ -27,7 +26,7 @@ def random_volume(shape, spacing, seed=0):
 def test_resampled_gives_each_voxel_the_nearest_label_and_keeps_the_frame(shape, spacing, factors):
     volume = random_volume(shape, spacing)
     wanted = tuple(step * factor for step, factor in zip(spacing, factors, strict=True))
-    finer = resampled(volume, wanted)
+    finer = resample(volume, wanted)
     if np.allclose(finer.spacing, volume.spacing, rtol=1e-5):
         return
     positions = np.argwhere(np.ones(finer.shape, bool)) * np.array(wanted) / np.array(spacing)
@@ -43,12 +42,12 @@ def test_resampled_gives_each_voxel_the_nearest_label_and_keeps_the_frame(shape,
 
 def test_resampled_leaves_a_volume_of_that_spacing_alone():
     volume = make_tiny_volume()
-    assert resampled(volume, (0.5, 0.7, 0.9000001)) is volume
+    assert resample(volume, (0.5, 0.7, 0.9000001)) is volume
 
 
 def test_resampled_shows_the_same_on_a_plane():
     volume = make_tiny_volume()
-    finer = resampled(volume, (0.25, 0.7, 0.3))
+    finer = resample(volume, (0.25, 0.7, 0.3))
     action = ManipulatorAction((10.0, 5.0), (1.0, 5.0))
     seen, seen_finer = volume.slice(action), finer.slice(action)
     assert (seen == seen_finer[::2, ::3][: seen.shape[0], : seen.shape[1]]).mean() > 0.95
@@ -56,7 +55,7 @@ def test_resampled_shows_the_same_on_a_plane():
 
 def test_resampled_refuses_what_no_machine_holds():
     with pytest.raises(VolumeError, match=r"wrist: resampled from .* it would have .* voxels, but"):
-        resampled(random_volume((8, 8, 8), (1.0, 1.0, 1.0)), (1e-6, 1e-6, 1e-6))
+        resample(random_volume((8, 8, 8), (1.0, 1.0, 1.0)), (1e-6, 1e-6, 1e-6))
 
 
 @pytest.mark.parametrize(("spacing", "expected"), [("own", False), ("finest", True)])

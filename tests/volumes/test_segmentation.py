@@ -5,11 +5,13 @@ from pathlib import Path
 import nrrd
 import numpy as np
 import pytest
+import slicerio
 
 from armscan.errors import VolumeError
 from armscan.volumes import LabelMap, open_dataset, read_volume
 
-SHARED = Path(__file__).parents[3] / "shared" / "slicer-files"
+# Saved by 3D Slicer; the package carries them for its own tests.
+SLICER_FILES = Path(slicerio.__file__).parent / "data"
 NAMES = ("Bones", "tendons", "ARTERY")
 # Left, posterior, superior: the second axis runs backwards.
 DIRECTIONS = np.array([[0.0, 0.5, 0.0], [0.0, 0.0, -0.7], [0.9, 0.0, 0.0]])
@@ -154,15 +156,13 @@ def test_damaged_segmentations_are_refused(tmp_path, tiny_volume, segments, chan
         read_volume(path)
 
 
-needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"needs 3D Slicer's own files in {SHARED}")
 RIBS = {"bones": ["ribs"], "tendons": ["right lung", "left lung"]}
 
 
-@needs_shared
 def test_a_real_segmentation_is_read_by_segment_names():
     import SimpleITK
 
-    path = SHARED / "Segmentation.seg.nrrd"
+    path = SLICER_FILES / "Segmentation.seg.nrrd"
     volume = read_volume(path, labels=LabelMap(**RIBS, artery=["tissue"], others="background"))
     stored = SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(path))).transpose(2, 1, 0)
     for label, values in {1: [1], 2: [5, 6], 3: [7]}.items():
@@ -170,9 +170,8 @@ def test_a_real_segmentation_is_read_by_segment_names():
     assert read_volume(path, labels=LabelMap(**RIBS, artery=["tissue"], others="background"), orientation="RAS")
 
 
-@needs_shared
 def test_a_real_segmentation_with_overlapping_segments_is_refused_or_resolved():
-    path = SHARED / "SegmentationOverlapping.seg.nrrd"
+    path = SLICER_FILES / "SegmentationOverlapping.seg.nrrd"
     labels = LabelMap(**RIBS, artery=["overlapping sphere"], others="background")
     with pytest.raises(VolumeError, match=r"the segments '.*' and 'overlapping sphere' overlap"):
         read_volume(path, labels=labels)

@@ -11,9 +11,9 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from armscan.checks import check_seed
 from armscan.errors import InvalidValueError
-from armscan.files import cache_folder, write_whole
+from armscan.utils.files import atomic_write, cache_folder
+from armscan.utils.validation import check_seed
 from armscan.volumes.phantom import generate, tube, wrist
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.volume import LabelVolume
@@ -23,12 +23,12 @@ _IN_MEMORY: WeakValueDictionary[Path, LabelVolume] = WeakValueDictionary()
 
 
 def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None) -> dict[str, LabelVolume]:
-    """Returns the phantoms of the given seeds by name; see `load_phantom`."""
+    """Return the phantoms of the given seeds by name; see `load_phantom`."""
     return {volume.name: volume for volume in (load_phantom(seed, cache_dir) for seed in seeds)}
 
 
 def load_phantom(seed: int, cache_dir: Path | None = None) -> LabelVolume:
-    """Returns the phantom of a seed, from the cache where it is there, made and kept otherwise.
+    """Return the phantom of a seed, from the cache where it is there, made and kept otherwise.
 
     Args:
         seed: as in `make_phantom`.
@@ -88,4 +88,4 @@ def _write(path: Path, volume: LabelVolume) -> None:
         "spacing": np.array(volume.spacing),
         "optimal_action": volume.optimal_action.to_array(),
     }
-    write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
+    atomic_write(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))

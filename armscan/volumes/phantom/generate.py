@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.checks import check_seed
+from armscan.utils.validation import check_seed
 from armscan.volumes.phantom.tube import Tube, fill_tube
 from armscan.volumes.phantom.wrist import draw_wrist
-from armscan.volumes.plane import FloatArray, ManipulatorAction, slid_into
+from armscan.volumes.plane import FloatArray, ManipulatorAction, shift_into
 from armscan.volumes.volume import LabelVolume
 
 SHAPE = (360, 800, 80)
@@ -35,7 +35,7 @@ class Pose:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Pose:
-        """Draws a pose in which the whole wrist is in the field of view."""
+        """Draw a pose in which the whole wrist is in the field of view."""
         across_mm, along_mm, depth_mm = np.multiply(SHAPE, SPACING_MM)
         return cls(
             rotation=(rng.uniform(-15.0, 15.0), rng.uniform(-2.0, 2.0)),
@@ -50,25 +50,25 @@ class Pose:
             left=bool(rng.random() < 0.5),
         )
 
-    def placed(self, tube: Tube) -> Tube:
-        """Returns the tube of a usual right hand as this hand has it."""
-        return (tube.mirrored() if self.left else tube).scaled(self.size)
+    def place(self, tube: Tube) -> Tube:
+        """Return the tube of a usual right hand as this hand has it."""
+        return (tube.mirror() if self.left else tube).scale(self.size)
 
     def optimal_action(self) -> ManipulatorAction:
-        """Returns the plane y = 0 of the wrist in the volume's frame, with its origin at the volume's side."""
+        """Return the plane y = 0 of the wrist in the volume's frame, with its origin at the volume's side."""
         plane = ManipulatorAction(self.rotation, (0.0, 0.0))
         across, in_depth = plane.matrix[:, 0], plane.matrix[:, 2]
         at_floor_mm = self.origin_mm - self.origin_mm[2] / in_depth[2] * in_depth
         at_side_mm = at_floor_mm - at_floor_mm[0] / across[0] * across
         action = ManipulatorAction(self.rotation, (0.0, at_side_mm[1]))
         bounds_mm = (SHAPE[0] * SPACING_MM[0], SHAPE[1] * SPACING_MM[1])
-        slid = slid_into(action, bounds_mm)
+        slid = shift_into(action, bounds_mm)
         assert slid is not None, "a pose keeps its plane inside the field of view"
         return slid
 
 
 def make_phantom(seed: int) -> LabelVolume:
-    """Makes the phantom wrist of a seed, 360 x 800 x 80 voxels of 0.27 x 0.27 x 0.55 mm.
+    """Make the phantom wrist of a seed, 360 x 800 x 80 voxels of 0.27 x 0.27 x 0.55 mm.
 
     Args:
         seed: of everything drawn: anatomy, size, pose, left or right, stray voxels.
@@ -85,13 +85,13 @@ def make_phantom(seed: int) -> LabelVolume:
     plane = ManipulatorAction(pose.rotation, (0.0, 0.0))
     labels = np.zeros(SHAPE, dtype=np.uint8)
     for tube in draw_wrist(rng):
-        fill_tube(labels, SPACING_MM, plane.matrix, pose.origin_mm, pose.placed(tube).nodes, tube.label)
+        fill_tube(labels, SPACING_MM, plane.matrix, pose.origin_mm, pose.place(tube).nodes, tube.label)
     _scatter_strays(labels, rng)
     return LabelVolume(labels, SPACING_MM, f"phantom-{seed}", optimal_action=action)
 
 
 def _scatter_strays(labels: np.ndarray, rng: np.random.Generator) -> None:
-    """Labels single background voxels at random, as slips of a segmenting hand do."""
+    """Label single background voxels at random, as slips of a segmenting hand do."""
     n_strays = rng.integers(*N_STRAY_VOXELS)
     where = tuple(rng.integers(0, n, n_strays) for n in labels.shape)
     strays = rng.integers(1, 4, n_strays).astype(np.uint8)

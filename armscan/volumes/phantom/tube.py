@@ -30,7 +30,7 @@ class Tube:
     def ovoid(
         cls, label: int, centre: tuple[float, float, float], radii: tuple[float, float, float], bluntness: float = 3.0
     ) -> Self:
-        """An egg about `centre` (x, y, z) with `radii` (x, y, z) in mm; a larger `bluntness` blunts its ends."""
+        """Return an egg about `centre` (x, y, z) with `radii` (x, y, z) in mm; a larger `bluntness` blunts its ends."""
         x, y, z = centre
         heights = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 17))
         width = (1 - np.abs(heights) ** bluntness) ** 0.5
@@ -41,7 +41,7 @@ class Tube:
     def shaft(
         cls, label: int, ends: tuple[tuple[float, float, float], tuple[float, float, float]], radii: tuple[float, float]
     ) -> Self:
-        """A long bone between two ends (x, y, z): thick at both, thinner between; `radii` (end, middle) in mm."""
+        """Return a long bone between two ends (x, y, z), thinner in the middle; `radii` (end, middle) in mm."""
         start, stop = sorted(ends, key=lambda end: end[1])
         along = np.array([0.0, 0.02, 0.06, 0.15, 0.3, 0.5, 0.7, 0.85, 0.94, 0.98, 1.0])
         end, middle = radii
@@ -52,17 +52,17 @@ class Tube:
 
     @classmethod
     def cord(cls, label: int, nodes: list[tuple[float, float, float, float, float]]) -> Self:
-        """A tendon, vessel or nerve through nodes (y, x, z, radius_x, radius_z), in any order along y."""
+        """Return a tendon, vessel or nerve through nodes (y, x, z, radius_x, radius_z), in any order along y."""
         return cls(label, np.array(sorted(nodes)))
 
-    def mirrored(self) -> Tube:
-        """The same tube of the other hand."""
+    def mirror(self) -> Tube:
+        """Return the same tube of the other hand."""
         nodes = self.nodes.copy()
         nodes[:, X] *= -1
         return Tube(self.label, nodes)
 
-    def scaled(self, factor: float) -> Tube:
-        """The same tube of a larger or smaller hand."""
+    def scale(self, factor: float) -> Tube:
+        """Return the same tube of a larger or smaller hand."""
         return Tube(self.label, self.nodes * factor)
 
 
@@ -75,7 +75,7 @@ def fill_tube(
     nodes: NDArray[np.float64],
     label: int,
 ) -> None:
-    """Labels the background voxels of a volume that lie in a tube.
+    """Label the background voxels of a volume that lie in a tube.
 
     Args:
         labels_xyz: the volume, changed in place; only voxels that are 0 are labelled.

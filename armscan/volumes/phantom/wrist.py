@@ -27,7 +27,7 @@ JOINT_Y = (-78.0, -113.0, -117.0, -109.0, -93.0)
 
 
 def draw_wrist(rng: np.random.Generator) -> list[Tube]:
-    """Draws the anatomy of one right wrist, of usual size; bones come first, so that they stay whole."""
+    """Draw the anatomy of one right wrist, of usual size; bones come first, so that they stay whole."""
     spread = rng.uniform(0.92, 1.08)
     return [
         *_forearm_bones(rng),
@@ -41,7 +41,7 @@ def draw_wrist(rng: np.random.Generator) -> list[Tube]:
 
 
 def _ovoid(rng: np.random.Generator, centre: tuple[float, float, float], radii: tuple[float, float, float]) -> Tube:
-    """A carpal bone, each of its figures varied a little."""
+    """Return a carpal bone, each of its figures varied a little."""
     x, y, z = np.array(centre) + rng.normal(0.0, (0.2, 0.5, 0.35))
     radius_x, radius_y, radius_z = np.array(radii) * rng.uniform(0.95, 1.04, 3)
     return Tube.ovoid(BONE, (x, y, z), (radius_x, radius_y, radius_z))
@@ -168,7 +168,7 @@ def _tendons(rng: np.random.Generator, spread: float) -> Iterator[Tube]:
 
 
 def _vessel_and_nerve(rng: np.random.Generator) -> Iterator[Tube]:
-    """The ulnar artery, on the palm's side of the hook and the pisiform, and the median nerve over the tendons."""
+    """Return the ulnar artery, palmar of hook and pisiform, and the median nerve over the tendons."""
     thick = rng.uniform(0.92, 1.12)
     x, z = rng.normal(0.0, 0.5), rng.normal(0.0, 0.3)
     yield Tube.cord(

@@ -1,0 +1,86 @@
+"""A policy as files that need nothing of ours: a program of torch, and ONNX."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from textwrap import shorten
+from typing import TYPE_CHECKING
+
+import torch
+
+from armscan.agents.policy import Batch, Policy
+from armscan.errors import ExportError, is_interruption
+
+if TYPE_CHECKING:
+    from torch.export import ExportedProgram
+
+# Of an observation that is one vector, and of what comes out; a part of an observation may be called `action`.
+OBSERVATION, NEXT_ACTION = "observation", "next_action"
+MAX_REASON_CHARS = 300
+
+
+def export_program(policy: Policy, batch: Batch) -> ExportedProgram:
+    """Return a policy as a program of torch, for batches of every size.
+
+    Args:
+        policy: of a learner.
+        batch: two observations at least: one would make a program for one.
+
+    Raises:
+        ExportError: if torch.export cannot take the policy.
+    """
+    size = torch.export.Dim("n")
+    shapes = {name: {0: size} for name in batch} if isinstance(batch, dict) else {0: size}
+    with _quietly("torch.export"):
+        return torch.export.export(policy, (batch,), dynamic_shapes=(shapes,))
+
+
+def save_program(program: ExportedProgram, file: Path) -> None:
+    """Write a program, as `torch.export.load` reads it."""
+    with _quietly("torch.export"):
+        torch.export.save(program, file)
+
+
+def save_onnx(program: ExportedProgram, batch: Batch, file: Path) -> None:
+    """Write a program as ONNX, with the parts of an observation as its inputs, for batches of every size.
+
+    Args:
+        program: as `export_program` returns it.
+        batch: of observations, which names its inputs.
+        file: takes all of it, weights included.
+
+    Raises:
+        ExportError: if ONNX cannot take the program.
+    """
+    with _quietly("ONNX"):
+        onnx = torch.onnx.export(
+            program,
+            dynamo=True,
+            verbose=False,
+            external_data=False,
+            input_names=list(batch) if isinstance(batch, dict) else [OBSERVATION],
+            output_names=[NEXT_ACTION],
+        )
+        assert onnx is not None
+        onnx.save(file)
+
+
+@contextmanager
+def _quietly(what: str) -> Iterator[None]:
+    """Silence the libraries of an export, and turn its errors into one line."""
+    # It looks for torchvision.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    # Any exception: a user's network may contain operations that cannot be exported.
+    except Exception as error:
+        if is_interruption(error):
+            raise
+        reason = shorten(str(error) or repr(error), MAX_REASON_CHARS)
+        raise ExportError(f"{what} cannot take the agent's network: {reason}") from error

@@ -1,0 +1,202 @@
+"""The optimal plane of a volume that has none: a search over planes for the middle of those that score best.
+
+The reward is constant over whole regions of planes: there is not one best plane but many, and the one that a person
+marks lies well inside of them. So the planes of a coarse grid are scored, those about the largest connected region of
+best ones are scored again on a finer grid, and the middle of the region is the plane. Nothing is drawn at random.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from armscan.anatomy.rewards import PUBLISHED_TARGETS, LandmarkReward, Reward
+from armscan.anatomy.scanner import Scanner
+from armscan.anatomy.tissues import Tissues, check_tissues
+from armscan.errors import InvalidValueError, OptimalPlaneError
+from armscan.utils.validation import check_float
+from armscan.volumes.plane import FloatArray, ManipulatorAction, shift_into
+from armscan.volumes.volume import LabelVolume
+
+MAX_PLANES = 1_000_000
+# Planes one step apart are neighbours, whichever and however many of their components differ.
+NEIGHBOURS = np.ones((3, 3, 3))
+# Rewards that differ by rounding only are the same.
+SAME_REWARD = 1e-9
+# Turned further, a plane hardly crosses the arm any more.
+MAX_ANGLE_DEG = 80.0
+
+
+@dataclass(frozen=True)
+class FoundPlane:
+    """What a search has found.
+
+    Args:
+        action: the plane, its origin (tx, ty) within the volume.
+        score: its reward, in [-1, 0].
+        counts: clusters of bones, tendons and artery that it shows.
+        spread: how far the planes that score best reach, end to end: (rz, rx) in degrees, along the arm in mm.
+        n_planes: how many planes were scored.
+    """
+
+    action: ManipulatorAction
+    score: float
+    counts: tuple[int, int, int]
+    spread: tuple[float, float, float]
+    n_planes: int
+
+
+@dataclass(frozen=True)
+class PlaneGrid:
+    """Planes at even steps; a pose (rz, rx, along) is two rotations in degrees and the slice centre's y in mm.
+
+    Args:
+        lowest: pose of the first plane, shape (3,).
+        steps: from one plane to the next, shape (3,).
+        shape: number of planes along each component.
+    """
+
+    lowest: FloatArray
+    steps: FloatArray
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def between(cls, lowest: FloatArray, highest: FloatArray, steps: FloatArray) -> Self:
+        """Return a grid from the lowest to the highest pose, both included, with about these steps."""
+        n_steps = np.maximum(1.0, np.round((highest - lowest) / steps))
+        if np.prod(n_steps + 1) > MAX_PLANES:
+            raise InvalidValueError(
+                f"the search would score {np.prod(n_steps + 1):.3g} planes, but at most {MAX_PLANES} are allowed: take "
+                "larger steps or smaller angles"
+            )
+        n_rz, n_rx, n_along = (int(n) + 1 for n in n_steps)
+        return cls(lowest, (highest - lowest) / n_steps, (n_rz, n_rx, n_along))
+
+    def finer_about(self, region: NDArray[np.int64]) -> Self:
+        """Return the planes at half the steps in the box that a region's planes and their neighbours lie in."""
+        first = np.maximum(region.min(axis=0) - 1, 0)
+        last = np.minimum(region.max(axis=0) + 1, np.subtract(self.shape, 1))
+        n_rz, n_rx, n_along = (int(n) for n in 2 * (last - first) + 1)
+        return type(self)(self.pose(first), self.steps / 2, (n_rz, n_rx, n_along))
+
+    def pose(self, index: NDArray[np.int64] | FloatArray) -> FloatArray:
+        """Return the pose at an index, shape (..., 3), between two planes where it is not whole."""
+        pose: FloatArray = self.lowest + index * self.steps
+        return pose
+
+    def rewards(self, judge: PlaneScorer) -> FloatArray:
+        """Return the reward of each plane; -1 where no plane within the bounds of an action has the pose."""
+        rewards = np.full(self.shape, -1.0)
+        for index in np.ndindex(self.shape):
+            plane = plane_at(judge.volume, self.pose(np.array(index)))
+            if plane is not None:
+                rewards[index], _ = judge.seen(plane)
+        return rewards
+
+
+class PlaneScorer:
+    """Scores planes of one volume.
+
+    Args:
+        volume: the volume.
+        reward: scores what is seen.
+        tissues: how what is seen is clustered.
+    """
+
+    def __init__(self, volume: LabelVolume, reward: Reward, tissues: Tissues) -> None:
+        self.volume = volume
+        self._reward = reward
+        self._scanner = Scanner([volume], tissues)
+
+    def seen(self, plane: ManipulatorAction) -> tuple[float, tuple[int, int, int]]:
+        """Return the reward of a plane and the clusters of bones, tendons and artery that it shows."""
+        _, landmarks = self._scanner.look(0, plane.matrix, plane.offset_mm)
+        bones, tendons, artery = (int(count) for count in landmarks[:, 0])
+        return self._reward.score(landmarks, self.volume.pixel_mm), (bones, tendons, artery)
+
+
+def find_optimal_plane(
+    volume: LabelVolume,
+    *,
+    rz_deg: float = 45.0,
+    rx_deg: float = 20.0,
+    step_deg: float = 5.0,
+    step_mm: float = 3.0,
+    success_threshold: float = 0.05,
+    targets: Sequence[int] = PUBLISHED_TARGETS,
+    clustering: str | Tissues = "pixels",
+) -> FoundPlane:
+    """Find the plane in the middle of those that the landmark reward likes best.
+
+    A plane that the volume is already labelled with is not looked at. Where the best planes reach to the limits of the
+    rotations, the middle is that of the part within.
+
+    Args:
+        volume: where to search, over its whole length.
+        rz_deg: planes turned about Z by up to +- this are tried, at most 80.
+        rx_deg: the same about X.
+        step_deg: between the rotations tried at first; half of it about the region that scores best.
+        step_mm: between the places along the arm, likewise.
+        success_threshold: a plane counts as found only if it scores above -success_threshold.
+        targets: of the reward.
+        clustering: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
+
+    Returns:
+        The plane with its score.
+
+    Raises:
+        InvalidValueError: if an argument is out of bounds, or more than a million planes would be tried.
+        OptimalPlaneError: naming the volume and the best score, if no plane scores above -success_threshold.
+    """
+    if not isinstance(volume, LabelVolume):
+        raise InvalidValueError(f"volume is {volume!r}, but it must be a LabelVolume")
+    judge = PlaneScorer(volume, LandmarkReward(targets), check_tissues(clustering))
+    check_float("success_threshold", success_threshold, above=0.0, at_most=1.0)
+    rz, rx = (
+        check_float(name, limit, at_least=0.0, at_most=MAX_ANGLE_DEG)
+        for name, limit in (("rz_deg", rz_deg), ("rx_deg", rx_deg))
+    )
+    turn, shift = check_float("step_deg", step_deg, above=0.0), check_float("step_mm", step_mm, above=0.0)
+    last_mm = 2 * volume.centre_mm[1]
+
+    coarse = PlaneGrid.between(np.array([-rz, -rx, 0.0]), np.array([rz, rx, last_mm]), np.array([turn, turn, shift]))
+    rewards = coarse.rewards(judge)
+    if rewards.max() <= -success_threshold:
+        raise OptimalPlaneError(
+            f"{volume.name}: no plane of {rewards.size} scores above -success_threshold = {-success_threshold:g}; "
+            f"the best score found is {rewards.max():.3f}"
+        )
+    fine = coarse.finer_about(largest_best_region(rewards))
+    fine_rewards = fine.rewards(judge)
+    region = largest_best_region(fine_rewards)
+
+    # Where the region is bent, its middle can lie outside of it: then the nearest of its planes is taken.
+    middle = region.mean(axis=0)
+    nearest = region[np.linalg.norm(region - middle, axis=1).argmin()]
+    planes = [plane for index in (middle, nearest) if (plane := plane_at(volume, fine.pose(index))) is not None]
+    plane = max(planes, key=lambda plane: judge.seen(plane)[0] >= fine_rewards.max() - SAME_REWARD)
+    score, counts = judge.seen(plane)
+    spread_rz, spread_rx, spread_along = (float(width) for width in np.ptp(region, axis=0) * fine.steps)
+    return FoundPlane(plane, score, counts, (spread_rz, spread_rx, spread_along), rewards.size + fine_rewards.size)
+
+
+def largest_best_region(rewards: FloatArray) -> NDArray[np.int64]:
+    """Return the indices, shape (n, 3), of the largest connected region of planes that score best."""
+    regions, _ = ndimage.label(rewards >= rewards.max() - SAME_REWARD, NEIGHBOURS)
+    largest = np.bincount(regions.ravel())[1:].argmax() + 1
+    return np.argwhere(regions == largest)
+
+
+def plane_at(volume: LabelVolume, pose: FloatArray) -> ManipulatorAction | None:
+    """Return the plane of a pose, its slice in the volume's middle across; None if its origin lies outside."""
+    rz, rx, along_mm = (float(component) for component in pose)
+    turned = ManipulatorAction((rz, rx), (0.0, 0.0))
+    centre_x, _, centre_z = volume.centre_mm
+    slice_centre = turned.matrix @ np.array([centre_x, 0.0, centre_z])
+    action = ManipulatorAction((rz, rx), (centre_x - slice_centre[0], along_mm - slice_centre[1]))
+    return shift_into(action, volume.size_mm[:2])

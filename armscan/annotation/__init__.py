@@ -1,0 +1,1 @@
+"""Labelling of planes, and the explorer."""

@@ -1,0 +1,224 @@
+"""A window or notebook in which a person moves the plane: the picture of an episode over four sliders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.widgets import Button, Slider
+from numpy.typing import NDArray
+
+from armscan.anatomy import Tissues, check_tissues
+from armscan.annotation.labelling import SUCCESS_THRESHOLD
+from armscan.envs.actions import COMPONENTS
+from armscan.envs.observations import View
+from armscan.envs.panels import BACKGROUND, INK, LINE_INK, OPTIMUM_INK, PLANE_INK, Ink
+from armscan.envs.rendering import HEIGHT, WIDTH, Beside, History, draw_plane, view_of
+from armscan.envs.rules import Volumes, named_volumes
+from armscan.envs.scene import SceneSampler
+from armscan.envs.window import check_display, opened
+from armscan.errors import OptimalPlaneError
+from armscan.utils.validation import check_choice
+from armscan.volumes import LabelVolume, ManipulatorAction, open_dataset
+
+BOUND_DEG = 180.0
+N_REMEMBERED = 60
+# In pixels from the window's lower left corner: (left, bottom, width, height).
+HEIGHT_BELOW = 148
+SLIDERS_AT, SLIDER_GAP = (64, 116, 400, 18), 34
+BUTTONS_AT, BUTTON_GAP = (640, 104, 204, 32), 44
+Box = tuple[int, int, int, int]
+
+
+class Explorer:
+    """A figure with the picture of a plane, a slider for each of its components, and buttons.
+
+    Args:
+        volumes: what can be looked at, by name; at least one.
+        name: the volume to begin with.
+        tissues: how what is seen is clustered.
+
+    Attributes:
+        figure: Matplotlib's.
+        sliders: of rz, rx in degrees and tx, ty in mm, by name.
+        volume: what is looked at.
+        optimum: its optimal plane within the sliders' bounds, None where none is known.
+        plane: the current plane.
+        view: what it shows.
+        rewards: of the planes looked at in this volume, the current one last.
+    """
+
+    volume: LabelVolume
+    optimum: ManipulatorAction | None
+    plane: ManipulatorAction
+    view: View
+
+    def __init__(self, volumes: dict[str, LabelVolume], name: str, tissues: Tissues) -> None:
+        self.volumes = volumes
+        self.rewards: list[float] = []
+        self._tissues = tissues
+        self._is_setting = False
+        self.figure, self._image = opened("armscan", np.full((HEIGHT, WIDTH, 3), BACKGROUND, np.uint8), HEIGHT_BELOW)
+        # Nothing else holds the widgets, and without their owner they no longer hear what is done to them.
+        setattr(self.figure, "explorer", self)  # noqa: B010
+        self.sliders = {component: self._slider(row, component) for row, component in enumerate(COMPONENTS)}
+        self.optimum_button = self._button(0, self.go_to_optimum)
+        self.previous_button = self._button(1, partial(self.next_volume, -1), "previous volume")
+        self.next_button = self._button(2, self.next_volume, "next volume")
+        self.choose(name)
+
+    def choose(self, name: str) -> None:
+        """Go to the middle of a volume.
+
+        Raises:
+            InvalidValueError: if there is no volume of that name.
+        """
+        self.volume = self.volumes[check_choice("volume", name, list(self.volumes))]
+        self.optimum = reachable_optimum(self.volume)
+        self.rewards.clear()
+        across_mm, along_mm, _ = self.volume.size_mm
+        bounds = ((-BOUND_DEG, BOUND_DEG), (-BOUND_DEG, BOUND_DEG), (0.0, across_mm), (0.0, along_mm))
+        marks = [None] * 4 if self.optimum is None else self.optimum.to_array().tolist()
+        for slider, (low, high), mark in zip(self.sliders.values(), bounds, marks, strict=True):
+            slider.valmin, slider.valmax = low, high
+            slider.ax.set_xlim(low, high)
+            slider.vline.set_visible(mark is not None)
+            slider.vline.set_xdata([mark or 0.0] * 2)
+        self.optimum_button.label.set_text("to the optimal plane" if self.optimum else "no optimal plane known")
+        self.optimum_button.set_active(self.optimum is not None)
+        self.go_to(ManipulatorAction((0.0, 0.0), (0.0, along_mm / 2)))
+
+    def next_volume(self, n_further: int = 1) -> None:
+        """Go to the volume that comes `n_further` after the current one, in a circle."""
+        names = list(self.volumes)
+        self.choose(names[(names.index(self.volume.name) + n_further) % len(names)])
+
+    def go_to_optimum(self) -> None:
+        """Go to the optimal plane, where one is known."""
+        if self.optimum is not None:
+            self.go_to(self.optimum)
+
+    def go_to(self, plane: ManipulatorAction) -> None:
+        """Set the sliders to a plane, or as near as they reach, and show it."""
+        self._is_setting = True
+        for slider, value in zip(self.sliders.values(), plane.to_array().tolist(), strict=True):
+            slider.set_val(value)
+        self._is_setting = False
+        self._look()
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Draw what is looked at, shape (512, 860, 3)."""
+        remembered = self.rewards[-N_REMEMBERED:]
+        first = len(self.rewards) - len(remembered) + 1
+        return draw_plane(
+            self.volume,
+            self.plane,
+            self.view,
+            beside=None if self.optimum is None else Beside(self.optimum, "optimal plane"),
+            history=History(remembered, range(first, first + N_REMEMBERED), -SUCCESS_THRESHOLD, "reward by plane"),
+        )
+
+    def _look(self) -> None:
+        self.plane = ManipulatorAction.from_array(np.array([slider.val for slider in self.sliders.values()]))
+        self.view = view_of(self.volume, self.plane, tissues=self._tissues)
+        self.rewards.append(self.view.reward)
+        self._image.set_data(self.picture())
+        self.figure.canvas.draw_idle()
+
+    def _slid(self, _: float) -> None:
+        if not self._is_setting:
+            self._look()
+
+    def _slider(self, row: int, component: str) -> Slider:
+        left, bottom, width, height = SLIDERS_AT
+        axes = self._axes((left, bottom - row * SLIDER_GAP, width, height))
+        slider = Slider(
+            axes,
+            component,
+            -BOUND_DEG,
+            BOUND_DEG,
+            valinit=0.0,
+            valfmt="%.1f°" if component in ("rz", "rx") else "%.1f mm",
+            color=_rgb(LINE_INK),
+            track_color=_rgb(LINE_INK),
+            initcolor=_rgb(OPTIMUM_INK),
+            handle_style={"facecolor": _rgb(PLANE_INK), "edgecolor": _rgb(PLANE_INK)},
+        )
+        for text in (slider.label, slider.valtext):
+            text.set_color(_rgb(INK))
+        # Drawn with the picture, once.
+        slider.drawon = False
+        slider.on_changed(self._slid)
+        return slider
+
+    def _button(self, row: int, action: Callable[[], None], label: str = "") -> Button:
+        left, bottom, width, height = BUTTONS_AT
+        axes = self._axes((left, bottom - row * BUTTON_GAP, width, height))
+        button = Button(axes, label, color=_rgb(LINE_INK), hovercolor=_rgb((92, 100, 118)))
+        button.label.set_color(_rgb(INK))
+        button.on_clicked(lambda _: action())
+        return button
+
+    def _axes(self, box: Box) -> Axes:
+        left, bottom, width, height = box
+        whole = HEIGHT + HEIGHT_BELOW
+        return self.figure.add_axes((left / WIDTH, bottom / whole, width / WIDTH, height / whole))
+
+
+def explore(
+    volumes: LabelVolume | Volumes = None, *, volume: str | None = None, clustering: str | Tissues = "pixels"
+) -> Explorer:
+    """Open a window, or in a notebook a figure, in which a plane is moved by sliders.
+
+    In a notebook run `%matplotlib widget` first. In a script `matplotlib.pyplot.show()` waits until the window is
+    closed.
+
+    Args:
+        volumes: a volume, several by name or in a sequence, or a folder, with a manifest or without; four phantoms
+            where it is None. They need no labelled plane.
+        volume: the name of the one to begin with; the first where it is None.
+        clustering: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
+
+    Returns:
+        The figure with its widgets; the figure keeps it for as long as it is open.
+
+    Raises:
+        DisplayError: if no window can be opened.
+        InvalidValueError: if an argument is outside what is allowed.
+        VolumeError: if the folder or a file cannot be used.
+        ManifestError: if the folder's manifest is damaged.
+    """
+    check_display()
+    tissues = check_tissues(clustering)
+    named = _named(volumes)
+    explorer = Explorer(
+        named, next(iter(named)) if volume is None else check_choice("volume", volume, [*named]), tissues
+    )
+    explorer.figure.show()
+    return explorer
+
+
+def reachable_optimum(volume: LabelVolume) -> ManipulatorAction | None:
+    """Return a volume's optimal plane with its origin within the volume, None where there is none of that kind."""
+    sampler = SceneSampler(rotation_bounds_deg=(BOUND_DEG, BOUND_DEG), translation_bounds_mm=None, transform=None)
+    try:
+        return sampler.unmoved(volume).optimum
+    except OptimalPlaneError:
+        return None
+
+
+def _named(volumes: LabelVolume | Volumes) -> dict[str, LabelVolume]:
+    if isinstance(volumes, LabelVolume):
+        return {volumes.name: volumes}
+    if isinstance(volumes, str | Path):
+        return {volume.name: volume for volume in open_dataset(volumes, require_manifest=False).volumes.values()}
+    return named_volumes(volumes)
+
+
+def _rgb(ink: Ink) -> tuple[float, float, float]:
+    """Return a colour as Matplotlib takes it."""
+    red, green, blue = (part / 255 for part in ink)
+    return red, green, blue

@@ -1,0 +1,159 @@
+"""Labelling a folder: volume by volume a plane that is found or was drawn, into the manifest and a picture of it."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from armscan.anatomy import LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
+from armscan.envs.rendering import Beside, draw_plane, view_of
+from armscan.errors import InvalidValueError, OptimalPlaneError, listed
+from armscan.utils.files import atomic_write
+from armscan.volumes import (
+    Dataset,
+    LabelVolume,
+    ManipulatorAction,
+    open_dataset,
+    read_markup,
+    record_planes,
+    write_markup,
+)
+from armscan.volumes.markups import MARKUP_SUFFIX
+
+# Default of an environment, whose episodes end above -success_threshold.
+SUCCESS_THRESHOLD = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabellingOptions:
+    """What is to be labelled, and how.
+
+    Args:
+        data: the folder of volumes.
+        tissues: how what is seen is clustered.
+        volumes: only these, by file name; None for all.
+        overwrite: whether volumes that have a plane are labelled as well.
+        pictures: the folder for pictures, made where it is not there.
+        markups: whether a markups file for 3D Slicer is written beside each picture.
+        markup: a markups file with the plane of `volume`, to be taken instead of a search.
+        volume: the one volume to label, whether it has a plane or not.
+    """
+
+    data: Path
+    tissues: Tissues
+    volumes: tuple[str, ...] | None = None
+    overwrite: bool = False
+    pictures: Path
+    markups: bool = False
+    markup: Path | None = None
+    volume: str | None = None
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A plane that is now in the manifest.
+
+    Args:
+        volume: that it was found or drawn for, with the plane that it had before.
+        action: the plane.
+        score: its reward.
+        counts: clusters of bones, tendons and artery that it shows.
+        spread: as `FoundPlane`'s, None where a person drew the plane.
+    """
+
+    volume: LabelVolume
+    action: ManipulatorAction
+    score: float
+    counts: tuple[int, int, int]
+    spread: tuple[float, float, float] | None = None
+
+
+def label(request: LabellingOptions) -> tuple[list[Labelled], list[OptimalPlaneError]]:
+    """Find or read a plane for each volume, draw it and write it into the manifest, volume by volume.
+
+    Returns:
+        The planes that were written into the manifest, and for which volumes none was found.
+
+    Raises:
+        ArmscanError: if the request or a file cannot be used.
+    """
+    dataset = open_dataset(request.data, require_manifest=False)
+    volumes = _wanted(request, dataset)
+    if request.markups and request.markup is None:
+        _write_known_markups(request, dataset.volumes, set(volumes))
+    labelled: list[Labelled] = []
+    failures: list[OptimalPlaneError] = []
+    for number, (name, volume) in enumerate(volumes.items(), 1):
+        print(f"{number}/{len(volumes)}  {name}", flush=True)
+        try:
+            plane = _found(request, volume) if request.markup is None else _drawn(request, volume, request.markup)
+        except OptimalPlaneError as error:
+            failures.append(error)
+            continue
+        # The manifest last: no plane stands there that nobody can look at.
+        _make_folder(request.pictures)
+        _write_picture(request.pictures / f"{name}.png", plane, request.tissues)
+        if request.markups:
+            write_markup(request.pictures / f"{name}{MARKUP_SUFFIX}", volume, plane.action)
+        record_planes(request.data, {name: (plane.action, plane.score)})
+        labelled.append(plane)
+    return labelled, failures
+
+
+def _wanted(request: LabellingOptions, dataset: Dataset) -> dict[str, LabelVolume]:
+    """Return the volumes to label, by file name."""
+    names = (request.volume,) if request.volume is not None else request.volumes
+    if names is None:
+        wanted = dataset.volumes
+    else:
+        if unknown := [name for name in names if name not in dataset.volumes]:
+            raise InvalidValueError(f"the volume is {unknown[0]!r}, but it must be {listed(dataset.volumes)}")
+        wanted = {name: dataset.volumes[name] for name in names}
+    if request.overwrite or request.markup is not None:
+        return wanted
+    return {name: volume for name, volume in wanted.items() if volume.optimal_action is None}
+
+
+def _found(request: LabellingOptions, volume: LabelVolume) -> Labelled:
+    found = find_optimal_plane(volume, success_threshold=SUCCESS_THRESHOLD, clustering=request.tissues)
+    return Labelled(volume, found.action, found.score, found.counts, found.spread)
+
+
+def _drawn(request: LabellingOptions, volume: LabelVolume, markup: Path) -> Labelled:
+    action = read_markup(markup, volume)
+    score, counts = PlaneScorer(volume, LandmarkReward(), request.tissues).seen(action)
+    return Labelled(volume, action, score, counts)
+
+
+def _write_known_markups(request: LabellingOptions, volumes: dict[str, LabelVolume], to_label: set[str]) -> None:
+    """Write the planes that are there already, and stay, so that they can be corrected too."""
+    for name, volume in volumes.items():
+        is_asked_for = request.volumes is None or name in request.volumes
+        if is_asked_for and name not in to_label and volume.optimal_action is not None:
+            _make_folder(request.pictures)
+            write_markup(request.pictures / f"{name}{MARKUP_SUFFIX}", volume, volume.optimal_action)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidValueError(
+            f"--pictures is {folder}, but no folder can be made there ({error.strerror})"
+        ) from error
+
+
+def _write_picture(path: Path, plane: Labelled, tissues: Tissues) -> None:
+    """Draw the slice, and the plane from two sides; beside it the plane that the volume had before, if any."""
+    volume = plane.volume
+    beside = None if volume.optimal_action is None else Beside(volume.optimal_action, "former plane")
+    drawn = draw_plane(volume, plane.action, view_of(volume, plane.action, tissues=tissues), beside=beside)
+    picture = io.BytesIO()
+    Image.fromarray(drawn).save(picture, "PNG")
+    try:
+        atomic_write(path, lambda file: file.write(picture.getvalue()))
+    except OSError as error:
+        raise InvalidValueError(f"{path}: the picture cannot be written ({error.strerror or error})") from error

@@ -1,0 +1,227 @@
+"""`armscan data`: what a folder of volumes holds, its optimal planes, and a look at its slices."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from armscan.cli.options import Command, CommaSeparated, FilePath, clustering_option
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from armscan.annotation.labelling import Labelled, LabellingOptions
+    from armscan.volumes import Dataset
+    from armscan.volumes.summary import VolumeReport
+
+# Folder of pictures within the folder of the data.
+PICTURES = "labelling"
+
+
+@click.group()
+def data() -> None:
+    """Inspect, label and explore volumes."""
+
+
+@data.command(cls=Command, left="nothing was written", examples=["data inspect wrists"])
+@click.argument("folder")
+def inspect(folder: str) -> None:
+    """Print what the volumes of FOLDER hold.
+
+    The volumes are read as the manifest says: their tissues, and what is missing or ignored. docs/manifest.md describes
+    the manifest, which may be missing.
+    """
+    # Deferred: `--help` needs none of it.
+    from armscan.volumes import open_dataset
+
+    _print_dataset(open_dataset(folder, require_manifest=False))
+
+
+@data.command(
+    cls=Command,
+    left="the planes found so far are in the manifest",
+    examples=["data label wrists", "data label wrists --volume a.nii.gz --markup moved.mrk.json"],
+)
+@click.argument("folder")
+@click.option("--volumes", type=CommaSeparated("NAME"), help="Only these volumes, by their file names.")
+@click.option("--overwrite", is_flag=True, help="Also label volumes that have a plane.")
+@click.option(
+    "--pictures",
+    type=FilePath("FOLDER"),
+    show_default=f"FOLDER/{PICTURES}",
+    help="Folder of the pictures of the planes.",
+)
+@click.option("--markups", is_flag=True, help="Write each plane as a markups file (.mrk.json) for 3D Slicer, too.")
+@click.option("--markup", type=FilePath("FILE"), help="Read the plane of --volume from this markups file.")
+@click.option("--volume", metavar="NAME", help="Volume of --markup.")
+@clustering_option()
+def label(
+    folder: str,
+    volumes: tuple[str, ...] | None,
+    overwrite: bool,
+    pictures: Path | None,
+    markups: bool,
+    markup: Path | None,
+    volume: str | None,
+    clustering: str | None,
+) -> int:
+    """Find the optimal planes of the volumes in FOLDER.
+
+    Volumes that have a plane are left alone by default. The planes, for a person to accept or reject, are written into
+    the manifest, which is created if there is none. docs/labelling.md explains how to check and correct them.
+    """
+    if (markup is None) != (volume is None):
+        raise click.UsageError("--markup and --volume must be given together: which file, and for which volume")
+    if markup is not None and (volumes or overwrite):
+        idle = "--volumes" if volumes else "--overwrite"
+        raise click.UsageError(f"{idle} is for a search, but --markup and --volume say which plane and for what")
+    from armscan.anatomy import check_tissues
+    from armscan.annotation.labelling import LabellingOptions
+    from armscan.annotation.labelling import label as label_planes
+
+    options = LabellingOptions(
+        data=Path(folder),
+        tissues=check_tissues(clustering or "pixels"),
+        volumes=volumes,
+        overwrite=overwrite,
+        pictures=pictures or Path(folder, PICTURES),
+        markups=markups,
+        markup=markup,
+        volume=volume,
+    )
+    labelled, failures = label_planes(options)
+    if labelled:
+        _print_planes(options, labelled)
+    elif not failures:
+        print("every volume has a plane already; --overwrite looks for new ones")
+        if markups:
+            print(f"their planes as files for 3D Slicer are in {options.pictures}")
+    for failure in failures:
+        print(f"error: {failure}", file=sys.stderr)
+    return 2 if failures else 0
+
+
+@data.command(cls=Command, left="nothing is written", examples=["data explore wrists --volume a.nii.gz"])
+@click.argument("folder", required=False)
+@click.option("--volume", metavar="NAME", help="Volume to begin with.  [default: the first]")
+@clustering_option()
+def explore(folder: str | None, volume: str | None, clustering: str | None) -> None:
+    """Move the plane by sliders in a window.
+
+    FOLDER holds the volumes, with a manifest or without. Default: phantom wrists.
+
+    In a notebook: %matplotlib widget, then armscan.annotation.explorer.explore(volume).
+    """
+    from matplotlib import pyplot
+
+    from armscan.annotation.explorer import explore as open_explorer
+
+    open_explorer(folder, volume=volume, clustering=clustering or "pixels")
+    pyplot.show()
+
+
+def _print_dataset(dataset: Dataset) -> None:
+    """Print a table for each volume, and the excluded volumes."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console()
+    for name, report in dataset.reports.items():
+        plane = "a labelled plane" if dataset.volumes[name].optimal_action else "no labelled plane"
+        split = f"for {dataset.splits[name]}, " if dataset.splits else ""
+        console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{plane}", style="bold"), soft_wrap=True)
+        console.print(Text(_geometry(report)), soft_wrap=True)
+        console.print(_tissue_table(report))
+    for name, reason in dataset.excluded.items():
+        console.print(Text(f"{name}: excluded" + ("" if reason == "True" else f" ({reason})")), soft_wrap=True)
+
+
+def _tissue_table(report: VolumeReport) -> Table:
+    """Return a row for each tissue: its values in the file, and how much of it the volume holds."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from armscan.volumes import LABEL_NAMES
+    from armscan.volumes.labelmap import shown
+
+    table = Table()
+    for heading in ("tissue", "in the file (voxels)"):
+        table.add_column(heading)
+    for heading in ("voxels", "mm3"):
+        table.add_column(heading, justify="right")
+    for value, tissue in LABEL_NAMES.items():
+        sources = ", ".join(f"{each.source} ({each.n_voxels})" for each in report.stored.found if each.label == value)
+        amounts = (
+            (str(report.n_voxels[tissue]), f"{report.tissue_mm3[tissue]:.0f}")
+            if tissue in report.n_voxels
+            else ("", "")
+        )
+        table.add_row(tissue, Text(sources or "-"), *amounts)
+    if report.stored.missing:
+        table.add_row("not there", Text(shown(report.stored.missing)), "", "")
+    return table
+
+
+def _geometry(report: VolumeReport) -> str:
+    stored = report.stored
+    parts = [f"{_grid(report.shape, report.spacing)}, axes towards {report.orientation}"]
+    is_as_stored = (report.shape, report.spacing, report.orientation) == (
+        stored.shape,
+        stored.spacing,
+        stored.orientation,
+    )
+    if not is_as_stored:
+        parts.append(f"read from {_grid(stored.shape, stored.spacing)}, axes towards {stored.orientation}")
+    if stored.crop_mm:
+        kept = ", ".join(f"{axis} from {low:g} to {high:g} mm" for axis, (low, high) in stored.crop_mm.items())
+        parts.append(f"cropped to {kept}")
+    return "; ".join(parts)
+
+
+def _grid(shape: Sequence[int], spacing: Sequence[float]) -> str:
+    voxels, steps = " x ".join(map(str, shape)), " x ".join(f"{step:.4g}" for step in spacing)
+    return f"{voxels} voxels of {steps} mm"
+
+
+def _print_planes(options: LabellingOptions, labelled: Sequence[Labelled]) -> None:
+    """Print a table of the planes, and what the person who checks them can do next."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from armscan.annotation.labelling import SUCCESS_THRESHOLD
+    from armscan.config.command_hints import label_command
+    from armscan.volumes.markups import MARKUP_SUFFIX
+
+    table = Table(title="planes written into the manifest", title_justify="left")
+    table.add_column("volume", overflow="fold")
+    for heading in ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "as good over\n°, °, mm"):
+        table.add_column(heading, justify="right")
+    for plane in labelled:
+        rz, rx, tx, ty = plane.action.to_array()
+        table.add_row(
+            Text(plane.volume.name),
+            f"{plane.score:.3f}",
+            ", ".join(map(str, plane.counts)),
+            f"{rz:.1f}, {rx:.1f}",
+            f"{tx:.1f}, {ty:.1f}",
+            "-" if plane.spread is None else "{:.0f}, {:.0f}, {:.0f}".format(*plane.spread),
+        )
+    Console().print(table)
+    for plane in labelled:
+        if plane.score <= -SUCCESS_THRESHOLD:
+            wanted = f"an environment wants more than {-SUCCESS_THRESHOLD:g}"
+            print(f"note: {plane.volume.name} scores {plane.score:.3f}, and {wanted}")
+    print(f"look at   {options.pictures}")
+    print("accept    nothing is left to do")
+    print(
+        "reject    take rotation, translation and score out of the volume's entry, or give the entry an exclude: REASON"
+    )
+    if not options.markups:
+        print("          (--markups writes the planes as files for 3D Slicer)")
+    print("correct   move the plane in 3D Slicer, save it, and read it back:")
+    print(f"          {label_command(options.data, f'FILE{MARKUP_SUFFIX}')}")

@@ -1,0 +1,181 @@
+"""`armscan evaluate`: metrics or a video of an agent on any volumes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from armscan.cli.options import Command, FilePath, clustering_option, is_given, one_line, tracking_option
+from armscan.errors import InvalidValueError
+from armscan.utils.validation import LARGEST_SEED, check_int
+
+if TYPE_CHECKING:
+    from armscan.evaluation.volumes import Volumes
+
+N_EPISODES, N_VIDEO_EPISODES = 200, 3
+# Overrides of `armscan run` that are options here.
+OPTIONS = {
+    "agent": "--agent NAME",
+    "tracking.uri": "--tracking URI",
+    "tracking.experiment": "--tracking-experiment NAME",
+    "evaluation.episodes": "--episodes NUMBER",
+}
+
+
+@click.command(
+    cls=Command,
+    left="no metrics or video were written",
+    examples=[
+        "evaluate 3bf2",
+        "evaluate 3bf2 --data wrists --success-threshold 0.01",
+        "evaluate 3bf2 --data phantom --phantoms 12 --video",
+        "evaluate --agent random --data wrists projection=zy",
+    ],
+)
+@click.argument("run", nargs=-1, metavar="[RUN | KEY=VALUE...]")
+@click.option("--agent", metavar="NAME", help="Evaluate an agent that needs no training instead of a run's.")
+@click.option(
+    "--data",
+    metavar="FOLDER|phantom",
+    help="Volumes: a folder, or phantoms that no run trains on.  [default: the agent's own]",
+)
+@click.option("--phantoms", type=click.IntRange(1, 10_000), default=8, help="Number of phantoms, for --data phantom.")
+@click.option(
+    "--episodes",
+    type=click.IntRange(1),
+    show_default=f"{N_EPISODES}; {N_VIDEO_EPISODES} with --video",
+    help="Episodes for each split, in turn on its volumes.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0, LARGEST_SEED),
+    default=0,
+    help="Seed of the episodes; all agents play the same ones.",
+)
+@click.option("--video", is_flag=True, help="Record the episodes as GIF and MP4 instead; nothing is tracked.")
+@click.option(
+    "--out",
+    type=FilePath("PATH"),
+    help="JSON file of metrics and episodes, or folder of the video.  [default: in evaluations or films]",
+)
+@click.option(
+    "--success-threshold", type=click.FloatRange(0, 1, min_open=True), help="End episodes above minus this reward."
+)
+@click.option("--max-steps", type=click.IntRange(1), help="End episodes after so many steps.")
+@click.option("--start", type=click.Choice(["middle", "random"]), help="Where episodes start.")
+@clustering_option()
+@click.option(
+    "--deterministic-eval/--no-deterministic-eval",
+    default=None,
+    help="Take the policy's mean action, or sample its actions.",
+)
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Where the network computes.")
+@tracking_option("MLflow tracking store of the run and of the evaluation.")
+@click.option(
+    "--tracking-experiment",
+    metavar="NAME",
+    help="MLflow experiment of the evaluation, with --agent; that of a run is the run's own.",
+)
+def evaluate(
+    run: tuple[str, ...],
+    agent: str | None,
+    data: str | None,
+    phantoms: int,
+    episodes: int | None,
+    seed: int,
+    video: bool,
+    out: Path | None,
+    tracking: str,
+    tracking_experiment: str | None,
+    **rules: Any,
+) -> None:
+    """Evaluate or record an agent on any volumes.
+
+    RUN is an MLflow run ID or its first four or more characters. With --agent, any KEY=VALUE of armscan run configures
+    the agent instead, experiment=PRESET included.
+
+    The rules of the episodes and --device are the agent's own by default. docs/evaluation.md explains the metrics,
+    docs/seeing.md the video.
+    """
+    changes = {name: value for name, value in rules.items() if value is not None}
+    _check_words(run, agent, data, changes)
+    if is_given("phantoms") and data != "phantom":
+        raise click.UsageError(f"--phantoms is {phantoms}, but it is for --data phantom")
+    if tracking_experiment is not None and (agent is None or video):
+        raise click.UsageError(
+            "--tracking-experiment is for --agent without --video: the evaluation of a run is tracked in the run's "
+            "own experiment, a video not at all"
+        )
+    folder = None if data == "phantom" else data
+    if folder is not None and not Path(folder).is_dir():
+        raise InvalidValueError(
+            f"--data is {folder!r}, but there is no such folder: it must be a folder of volumes, or phantom"
+        )
+    overrides = [] if agent is None else [f"agent={agent}", *run, *(["data=nifti"] if folder else [])]
+    # Deferred: a mistake on the command line is answered before these are loaded.
+    from armscan import evaluation
+    from armscan.config.defaults import default_tracking
+    from armscan.config.error_messages import silence_library_warnings
+    from armscan.evaluation.apply import apply
+
+    silence_library_warnings()
+    n_episodes = episodes or (N_VIDEO_EPISODES if video else N_EPISODES)
+    store = default_tracking() | {"uri": tracking}
+    if tracking_experiment is not None:
+        store["experiment"] = tracking_experiment
+    with one_line(overrides):
+        subject = (
+            evaluation.agent_of_run(tracking, run[0], changes)
+            if agent is None
+            else evaluation.agent_of_overrides(overrides, folder, changes)
+        )
+        if video:
+            applied = apply(subject, data, phantoms, render_mode="rgb_array")
+        else:
+            applied = apply(subject, data, phantoms, check=lambda groups: _check_episodes(n_episodes, groups))
+    if video:
+        from armscan.evaluation.video import record_video
+        from armscan.experiment.console import from_here
+
+        for file in record_video(applied, n_episodes=n_episodes, seed=seed, out=out):
+            print(f"look at   {from_here(file)}")
+        return
+    from rich.console import Console
+
+    from armscan.evaluation.track import evaluate_and_track
+    from armscan.experiment.console import print_where_to_look
+
+    report, file = evaluate_and_track(applied, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
+    for table in evaluation.report_tables(report):
+        Console().print(table)
+    print_where_to_look(Path.cwd(), tracking, files=(str(file),))
+
+
+def _check_words(run: Sequence[str], agent: str | None, data: str | None, changes: Mapping[str, Any]) -> None:
+    """Raise an error unless there is one run or an agent, with no override that is an option here."""
+    if agent is None:
+        if any("=" in word for word in run):
+            raise click.UsageError(f"{' '.join(run)!r} configures an agent: give --agent NAME with it, or RUN alone")
+        if len(run) != 1:
+            raise click.UsageError("give one RUN, or --agent NAME")
+        return
+    from armscan.config.defaults import CHANGES
+
+    given = {CHANGES[name]: f"--{name.replace('_', '-')}" for name in changes}
+    given |= dict.fromkeys(("data", "data.path"), "--data") if data is not None else {}
+    for word in run:
+        key = word.partition("=")[0].lstrip("+~")
+        if key in OPTIONS or key.startswith(("tracking.", "evaluation.")):
+            option = OPTIONS.get(key, "options of armscan evaluate")
+            raise click.UsageError(f"{key} is for armscan run, and not read here: give {option}")
+        if key in given:
+            raise click.UsageError(f"{given[key]} and {key} are both given, but they are one value: give one of them")
+
+
+def _check_episodes(n_episodes: int, groups: Mapping[str, Volumes]) -> None:
+    for label, volumes in groups.items():
+        which = f"episodes, of which each of {len(volumes)} {label} is to have one,"
+        check_int(which, n_episodes, at_least=len(volumes))

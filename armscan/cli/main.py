@@ -1,0 +1,67 @@
+"""The program `armscan`: its commands, and how mistakes and interrupts end it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+import click
+
+from armscan.cli.data import data
+from armscan.cli.evaluate import evaluate
+from armscan.cli.options import TRACEBACKS, Interrupted
+from armscan.cli.policy import policy
+from armscan.cli.report import report
+from armscan.cli.run import run
+from armscan.cli.runs import runs
+from armscan.cli.ui import ui
+
+PROGRAM = "armscan"
+
+
+@click.group(
+    commands=(run, evaluate, runs, policy, report, ui, data),
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120, "show_default": True},
+)
+@click.version_option(package_name="armscan")
+def armscan() -> None:
+    """Train and evaluate agents that find the carpal tunnel's plane in labelmaps of the arm.
+
+    armscan COMMAND --help explains a command.
+    """
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program; a mistake of its user is answered in one line.
+
+    Args:
+        arguments: of the command line. Default: those of this process.
+
+    Returns:
+        The exit code: 2 for a mistake, 130 for an interrupt, else the command's own.
+    """
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        return armscan.main(words, prog_name=PROGRAM, standalone_mode=False) or 0
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message(), file=sys.stderr)
+        return error.exit_code
+    except Interrupted as error:
+        print(f"\n{error.message}", file=sys.stderr)
+        return error.exit_code
+    except click.ClickException as error:
+        print(f"error: {' '.join(error.format_message().split())}", file=sys.stderr)
+        return error.exit_code
+    except click.Abort:
+        print("\ninterrupted", file=sys.stderr)
+        return Interrupted.exit_code
+    except Exception as error:
+        # Deferred: it loads Hydra.
+        from armscan.config.error_messages import one_line_message
+
+        line = one_line_message(error, words)
+        if line is None or os.environ.get(TRACEBACKS):
+            raise
+        print(f"error: {line}", file=sys.stderr)
+        return 2

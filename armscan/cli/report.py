@@ -1,0 +1,90 @@
+"""`armscan report`: the HTML report of a study, or of runs compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from armscan.cli.options import Command, FilePath, is_given, storage_option, tracking_option
+from armscan.errors import InvalidValueError, StudyError, listed
+
+# The option with the place of what the report is of.
+PLACES = {"study": "storage", "runs": "tracking"}
+
+
+@click.command(
+    cls=Command, left="the report may be incomplete", examples=["report --study sac_y", "report --runs 4f2a,91c0"]
+)
+@click.option("--study", metavar="NAME", help="Report on this study.")
+@click.option(
+    "--runs",
+    metavar="ID,ID,...",
+    help="Compare these runs: MLflow run IDs or their beginnings. A multirun or a trial stands for all trainings below "
+    "it, experiment:NAME for an MLflow experiment.",
+)
+@click.option("--out", type=FilePath("FOLDER"), help="Folder of the report.  [default: a new one in reports]")
+@storage_option("Optuna storage of the study.")
+@tracking_option("MLflow tracking store of the runs.")
+def report(study: str | None, runs: str | None, out: Path | None, storage: str, tracking: str) -> None:
+    """Report on a study, or compare runs.
+
+    The report is one HTML file that needs no server, with its numbers as CSV beside it. The study or the runs may still
+    be running. docs/reports.md explains how to read it.
+    """
+    if (study is None) == (runs is None):
+        given = "neither --study nor --runs is given" if study is None else "--study and --runs are both given"
+        raise click.UsageError(f"{given}, but a report is of one of them: give --study NAME or --runs ID,ID")
+    of, other = ("study", "runs") if runs is None else ("runs", "study")
+    if is_given(PLACES[other]):
+        raise click.UsageError(f"--{PLACES[other]} is given, but it is for --{other}, and this report is of --{of}")
+    _check_folder(out)
+    # Deferred: a mistake on the command line is answered before these are loaded.
+    from armscan.config.error_messages import silence_library_warnings
+    from armscan.reports.runs import compare_runs
+
+    silence_library_warnings()
+    if runs is not None:
+        file = compare_runs(runs, tracking, None if out is None else str(out))
+    elif study is not None:
+        file = _report_on_study(study, storage, out)
+    print(f"look at   {file}")
+
+
+def _report_on_study(name: str, uri: str, out: Path | None) -> Path:
+    import optuna
+
+    from armscan.sweeps.results.report import write_report
+    from armscan.sweeps.storage.storage import existing_storage
+    from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX, check_study_name
+    from armscan.sweeps.study.study import is_ours
+
+    check_study_name("--study", name)
+    storage = existing_storage(uri, where="--storage")
+    if storage is None:
+        raise StudyError(f"--storage is {uri!r}, but nothing is there: give the one that it is in")
+    names = optuna.get_all_study_names(storage.optuna)
+    if name not in names:
+        others = [each for each in names if not each.endswith(FINAL_EVAL_SUFFIX)]
+        raise StudyError(f"--study is {name!r}, but {_there_are(others)} in {storage.uri!r}")
+    study = optuna.load_study(study_name=name, storage=storage.optuna)
+    if not is_ours(study):
+        raise StudyError(f"--study is {name!r}, but that one in {storage.uri!r} was not made by armscan")
+    evaluated = []
+    if name + FINAL_EVAL_SUFFIX in names:
+        final = optuna.load_study(study_name=name + FINAL_EVAL_SUFFIX, storage=storage.optuna)
+        evaluated = final.get_trials(deepcopy=False)
+    return write_report(study, evaluated, out or Path("reports", name))
+
+
+def _check_folder(out: Path | None) -> None:
+    """Raise an error where the report's folder cannot be made, before the report is."""
+    if out is not None:
+        nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
+        if not nearest.is_dir():
+            raise InvalidValueError(f"--out is {str(out)!r}, but {nearest} is no folder: name one, or a new one")
+
+
+def _there_are(names: Sequence[str]) -> str:
+    return f"there is only {listed(names)}" if names else "there is no study"

@@ -1,0 +1,273 @@
+"""`armscan runs`: the runs of an MLflow tracking store."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from armscan.cli.options import Command, CommaSeparated, FilePath, Moment, UriParam, tracking_option
+
+if TYPE_CHECKING:
+    from armscan.runs.query import Selection
+    from armscan.tracking import TrackingStore
+
+STATUSES = ("finished", "failed", "killed", "running")
+SORTS = ("started", "duration", "success", "steps", "size")
+REPRODUCTIONS = Path("reproductions")
+
+
+SELECTION = (
+    click.option("--experiment", metavar="NAME", help="Only runs of this MLflow experiment."),
+    click.option(
+        "--status", type=CommaSeparated("STATUS", STATUSES), help=f"Only runs that are {', '.join(STATUSES)}."
+    ),
+    click.option("--agent", type=CommaSeparated("NAME"), help="Only runs of these agents."),
+    click.option("--obs", type=CommaSeparated("NAME"), help="Only runs with these observations."),
+    click.option("--projection", metavar="NAME,...", help="Only runs with these projections, such as zy or [rz,ty]."),
+    click.option("--since", type=Moment(), help="Only runs started then or later: 90m, 12h, 7d, 4w or 2026-01-31."),
+    click.option("--before", type=Moment(), help="Only runs started before then."),
+    click.option("--where", metavar="FILTER", help="Only runs that match this MLflow filter string."),
+    click.option("--parent", metavar="RUN", help="Only children of this multirun, study or evaluated run."),
+    click.option(
+        "--sort",
+        type=click.Choice([f"{sign}{key}" for key in SORTS for sign in ("", "-")]),
+        metavar="KEY",
+        default="-started",
+        help=f"Sort by {', '.join(SORTS)}; -KEY: descending.",
+    ),
+    click.option("--limit", type=click.IntRange(1), help="Only so many runs."),
+)
+
+
+def _with_selection(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that select runs."""
+    for option in reversed(SELECTION):
+        command = option(command)
+    return command
+
+
+@click.group()
+def runs() -> None:
+    """List, show, prune, sync and reproduce runs."""
+
+
+@runs.command(
+    "list",
+    cls=Command,
+    left="nothing was changed",
+    examples=["runs list --status failed,killed --since 7d", "runs list --agent sac --sort -success --limit 5"],
+)
+@_with_selection
+@click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), default="table", help="Output format.")
+@click.option("--children", is_flag=True, help="List children below their parents, not collapsed into them.")
+@tracking_option()
+def list_runs(form: str, children: bool, tracking: str, **selected: Any) -> None:
+    """List runs, the newest first.
+
+    docs/runs.md explains the columns.
+    """
+    from armscan.runs import Sizes, collapse, expand, find, sort_rows, write_entries
+
+    with _open(tracking) as client:
+        selection = _selection(**selected)
+        found = find(client, selection)
+        entries = sort_rows(collapse(found, Sizes(client)), selection.sort, is_down=selection.is_down)[
+            : selection.limit
+        ]
+        if not entries and form == "table":
+            print(f"no run of {client.uri} is selected")
+        else:
+            write_entries(expand(entries, found) if children else entries, form)
+
+
+@runs.command(cls=Command, left="nothing was changed", examples=["runs show 3bf2"])
+@click.argument("run")
+@tracking_option()
+def show(run: str, tracking: str) -> None:
+    """Show everything about a run.
+
+    RUN is an MLflow run ID or its first four or more characters.
+    """
+    from armscan.runs import show as show_run
+    from armscan.tracking import find_run
+
+    with _open(tracking) as client:
+        show_run(client, find_run(client, run), tracking)
+
+
+@runs.command(
+    cls=Command,
+    left="what was not removed by now is still there",
+    examples=["runs prune checkpoints --before 30d", "runs prune runs --status failed --before 7d --apply"],
+)
+@click.argument("what", type=click.Choice(["checkpoints", "folders", "runs"]))
+@_with_selection
+@click.option("--apply", is_flag=True, help="Remove; without it, nothing is touched.")
+@tracking_option()
+def prune(what: str, apply: bool, tracking: str, **selected: Any) -> int:
+    """Remove checkpoints, folders or runs.
+
+    checkpoints: those of ended runs, from their folders. folders: those of ended runs, on this machine. runs: their
+    folders, and the runs are marked as deleted for `mlflow gc`. docs/runs.md says what is never removed.
+    """
+    from armscan.runs import RUNS, Sizes, find, format_bytes, gc_hint, plan, print_plan, sort_rows
+    from armscan.runs.rows import RunRow
+
+    with _open(tracking) as client:
+        selection = _selection(**selected)
+        sizes = Sizes(client)
+        entries = [RunRow(run, sizes) for run in find(client, selection)]
+        meant = sort_rows(entries, selection.sort, is_down=selection.is_down)[: selection.limit]
+        cases = plan(client, [entry.run for entry in meant], what)
+        if apply:
+            return remove_planned(client, cases, what)
+        print_plan(cases)
+    taken = [case for case in cases if case.left is None]
+    freed = format_bytes(sum(case.n_bytes for case in taken))
+    print(f"{what} of {len(taken)} of {len(cases)} runs would be removed, {freed}; nothing is touched")
+    if what == RUNS:
+        print(gc_hint(client.uri))
+    if taken:
+        words = click.get_current_context().obj
+        print(f"remove it {shlex.join(['armscan', 'runs', 'prune', *words, '--apply'])}")
+    return 0
+
+
+@runs.command(
+    cls=Command, left="what was not delivered is still there", examples=["runs sync outputs", "runs sync studies/sac_y"]
+)
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--tracking", type=UriParam(), help="MLflow tracking store.  [default: the one that each run names]")
+def sync(folder: Path, tracking: str | None) -> int:
+    """Upload what runs could not while their store was away.
+
+    FOLDER is the folder of a run, of a study, or above them. What is delivered already is not delivered again; runs
+    that are still going on deliver for themselves. Exit code: 1 if something is left.
+    """
+    from armscan.config.error_messages import silence_library_warnings
+    from armscan.tracking import open_existing_store
+    from armscan.tracking import sync as deliver
+
+    silence_library_warnings()
+    opened = cache(lambda tracked_in: open_existing_store(tracking or tracked_in))
+    deliveries = deliver(folder, opened)
+    for delivery in deliveries:
+        which = f"run {delivery.run_id}" if delivery.run_id else "a run"
+        left = f", the rest is left: {delivery.left}" if delivery.left else ""
+        print(f"{which} in {delivery.folder}: {delivery.n_entries} entries delivered{left}")
+    if not deliveries:
+        print(f"{folder}: nothing is left to be delivered")
+    return 1 if any(delivery.left for delivery in deliveries) else 0
+
+
+@runs.command(
+    cls=Command,
+    left="the reproduction is not complete",
+    examples=["runs reproduce 3bf2 --dry-run", "runs reproduce 3bf2 --out again"],
+)
+@click.argument("run")
+@click.option("--dry-run", is_flag=True, help="Only list what differs from the run.")
+@click.option("--out", type=FilePath("FOLDER"), show_default="reproductions/ID-TIME", help="Folder of the new run.")
+@tracking_option()
+def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str) -> int:
+    """Run a run once more, and compare every metric.
+
+    RUN is an MLflow run ID or its first four or more characters. Nothing is checked out or installed: what differs in
+    code, packages and machine is listed. The volumes must be the same. The new run has the configuration and the seed
+    of the old one, and is tracked beside it. Exit code: 0 if all metrics are equal (with --dry-run: if nothing
+    differs), else 1.
+    """
+    from armscan.config.error_messages import silence_library_warnings
+    from armscan.utils.threads import limit_threads
+
+    # As a run is computed.
+    limit_threads()
+    from armscan.runs import reproduce as reproduction
+
+    silence_library_warnings()
+    original = reproduction.load_original(tracking, run)
+    differences = reproduction.differences(original)
+    print(f"run {original.run.run_id}: {original.run.name}")
+    for difference in differences:
+        print(f"differs: {difference}")
+    if not differences:
+        print("code, packages, machine and volumes are those that it was made with")
+    if dry_run:
+        return 1 if differences else 0
+    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    folder = out or REPRODUCTIONS / f"{original.run.run_id[:8]}-{now}"
+    comparison = reproduction.reproduce(original, folder, differences)
+    for line in comparison.lines():
+        print(line)
+    return 0 if comparison.is_same else 1
+
+
+@contextmanager
+def _open(uri: str) -> Iterator[TrackingStore]:
+    """Open a store; turn its errors into a `TrackingError`."""
+    from armscan.config.error_messages import silence_library_warnings
+    from armscan.tracking import open_existing_store
+    from armscan.tracking.store import store_errors
+
+    silence_library_warnings()
+    client = open_existing_store(uri)
+    with store_errors(client.uri):
+        yield client
+
+
+def _selection(
+    status: Sequence[str] | None,
+    agent: tuple[str, ...] | None,
+    obs: tuple[str, ...] | None,
+    projection: str | None,
+    sort: str,
+    **others: Any,
+) -> Selection:
+    from armscan.runs.query import Selection, projection_params
+
+    choices = {f"choice.{group}": names for group, names in {"agent": agent, "obs": obs}.items() if names}
+    return Selection(
+        statuses=frozenset(each.upper() for each in status or ()),
+        choices=choices,
+        projections=projection_params(projection) if projection else (),
+        sort=sort.removeprefix("-"),
+        is_down=sort.startswith("-"),
+        **others,
+    )
+
+
+def remove_planned(client: TrackingStore, cases: Sequence[Any], what: str) -> int:
+    """Remove what is planned, run by run, and print how each went; return the exit code."""
+    from armscan.runs import RUNS, NotRemovedError, RunSkippedError, format_bytes, gc_hint, remove
+    from armscan.tracking.client import reason_in
+
+    freed, n_removed, n_failed = 0, 0, 0
+    for case in cases:
+        run_id = case.run.info.run_id
+        if case.left is not None:
+            print(f"{run_id} stays: {case.left}")
+            continue
+        try:
+            note = remove(client, case, what)
+        except RunSkippedError as error:
+            print(f"{run_id} stays: {error}")
+        # An error of one store must not affect the runs of the others.
+        except Exception as error:
+            n_failed += 1
+            reason = error if isinstance(error, NotRemovedError) else reason_in(error)
+            print(f"{run_id} is not removed: {reason}", file=sys.stderr)
+        else:
+            freed, n_removed = freed + case.n_bytes, n_removed + 1
+            print(f"{run_id} removed, {format_bytes(case.n_bytes)}" + (f"; {note}" if note else ""), flush=True)
+    print(f"{what} of {n_removed} of {len(cases)} runs removed, {format_bytes(freed)}")
+    if what == RUNS:
+        print(gc_hint(client.uri))
+    return 1 if n_failed else 0

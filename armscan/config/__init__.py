@@ -1,0 +1,1 @@
+"""Configuration: where it is, services, credentials, error messages."""

@@ -1,0 +1,52 @@
+"""The choices of each configuration group, and the help that names them."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from armscan.config.sources import CONF, SWEEP, SWEEPS, config_folder, own_folders, sweeps_folder
+
+# Groups that other configurations choose from, not people.
+HIDDEN = ("hydra/help", "study")
+MAX_CHARS = 100
+
+
+def choices() -> dict[str, dict[str, Path]]:
+    """Return the file of each choice, by group and name; one's own files replace those of the same name."""
+    own = own_folders()
+    roots = [(config_folder(), ""), (own.get(CONF), ""), (sweeps_folder(), SWEEP), (own.get(SWEEPS), SWEEP)]
+    found: dict[str, dict[str, Path]] = {}
+    for root, prefix in roots:
+        for path in sorted(root.rglob("*.yaml")) if root is not None else ():
+            group = Path(prefix, path.parent.relative_to(root)).as_posix() if root is not None else ""
+            found.setdefault(group, {})[path.stem] = path
+    return dict(sorted(found.items()))
+
+
+def summary(path: Path) -> str:
+    """Return the first sentence of the comment that a file begins with."""
+    lines = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        if not line.startswith("#"):
+            break
+        if not line.startswith("# @"):
+            lines.append(line.removeprefix("#").strip())
+    sentence = " ".join(lines).partition(". ")[0].removesuffix(".")
+    return textwrap.shorten(sentence, MAX_CHARS, placeholder=" ...")
+
+
+def choices_help() -> str:
+    """Return all groups with their choices, one line each."""
+    parts = []
+    for group, files in choices().items():
+        if group not in (".", *HIDDEN):
+            width = max(map(len, files)) + 2
+            parts += [f"{group}=", *(f"  {name:{width}}{summary(path)}".rstrip() for name, path in files.items()), ""]
+    # Hydra fills in what follows a dollar sign.
+    return "\n".join(parts).replace("$", "$$")
+
+
+OmegaConf.register_new_resolver("armscan.choices", choices_help, replace=True)

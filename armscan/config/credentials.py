@@ -1,0 +1,106 @@
+"""Passwords of services: they come from the environment or a file; an address that has one is refused."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from armscan.errors import InvalidValueError
+
+if TYPE_CHECKING:
+    from sqlalchemy import URL
+
+# Of the database with the studies; of a database with runs; of an MLflow server, as MLflow itself reads it.
+STORAGE_PASSWORD = "ARMSCAN_STORAGE_PASSWORD"
+TRACKING_PASSWORD = "ARMSCAN_TRACKING_PASSWORD"
+SERVER_PASSWORD = "MLFLOW_TRACKING_PASSWORD"
+# A variable of this name holds a file's path instead, as containers are given their secrets.
+FILE_SUFFIX = "_FILE"
+# USER:PASSWORD@, where the password of a database may contain a slash; or an option such as sslpassword=.
+PASSWORD = re.compile(
+    r"""https?://[^/?#]*:[^/?#]*@
+    | (?!https?:|sqlite|file)[\w+.-]+://[^/?#:]*:[^?#]*@
+    | (?!sqlite|file)[\w+.-]+://.*[?&]\w*password=.""",
+    re.VERBOSE,
+)
+ACCOUNT = re.compile(r"(?<=://)([^/@:?#\s]*):([^/@?#\s]*)@")
+MASK = "***"
+# A shorter password also occurs in unrelated words, and masking those would reveal it.
+MIN_MASKED_CHARS = 4
+
+
+def check_address(name: str, uri: str) -> None:
+    """Raise `InvalidValueError` if the address of a service contains a password.
+
+    Args:
+        name: the option, config key or variable that the address comes from.
+        uri: the address; a file has no password.
+    """
+    if PASSWORD.match(uri) is None:
+        return
+    if uri.startswith("http"):
+        instead = f"set MLFLOW_TRACKING_USERNAME and {SERVER_PASSWORD}"
+    else:
+        variable = STORAGE_PASSWORD if "storage" in name.split()[0].lower() else TRACKING_PASSWORD
+        instead = f"put it in ~/.pgpass or the file that PGPASSFILE names, or set {variable}"
+    raise InvalidValueError(f"{name} has a password in its address, where others could read it: {instead}")
+
+
+def check_words(words: Sequence[str]) -> None:
+    """Raise `InvalidValueError` if a `key=value` word of a command line contains a password."""
+    for word in words:
+        key, _, value = word.partition("=")
+        check_address(key, value.strip("'\""))
+
+
+def read_password(variable: str) -> str | None:
+    """Return a password from an environment variable, or from the file that `{variable}_FILE` names; None if unset.
+
+    Raises:
+        InvalidValueError: if the file cannot be read.
+    """
+    if password := os.environ.get(variable):
+        return password
+    name = variable + FILE_SUFFIX
+    file = os.environ.get(name)
+    if not file:
+        return None
+    try:
+        password = Path(file).read_text().rstrip("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise InvalidValueError(f"{name} is {file!r}, but it cannot be read ({reason})") from None
+    if not password:
+        raise InvalidValueError(f"{name} is {file!r}, but that file is empty")
+    return password
+
+
+def database_url(uri: str, variable: str) -> URL:
+    """Return the URL of a database with its driver and, where there is one, its password.
+
+    Args:
+        uri: address of a SQLite or PostgreSQL database.
+        variable: environment variable of the password; libpq reads ~/.pgpass itself.
+    """
+    # Deferred: most commands do not need it.
+    from sqlalchemy import make_url
+
+    url = make_url(uri)
+    if url.drivername == "postgresql":
+        url = url.set(drivername="postgresql+psycopg")
+    if url.get_backend_name() == "postgresql" and (password := read_password(variable)):
+        url = url.set(password=password)
+    return url
+
+
+def mask_passwords(text: str) -> str:
+    """Return a text, such as a library's error, without the passwords of this process and of any address in it."""
+    text = ACCOUNT.sub(rf"\1:{MASK}@", text)
+    for variable in (STORAGE_PASSWORD, TRACKING_PASSWORD, SERVER_PASSWORD):
+        password = os.environ.get(variable, "")
+        if len(password) >= MIN_MASKED_CHARS:
+            text = text.replace(password, MASK)
+    return text

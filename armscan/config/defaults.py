@@ -1,0 +1,50 @@
+"""Configuration outside Hydra: plain values, and the default tracking store and study storage."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from armscan.config.services import STORAGE, address_of
+from armscan.config.sources import config_file
+
+# The rules that an evaluation may change in one word, and where they stand in the configuration.
+CHANGES = {
+    "success_threshold": "env.success_threshold",
+    "max_steps": "env.max_steps",
+    "start": "env.start",
+    "clustering": "env.clustering",
+    "deterministic_eval": "agent.deterministic_eval",
+    "device": "compute.device",
+}
+RESUME, TRACKING_URI = "resume", "tracking.uri"
+# Only shows what a study would run.
+PLAN = "--plan"
+# The services that many machines share.
+CLUSTER = "cluster"
+# Hydra's options for several runs.
+MULTIRUN = ("-m", "--multirun")
+# What says where and how things are computed and kept, not what; and the seed, by which runs of the same thing differ.
+NOT_COMPARED = ("tracking", "device", "compute.device", "seed")
+# The phantoms, where a command asks for volumes.
+PHANTOM = "phantom"
+
+
+def to_plain(config: DictConfig | ListConfig) -> dict[str, Any]:
+    """Return a configuration, or a section of one, as plain dictionaries, lists, numbers and texts, all resolved.
+
+    Raises:
+        MissingMandatoryValue: if a value that must be given is not.
+    """
+    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+
+
+def default_tracking() -> dict[str, Any]:
+    """Return the default section `tracking`."""
+    return to_plain(OmegaConf.load(config_file("tracking/mlflow.yaml")))
+
+
+def default_storage() -> str:
+    """Return the default storage of studies."""
+    return address_of(STORAGE, "optuna.journal")

@@ -1,0 +1,130 @@
+"""Factories of environments with their wrappers, single and vectorised."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from gymnasium.vector import VectorEnv
+
+from armscan.anatomy import PUBLISHED_TARGETS, check_tissues
+from armscan.envs.env import ArmscanEnv
+from armscan.envs.history import boxes_of, check_exclusions
+from armscan.envs.rules import Rules, Volumes, check_reward
+from armscan.envs.vector_env import ArmscanVectorEnv
+from armscan.envs.vector_wrappers import VectorBestActionMemory, VectorFrameStack
+from armscan.envs.wrappers import MOST_KEPT, BestActionMemory, Env, FrameStack
+from armscan.errors import InvalidValueError, listed
+from armscan.utils.validation import check_bool, check_int
+from armscan.volumes import LabelVolume
+
+
+class EnvFactory:
+    """Makes environments that differ in nothing but their volumes.
+
+    Args:
+        **rules: of every environment, as in `make_armscan_env`.
+
+    Raises:
+        InvalidValueError: if there is no such rule.
+    """
+
+    def __init__(self, **rules: Any) -> None:
+        allowed = [name for maker in (Rules, make_armscan_env) for name in _keywords(maker)]
+        if unknown := [name for name in rules if name not in allowed]:
+            raise InvalidValueError(f"env has no rule {unknown[0]!r}, but only {listed(allowed)}")
+        self.rules = rules
+
+    def fitted_to(self, volumes: Mapping[str, LabelVolume]) -> EnvFactory:
+        """Return a factory whose reward is fitted to these volumes; its environments may have other volumes."""
+        tissues = check_tissues(self.rules.get("clustering", "pixels"))
+        reward = check_reward(self.rules.get("reward"), self.rules.get("targets", PUBLISHED_TARGETS))
+        return EnvFactory(
+            **self.rules | {"reward": reward.fitted_to(volumes.values(), tissues), "targets": PUBLISHED_TARGETS}
+        )
+
+    def one(self, volumes: Volumes, *, render_mode: str | None = None) -> Env:
+        """Make one environment."""
+        return make_armscan_env(volumes, render_mode=render_mode, **self.rules)
+
+    def many(self, num_envs: int, volumes: Volumes, *, autoreset_mode: str = "NextStep") -> VectorEnv[Any, Any, Any]:
+        """Make many environments on the same volumes."""
+        return make_armscan_vector_env(num_envs, volumes, autoreset_mode=autoreset_mode, **self.rules)
+
+
+def make_armscan_env(
+    volumes: Volumes = None,
+    *,
+    stack: int = 1,
+    stack_exclude: Sequence[str] = (),
+    memory: int = 0,
+    stack_memory: bool = False,
+    **kwargs: Any,
+) -> Env:
+    """Make an environment with its wrappers; this is what `gymnasium.make("armscan/Armscan-v0", ...)` calls.
+
+    Args:
+        volumes: as in `ArmscanEnv`.
+        stack: how many of the last observations are stacked; 1 for none but the latest.
+        stack_exclude: parts of a `Dict` observation that are not stacked.
+        memory: how many of the best (action, reward) pairs are added; 0 for none.
+        stack_memory: whether the memory is stacked with the rest; otherwise it is added after the stack.
+        **kwargs: the other arguments of `ArmscanEnv`.
+    """
+    order = _wrapper_order(stack, memory, stack_memory)
+    env: Env = ArmscanEnv(volumes, **kwargs)
+    for wrapper in order:
+        env = FrameStack(env, stack, exclude=stack_exclude) if wrapper == "stack" else BestActionMemory(env, memory)
+    if "stack" not in order:
+        check_exclusions(stack_exclude, boxes_of(env.observation_space, "FrameStack"))
+    return env
+
+
+def make_armscan_vector_env(
+    num_envs: int = 1,
+    volumes: Volumes = None,
+    *,
+    stack: int = 1,
+    stack_exclude: Sequence[str] = (),
+    memory: int = 0,
+    stack_memory: bool = False,
+    **kwargs: Any,
+) -> VectorEnv[Any, Any, Any]:
+    """Make many environments with their wrappers; what `gymnasium.make_vec("armscan/Armscan-v0", ...)` calls.
+
+    Args:
+        num_envs: how many.
+        volumes: as in `ArmscanEnv`.
+        stack: as in `make_armscan_env`.
+        stack_exclude: likewise.
+        memory: likewise.
+        stack_memory: likewise.
+        **kwargs: the other arguments of `ArmscanVectorEnv`.
+    """
+    order = _wrapper_order(stack, memory, stack_memory)
+    env: VectorEnv[Any, Any, Any] = ArmscanVectorEnv(num_envs, volumes, **kwargs)
+    for wrapper in order:
+        if wrapper == "stack":
+            env = VectorFrameStack(env, stack, exclude=stack_exclude)
+        else:
+            env = VectorBestActionMemory(env, memory)
+    if "stack" not in order:
+        check_exclusions(stack_exclude, boxes_of(env.single_observation_space, "VectorFrameStack"))
+    return env
+
+
+def _keywords(maker: Callable[..., Any]) -> list[str]:
+    """Return the names of what can only be given by name."""
+    parameters = inspect.signature(maker).parameters.values()
+    return [parameter.name for parameter in parameters if parameter.kind is inspect.Parameter.KEYWORD_ONLY]
+
+
+def _wrapper_order(stack: int, memory: int, stack_memory: bool) -> list[str]:
+    """Return which wrappers are put around an environment, the innermost first: `stack`, `memory`."""
+    wanted = {
+        "stack": check_int("stack", stack, at_least=1, at_most=MOST_KEPT) > 1,
+        "memory": check_int("memory", memory, at_least=0, at_most=MOST_KEPT) > 0,
+    }
+    order = ("memory", "stack") if check_bool("stack_memory", stack_memory) else ("stack", "memory")
+    return [name for name in order if wanted[name]]

@@ -1,0 +1,115 @@
+"""Observations by name, and merged ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from gymnasium import spaces
+
+from armscan.anatomy import PUBLISHED_TARGETS
+from armscan.envs.observations import (
+    ActionRewardObservation,
+    ClusterObservation,
+    Observation,
+    SliceGeometry,
+    View,
+    observe_all,
+)
+from armscan.envs.slice_observations import SliceChannelsObservation, SliceObservation
+from armscan.envs.spaces import Parts
+from armscan.errors import InvalidValueError, listed
+
+
+class MergedObservation:
+    """Several observations as one.
+
+    Args:
+        observations: what to merge, as objects or by name; no two may have a part of the same name.
+        targets: what `cluster`, given by name, divides its counts by.
+
+    Raises:
+        InvalidValueError: if there is none, or one is no observation.
+    """
+
+    def __init__(
+        self, observations: Sequence[str | Observation], *, targets: Sequence[int] = PUBLISHED_TARGETS
+    ) -> None:
+        if isinstance(observations, str) or not isinstance(observations, Sequence) or not observations:
+            raise InvalidValueError(f"observations is {observations!r}, but it must be a list of at least one")
+        self.observations = tuple(
+            member for observation in observations for member in members_of(check_observation(observation, targets))
+        )
+
+    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
+        """See `Observation.spaces`.
+
+        Raises:
+            InvalidValueError: if two observations have a part of the same name.
+        """
+        merged: dict[str, spaces.Box] = {}
+        for observation in self.observations:
+            parts = observation.spaces(geometries, n_free)
+            if twice := sorted(merged.keys() & parts.keys()):
+                raise InvalidValueError(f"merged observations both have the key {listed(twice)}")
+            merged.update(parts)
+        return merged
+
+    def observe(self, view: View) -> Parts:
+        """See `Observation.observe`."""
+        return {key: part for observation in self.observations for key, part in observation.observe(view).items()}
+
+    def observe_all(self, views: Sequence[View]) -> Parts:
+        """See `observe_all`."""
+        return {key: part for each in self.observations for key, part in observe_all(each, views).items()}
+
+
+def named_observations() -> Mapping[str, type[Observation]]:
+    """Return the observations that have a name."""
+    return {
+        "action_reward": ActionRewardObservation,
+        "cluster": ClusterObservation,
+        "slice": SliceObservation,
+        "slice_channels": SliceChannelsObservation,
+    }
+
+
+def members_of(observation: Observation) -> tuple[Observation, ...]:
+    """Return what an observation is merged of, itself where it is not."""
+    return observation.observations if isinstance(observation, MergedObservation) else (observation,)
+
+
+def check_observation(
+    observation: str | Observation | Sequence[str | Observation], targets: Sequence[int] = PUBLISHED_TARGETS
+) -> Observation:
+    """Return an observation given as such, by name, or as a list of those that are merged.
+
+    Args:
+        observation: likewise.
+        targets: what `cluster`, given by name, divides its counts by.
+
+    Raises:
+        InvalidValueError: if there is no observation of that name, or it is no observation.
+    """
+    names = named_observations()
+    if isinstance(observation, str) and observation in names:
+        return ClusterObservation(targets=targets) if observation == "cluster" else names[observation]()
+    if isinstance(observation, list | tuple):
+        return MergedObservation(observation, targets=targets)
+    has_methods = all(callable(getattr(observation, method, None)) for method in ("spaces", "observe"))
+    if isinstance(observation, str | type) or not has_methods:
+        raise InvalidValueError(
+            f"observation is {observation!r}, but it must be {listed(names)}, a list of them, or an object with the "
+            "methods of Observation"
+        )
+    return observation  # type: ignore[return-value]
+
+
+def with_action_reward(
+    observation: str | Observation | Sequence[str | Observation], targets: Sequence[int] = PUBLISHED_TARGETS
+) -> Observation:
+    """Return the observation, as `check_observation` does, with action and reward, which are part of every one."""
+    checked = check_observation(observation, targets)
+    members = members_of(checked)
+    if any(isinstance(member, ActionRewardObservation) for member in members):
+        return checked
+    return MergedObservation([*members, ActionRewardObservation()])

@@ -1,0 +1,230 @@
+"""Rules of an environment: volumes, actions, observations, reward, end of an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from armscan.anatomy import (
+    PUBLISHED_TARGETS,
+    LandmarkReward,
+    Landmarks,
+    Reward,
+    Scanner,
+    Tissues,
+    check_targets,
+    check_tissues,
+)
+from armscan.envs.actions import ActionBounds, free_components
+from armscan.envs.observation_registry import with_action_reward
+from armscan.envs.observations import Observation, View, observe_all, smallest_shape
+from armscan.envs.scene import RandomTransform, Scene, SceneSampler, slice_geometry
+from armscan.envs.spaces import MultiBoxSpace, Parts, flat_space, flatten, in_order
+from armscan.errors import InvalidValueError, OptimalPlaneError, listed
+from armscan.utils.validation import check_bool, check_choice, check_float, check_int, check_numbers
+from armscan.volumes import LabelVolume, load_phantoms, read_dataset
+from armscan.volumes.plane import ManipulatorAction
+
+STARTS = ("middle", "random")
+DEFAULT_PHANTOMS = range(4)
+MAX_DRAWS = 1000
+NO_ACTION = np.zeros(0)
+
+Volumes = Mapping[str, LabelVolume] | Sequence[LabelVolume] | str | Path | None
+ObservationLike = str | Observation | Sequence[str | Observation]
+Observed = NDArray[Any] | Parts
+
+
+class Rules:
+    """The rules that one environment or many play by; see `ArmscanEnv` for its arguments."""
+
+    def __init__(
+        self,
+        volumes: Volumes = None,
+        *,
+        observation: ObservationLike = "cluster",
+        flat: bool | None = None,
+        projection: str | Sequence[str] = "y",
+        reward: Reward | None = None,
+        targets: Sequence[int] = PUBLISHED_TARGETS,
+        clustering: str | Tissues = "pixels",
+        success_threshold: float = 0.05,
+        max_steps: int = 50,
+        start: str = "middle",
+        rotation_bounds_deg: tuple[float, float] = (180.0, 180.0),
+        translation_bounds_mm: tuple[float, float] | None = None,
+        transform: RandomTransform | None = RandomTransform(),  # noqa: B008 - it is immutable
+    ) -> None:
+        self.volumes = named_volumes(volumes)
+        self.names = list(self.volumes)
+        self.success_threshold = check_float("success_threshold", success_threshold, above=0.0, at_most=1.0)
+        self.max_steps = check_int("max_steps", max_steps, at_least=1)
+        self.start = check_choice("start", start, STARTS)
+        self.tissues = check_tissues(clustering)
+        self.reward = check_reward(reward, targets).fitted_to(self.volumes.values(), self.tissues)
+        rotation = check_numbers("rotation_bounds_deg", rotation_bounds_deg, 2, "for rz and rx")
+        if translation_bounds_mm is not None:
+            translation = check_numbers("translation_bounds_mm", translation_bounds_mm, 2, "for tx and ty")
+            translation_bounds_mm = (translation[0], translation[1])
+        self._sampler = SceneSampler(
+            rotation_bounds_deg=(rotation[0], rotation[1]),
+            translation_bounds_mm=translation_bounds_mm,
+            transform=transform,
+        )
+        self._scanner = Scanner(list(self.volumes.values()), self.tissues)
+        self._place = {name: place for place, name in enumerate(self.names)}
+        self._check_optimal_planes()
+        self.free = free_components(projection)
+        self.action_space = spaces.Box(-1.0, 1.0, (len(self.free),), np.float32)
+        self._geometries = {name: slice_geometry(volume) for name, volume in self.volumes.items()}
+        self._smallest_shape = smallest_shape(list(self._geometries.values()))
+        self._observation = with_action_reward(observation, getattr(self.reward, "targets", PUBLISHED_TARGETS))
+        self._boxes = boxes = self._observation.spaces(list(self._geometries.values()), len(self.free))
+        are_vectors = all(len(box.shape) == 1 for box in boxes.values())
+        self._is_flat = are_vectors if flat is None else check_bool("flat", flat)
+        self.observation_space: spaces.Box | MultiBoxSpace = (
+            flat_space(boxes) if self._is_flat else MultiBoxSpace(boxes)
+        )
+
+    def look(self, scenes: Sequence[Scene], actions: Sequence[ManipulatorAction]) -> list[View]:
+        """Look at planes, one in each scene; many are looked at together, on all cores.
+
+        The views' `action` is left empty.
+        """
+        maps = [scene.plane_map(action) for scene, action in zip(scenes, actions, strict=True)]
+        places = [self._place[scene.volume.name] for scene in scenes]
+        if len(scenes) == 1:
+            return [self._view(scenes[0], *self._scanner.look(places[0], *maps[0]))]
+        slices, landmarks = self._scanner.look_all(
+            np.array(places), np.array([matrix for matrix, _ in maps]), np.array([offset for _, offset in maps])
+        )
+        return [self._view(*seen) for seen in zip(scenes, slices, landmarks, strict=True)]
+
+    @property
+    def bounds(self) -> dict[str, ActionBounds]:
+        """What actions stand for on each volume, by its name."""
+        return {name: self._sampler.bounds(volume) for name, volume in self.volumes.items()}
+
+    def draw_scenes(self, names: Sequence[str], rngs: Sequence[np.random.Generator]) -> list[Scene]:
+        """Draw a scene of each named volume with the generator beside it, its optimal plane above -success_threshold.
+
+        Raises:
+            OptimalPlaneError: if no motion in a thousand leaves the optimal plane within the bounds and rewarded.
+        """
+        drawn: dict[int, Scene] = {}
+        for _ in range(MAX_DRAWS):
+            proposed = {
+                i: scene
+                for i, (name, rng) in enumerate(zip(names, rngs, strict=True))
+                if i not in drawn and (scene := self._sampler.propose(self.volumes[name], rng)) is not None
+            }
+            if proposed:
+                views = self.look(list(proposed.values()), [scene.optimum for scene in proposed.values()])
+                drawn |= {i: proposed[i] for i, view in zip(proposed, views, strict=True) if self.is_solved(view)}
+            if len(drawn) == len(names):
+                return [drawn[i] for i in range(len(names))]
+        name = next(name for i, name in enumerate(names) if i not in drawn)
+        raise OptimalPlaneError(
+            f"{name}: no transform of {MAX_DRAWS} drawn from {self._sampler.transform} keeps the optimal plane within "
+            f"the bounds {self._sampler.bounds(self.volumes[name])} and its reward above -success_threshold = "
+            f"{-self.success_threshold:g}"
+        )
+
+    def is_solved(self, view: View) -> bool:
+        """Whether a view's reward ends an episode."""
+        return view.reward > -self.success_threshold
+
+    def observe(self, view: View) -> Observed:
+        """Return the observation of a view, within `observation_space`."""
+        parts = in_order(self._observation.observe(view), self._boxes)
+        return flatten({name: part.ravel() for name, part in parts.items()}) if self._is_flat else parts
+
+    def observe_all(self, views: Sequence[View]) -> Observed:
+        """Return the observations of many views, shape (n_views, ...)."""
+        parts = in_order(observe_all(self._observation, views), self._boxes, (len(views),))
+        if not self._is_flat:
+            return parts
+        return flatten({name: part.reshape(len(views), -1) for name, part in parts.items()})
+
+    def _view(self, scene: Scene, slice_xz: NDArray[np.uint8], landmarks: Landmarks) -> View:
+        volume = scene.volume
+        return View(
+            slice_xz=slice_xz,
+            landmarks=landmarks,
+            tissues=self.tissues,
+            geometry=self._geometries[volume.name],
+            smallest_shape=self._smallest_shape,
+            action=NO_ACTION,
+            reward=self._score(landmarks, volume),
+        )
+
+    def _score(self, landmarks: Landmarks, volume: LabelVolume) -> float:
+        """Return the reward of a slice; raise `InvalidValueError` if a custom reward returns no number in [-1, 0]."""
+        score = self.reward.score(landmarks, volume.pixel_mm)
+        if type(score) is float and -1.0 <= score <= 0.0:
+            return score
+        return check_float(f"what {type(self.reward).__name__} scored", score, at_least=-1.0, at_most=0.0)
+
+    def _check_optimal_planes(self) -> None:
+        for volume in self.volumes.values():
+            scene = self._sampler.unmoved(volume)
+            _, landmarks = self._scanner.look(self._place[volume.name], *scene.plane_map(scene.optimum))
+            score = self._score(landmarks, volume)
+            if score <= -self.success_threshold:
+                counts = tuple(landmarks[:, 0].astype(int).tolist())
+                raise OptimalPlaneError(
+                    f"{volume.name}: the labelled optimal plane scores {score:.3f} (bones, tendons, artery: {counts}), "
+                    f"but it must score above -success_threshold = {-self.success_threshold:g}"
+                )
+
+
+def named_volumes(volumes: Volumes) -> dict[str, LabelVolume]:
+    """Return volumes given in any of the ways that `ArmscanEnv` takes, by name.
+
+    Raises:
+        InvalidValueError: if there is none, something else is among them, or two have the same name.
+    """
+    if volumes is None:
+        return load_phantoms(DEFAULT_PHANTOMS)
+    if isinstance(volumes, str | Path):
+        return read_dataset(volumes)
+    if isinstance(volumes, Mapping):
+        listed_volumes = list(volumes.values())
+    elif isinstance(volumes, list | tuple):
+        listed_volumes = list(volumes)
+    else:
+        raise InvalidValueError(f"volumes is {volumes!r}, but it must be volumes by name or in a list, or a folder")
+    if not listed_volumes:
+        raise InvalidValueError("volumes is empty, but an environment needs at least one")
+    for volume in listed_volumes:
+        if not isinstance(volume, LabelVolume):
+            raise InvalidValueError(f"volumes holds {volume!r}, but each must be a LabelVolume")
+    if isinstance(volumes, Mapping):
+        for key, volume in volumes.items():
+            if key != volume.name:
+                raise InvalidValueError(f"volumes holds {volume.name!r} as {key!r}, but it must be under its name")
+    named = {volume.name: volume for volume in listed_volumes}
+    if len(named) < len(listed_volumes):
+        raise InvalidValueError(f"volumes holds two of the same name among {listed(v.name for v in listed_volumes)}")
+    return named
+
+
+def check_reward(reward: Reward | None, targets: Sequence[int]) -> Reward:
+    """Return a reward given as such, or by the targets of the published one.
+
+    Raises:
+        InvalidValueError: if it is no reward, or comes with targets of its own beside it.
+    """
+    targets = check_targets(targets)
+    if reward is None:
+        return LandmarkReward(targets)
+    if targets != PUBLISHED_TARGETS:
+        raise InvalidValueError(f"targets is {targets} beside a reward of its own, but only one of both may be given")
+    if isinstance(reward, type) or not all(callable(getattr(reward, name, None)) for name in ("fitted_to", "score")):
+        raise InvalidValueError(f"reward is {reward!r}, but it must be an object with the methods of Reward")
+    return reward

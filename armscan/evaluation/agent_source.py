@@ -1,0 +1,114 @@
+"""What is evaluated: the agent of a tracked run, or one that a configuration describes."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from armscan.config.compose import compose
+from armscan.config.defaults import CHANGES
+from armscan.errors import CheckpointError, InvalidValueError
+from armscan.experiment.build import check_sections
+from armscan.tracking.lookup import DOMAIN_TAG, EVALUATED_TAG, FoundRun, load_run
+from armscan.training import CheckpointProvenance, Fingerprints, TrainingDomain, load_weights
+
+# Files and folders that the section `data` names.
+PATHS = ("path", "cache_dir")
+
+
+@dataclass(frozen=True)
+class TrainedAgent:
+    """What is evaluated.
+
+    Args:
+        name: what tables and files call it.
+        config: resolved, with the changes that were asked for.
+        run: that it was trained in, None for an agent that no run is of.
+        weights: of a learner, None where it has kept none.
+        n_env_steps: that it was trained for.
+        domain: what it was trained on, None where that was not kept.
+        volumes: the fingerprints of its run's volumes, None where these were not kept.
+    """
+
+    name: str
+    config: DictConfig
+    run: FoundRun | None = None
+    weights: dict[str, Any] | None = field(default=None, repr=False)
+    n_env_steps: int = 0
+    domain: TrainingDomain | None = None
+    volumes: Fingerprints | None = field(default=None, repr=False)
+
+
+def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any]) -> TrainedAgent:
+    """Return the agent of a tracked run.
+
+    Raises:
+        ArmscanError: if there is no such run, it has kept too little, or what it has kept is damaged.
+    """
+    run = load_run(tracking, run_id)
+    if EVALUATED_TAG in run.tags:
+        raise InvalidValueError(f"run is {run_id!r}, but that is an evaluation, of {run.tags[EVALUATED_TAG]}")
+    with tempfile.TemporaryDirectory() as folder:
+        config = from_its_folder(changed(OmegaConf.create(run.config(Path(folder))), changes), run.tags)
+        weights, facts = _weights(run, Path(folder))
+        # Of learners that were trained before runs kept them, the checkpoint has them.
+        volumes = run.volumes(Path(folder)) or facts.get("volumes") or None
+    domain = TrainingDomain.from_json(run.tags[DOMAIN_TAG]) if DOMAIN_TAG in run.tags else None
+    return TrainedAgent(run.name, config, run, weights, int(facts.get("n_env_steps", 0)), domain, volumes)
+
+
+def agent_of_overrides(words: Sequence[str], folder: str | None, changes: Mapping[str, Any]) -> TrainedAgent:
+    """Return the agent of a configuration, composed as `python -m armscan.run` composes it.
+
+    Args:
+        words: `key=value`, `agent=NAME` among them, and `data=nifti` where there is a folder.
+        folder: of the volumes that it is evaluated on, which are its own then; None for those of the configuration.
+        changes: of the rules.
+    """
+    config = compose(words)
+    if folder:
+        config.data.path = folder
+    OmegaConf.resolve(config)
+    agents = [word.partition("=")[2] for word in words if word.startswith("agent=")]
+    return TrainedAgent(agents[-1], changed(config, changes))
+
+
+def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
+    """Return the configuration with changed rules, by the names in `CHANGES`.
+
+    Raises:
+        InvalidValueError: if the configuration has no place for one, or lacks a section.
+    """
+    check_sections(config)
+    for name, value in changes.items():
+        section, _, key = CHANGES[name].partition(".")
+        if key not in config[section]:
+            raise InvalidValueError(f"{name} is {value!r}, but this agent has no such value")
+        config[section][key] = value
+    return config
+
+
+def from_its_folder(config: DictConfig, tags: Mapping[str, str]) -> DictConfig:
+    """Return a run's configuration with the files of its data named from anywhere, not from where it was started."""
+    for key in PATHS:
+        if isinstance(path := config.data.get(key), str) and "working_folder" in tags:
+            config.data[key] = str(Path(tags["working_folder"], path))
+    return config
+
+
+def _weights(run: FoundRun, folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
+    path = run.checkpoint(folder)
+    if path is None:
+        return None, {}
+    try:
+        weights, facts = load_weights(path)
+        CheckpointProvenance(run_id=run.run_id).check(path, facts)
+    except CheckpointError as error:
+        # The file lies in a folder that is gone when this is read.
+        raise CheckpointError(f"run {run.run_id}: {str(error).replace(str(path), path.name)}") from error
+    return weights, facts

@@ -1,0 +1,116 @@
+"""An evaluation with its report: as a JSON file, and as an MLflow run below the run that is evaluated."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from armscan.config.defaults import to_plain
+from armscan.errors import InvalidValueError
+from armscan.evaluation.apply import AppliedAgent, file_name
+from armscan.evaluation.report import EvaluationReport
+from armscan.evaluation.volumes import data_name
+from armscan.tracking import EVALUATED_TAG, TrackedRun, check_artifacts, deliver_pending, open_store
+from armscan.utils.files import atomic_write, check_writable
+
+FOLDER, SUFFIX = Path("evaluations"), ".json"
+# Keys of the JSON file of every evaluation.
+REPORT_KEYS = {"of", "name", "splits", "volumes", "episodes", "tracked_as"}
+
+
+def evaluate_and_track(
+    applied: AppliedAgent,
+    store: Mapping[str, Any],
+    *,
+    n_episodes: int,
+    seed: int,
+    changes: Mapping[str, Any],
+    out: Path | None = None,
+) -> tuple[EvaluationReport, Path]:
+    """Evaluate an agent, write the report as JSON, and track it.
+
+    Args:
+        applied: the agent on its volumes.
+        store: the config section `tracking`; used for an agent without a run.
+        n_episodes: for each group of volumes.
+        seed: seed of the first episode; the others follow from it.
+        changes: rules of the episodes that differ from the agent's configuration.
+        out: the JSON file. Default: a new one in `evaluations`.
+
+    Returns:
+        The report, and its JSON file.
+
+    Raises:
+        ArmscanError: if the report cannot be written or tracked.
+    """
+    subject = applied.subject
+    if subject.run is not None:
+        client, experiment_id = subject.run.client, subject.run.experiment_id
+        check_artifacts(client, experiment_id)
+        _check_out(out)
+    else:
+        _check_out(out)
+        client, experiment_id = open_store(**store)
+    deliver_pending(client)
+    of, data = subject.run.run_id if subject.run else subject.name, data_name(applied.data)
+    facts = {
+        "of": of,
+        "name": subject.name,
+        "data": applied.data or data,
+        "episodes_a_split": n_episodes,
+        "seed": seed,
+        "changes": dict(changes),
+        "notes": list(applied.notes),
+    }
+    with TrackedRun.start(
+        client,
+        experiment_id,
+        name=f"evaluation: {subject.name} on {data}",
+        config={**to_plain(subject.config), "evaluation": facts},
+        tags={EVALUATED_TAG: of},
+        folder=FOLDER,
+        parent_id=subject.run.run_id if subject.run else None,
+    ) as tracked:
+        evaluations = applied.evaluator.evaluate(n_episodes, seed, tell=partial(print, flush=True))
+        # An agent's own training and test volumes are never merged into one total.
+        report = EvaluationReport(
+            evaluations, has_total=applied.data is not None, facts={**facts, "tracked_as": tracked.run_id}
+        )
+        for group, metrics in report.metrics().items():
+            named = {f"{group}/{name}": value for name, value in metrics.items()}
+            tracked.log_figures(named, n_env_steps=subject.n_env_steps)
+        file = out or FOLDER / f"{file_name(f'{subject.name}-{data}')}-{tracked.run_id[:8]}{SUFFIX}"
+        text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
+        atomic_write(file, lambda opened: opened.write(text.encode()))
+        tracked.log_files(file)
+    return report, file
+
+
+def _check_out(out: Path | None) -> None:
+    """Write where the JSON file will lie, before an evaluation that may take hours."""
+    file = out or FOLDER / "evaluation.json"
+    if file.suffix != SUFFIX:
+        raise InvalidValueError(f"--out is {str(file)!r}, but it must be a file whose name ends with {SUFFIX}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(file)
+        is_other = out is not None and file.exists() and not _is_report(file)
+    except OSError as error:
+        raise InvalidValueError(
+            f"--out is {str(file)!r}, but no file can be written there: {error.strerror}"
+        ) from error
+    if is_other:
+        raise InvalidValueError(
+            f"--out is {str(file)!r}, but that file is no evaluation, and would be lost: name another"
+        )
+
+
+def _is_report(file: Path) -> bool:
+    try:
+        contents = json.loads(file.read_bytes())
+    except ValueError:
+        return False
+    return isinstance(contents, dict) and contents.keys() >= REPORT_KEYS

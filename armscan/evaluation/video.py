@@ -1,0 +1,70 @@
+"""A video of an agent, as a GIF and an MP4."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from functools import partial
+from pathlib import Path
+
+from armscan.errors import InvalidValueError
+from armscan.evaluation.apply import AppliedAgent, file_name
+from armscan.evaluation.runner import FIRST_SEED
+from armscan.evaluation.volumes import data_name
+from armscan.training import TEST, VideoRecorder, outcome
+from armscan.utils.files import atomic_write, check_writable
+
+FOLDER = Path("films")
+SUFFIXES = (".gif", ".mp4")
+
+
+def record_video(applied: AppliedAgent, *, n_episodes: int, seed: int, out: Path | None = None) -> list[Path]:
+    """Record the episodes that an evaluation with the same seed plays, and print how each went.
+
+    Args:
+        applied: the agent on its volumes; of its own volumes, only the test volumes are shown.
+        n_episodes: for each group of volumes.
+        seed: seed of the first episode; the others follow from it.
+        out: the folder of the files. Default: `films`.
+
+    Returns:
+        The GIF and the MP4.
+    """
+    folder = out or FOLDER
+    _check_folder(folder)
+    subject = applied.subject
+    which = [subject.run.run_id[:8]] if subject.run else []
+    name = file_name("-".join([subject.name, data_name(applied.data), *which, f"seed{seed}"]))
+    files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
+    with tempfile.TemporaryDirectory() as made_in:
+        made = [Path(made_in) / f"video{suffix}" for suffix in SUFFIXES]
+        _record(applied, n_episodes, seed, *made)
+        for source, file in zip(made, files, strict=True):
+            with source.open("rb") as contents:
+                atomic_write(file, partial(shutil.copyfileobj, contents))
+    return files
+
+
+def _record(applied: AppliedAgent, n_episodes: int, seed: int, gif: Path, mp4: Path) -> None:
+    envs = applied.evaluator.envs
+    shown = envs if applied.data else {TEST: envs[TEST]}
+    with VideoRecorder(gif, mp4) as video:
+        for label, env in shown.items():
+            names = list(env.get_wrapper_attr("volumes"))
+            for number in range(n_episodes):
+                volume, title = names[number % len(names)], f"seed {seed + number}"
+                episode = video.capture(
+                    applied.evaluator.agent, env, volume_name=volume, seed=FIRST_SEED + seed + number, title=title
+                )
+                print(f"{label}: {volume}, {title}: {outcome(episode)}", flush=True)
+
+
+def _check_folder(folder: Path) -> None:
+    """Write where the video will lie, before the agent plays for it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        check_writable(folder / "video")
+    except OSError as error:
+        raise InvalidValueError(
+            f"--out is {str(folder)!r}, but no video can be written there: {error.strerror}"
+        ) from error

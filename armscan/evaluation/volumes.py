@@ -1,0 +1,134 @@
+"""Volumes of an evaluation: the run's own, a folder, or phantoms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+
+from hydra.utils import instantiate
+
+from armscan.config.defaults import PHANTOM
+from armscan.config.error_messages import one_line_message
+from armscan.errors import InvalidValueError
+from armscan.evaluation.agent_source import TrainedAgent
+from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged, fingerprint
+from armscan.volumes import LabelVolume, load_phantoms, open_dataset
+from armscan.volumes.dataset import SPLITS
+
+# No phantom of a run has these seeds: its test phantoms begin a million below.
+PHANTOMS_FIRST_SEED = 3_000_000
+Volumes = dict[str, LabelVolume]
+
+
+def own_split(subject: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
+    """Read an agent's own volumes: those that its configuration describes.
+
+    Args:
+        subject: the agent.
+        parts: of the split that matter: in these the volumes of a run must still be those that it was started with.
+
+    Raises:
+        ChangedVolumesError: if they are not.
+        InvalidValueError: if they cannot be read.
+    """
+    run = subject.run
+    try:
+        split: Split = instantiate(subject.config.data, _convert_="object")
+    # Hydra wraps exceptions raised by constructors.
+    except Exception as error:
+        line = one_line_message(error)
+        if run is None or line is None:
+            raise
+        raise InvalidValueError(
+            f"the volumes of run {run.run_id} cannot be read: {line} (it was started in "
+            f"{run.tags.get('working_folder', 'a folder that was not kept')} on {run.tags.get('host', 'some host')})"
+        ) from error
+    if run is not None and subject.volumes is not None:
+        now = {part: prints for part, prints in split.fingerprints().items() if part in parts}
+        check_unchanged(subject.volumes, now, f"run {run.run_id} was started with")
+    return split
+
+
+def volume_groups(data: str | None, n_phantoms: int, own: Callable[[], Split]) -> dict[str, Volumes]:
+    """Return the volumes to evaluate on, by group name.
+
+    Args:
+        data: a folder, `phantom` for phantoms that no run trains on, None for the agent's own volumes.
+        n_phantoms: how many phantoms.
+        own: reads the agent's own volumes.
+    """
+    if data is None:
+        split = own()
+        return {TRAINING: split.training, VALIDATION: split.validation, TEST: split.test}
+    if data == PHANTOM:
+        return {"new phantoms": load_phantoms(range(PHANTOMS_FIRST_SEED, PHANTOMS_FIRST_SEED + n_phantoms), None)}
+    dataset = open_dataset(data)
+    groups = {f"{split} split": dataset.volumes_of(split) for split in SPLITS}
+    return {label: volumes for label, volumes in groups.items() if volumes} or {"volumes": dataset.volumes}
+
+
+def data_name(data: str | None) -> str:
+    """Return what volumes are called in the names of files and runs."""
+    return "own volumes" if data is None else Path(data).resolve().name
+
+
+def known_volumes(subject: TrainedAgent, groups: Mapping[str, Volumes]) -> list[str]:
+    """Return a sentence for each purpose that an agent's run has had these volumes for, or others of these names.
+
+    Args:
+        subject: the agent of a run.
+        groups: the volumes, by what they are called.
+    """
+    assert subject.run is not None
+    volumes = {name: volume for group in groups.values() for name, volume in group.items()}
+    prints = {name: fingerprint(volume) for name, volume in volumes.items()} if subject.volumes else {}
+    notes = []
+    for part, what in (
+        ("training", "the agent was trained on"),
+        ("validation", "the agent's checkpoint was chosen on"),
+    ):
+        had = (subject.volumes or {}).get(part, {})
+        names_of = {print_: name for name, print_ in had.items()}
+        same = {name: names_of[print_] for name, print_ in prints.items() if print_ in names_of}
+        if same:
+            shown = (name if name == there else f"{name} (there {there})" for name, there in same.items())
+            notes.append(f"{what} these volumes: {', '.join(shown)}")
+        names = had or subject.run.tags.get(f"volumes.{part}", "").split(" ")
+        if others := [name for name in volumes if name in names and name not in same]:
+            which = "other volumes" if had else "volumes"
+            notes.append(f"{what} {which} of these names: {', '.join(others)}")
+    return notes
+
+
+class TrainingVolumes(Mapping[str, LabelVolume]):
+    """The training volumes, which are not read before somebody looks at them: only some rewards do.
+
+    Args:
+        load: reads the volumes of a run.
+    """
+
+    def __init__(self, load: Callable[[], Split]) -> None:
+        self._load = load
+
+    @cached_property
+    def _volumes(self) -> Volumes:
+        try:
+            return self._load().training
+        # Hydra wraps exceptions raised by constructors.
+        except Exception as error:
+            line = one_line_message(error)
+            if line is None:
+                raise
+            raise InvalidValueError(
+                f"the reward is fitted to the volumes that the agent was trained on, but they are not to be had: {line}"
+            ) from error
+
+    def __getitem__(self, name: str) -> LabelVolume:
+        return self._volumes[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._volumes)
+
+    def __len__(self) -> int:
+        return len(self._volumes)

@@ -1,0 +1,155 @@
+"""Build an experiment from its configuration and check it before anything is trained or tracked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from armscan.agents import Agent, AgentSetup, Learner
+from armscan.config.defaults import CLUSTER
+from armscan.envs import EnvFactory
+from armscan.errors import InvalidValueError, listed
+from armscan.training import Budget, Split
+from armscan.training.domain import smallest_slice, with_crops
+from armscan.utils.validation import check_int, check_seed
+from armscan.volumes import LabelVolume
+
+SECTIONS = (
+    "data",
+    "obs",
+    "reward",
+    "agent",
+    "network",
+    "tracking",
+    "env",
+    "training",
+    "evaluation",
+    "compute",
+)
+SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
+EVALUATION_KEYS = ("episodes",)
+TRACKING_KEYS = ("uri", "experiment", "artifacts", "wait_s", "system_metrics_s", "policy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """What a configuration describes.
+
+    Args:
+        split: the volumes.
+        maker: of environments, its reward fitted to the training volumes.
+        agent: which may be a learner.
+        budget: of the training.
+        n_episodes: of each final evaluation.
+        seed: of everything that is drawn.
+        smallest_slice_px: shape (across, depth) that the slices of all volumes have at least; images are cropped to it
+            where nothing else is said, whichever the split.
+    """
+
+    split: Split
+    maker: EnvFactory
+    agent: Agent
+    budget: Budget
+    n_episodes: int
+    seed: int
+    smallest_slice_px: tuple[int, int]
+
+
+def build_experiment(config: DictConfig, split: Split | None = None) -> Experiment:
+    """Build an experiment from its composed configuration.
+
+    Args:
+        config: all of it.
+        split: its volumes, where they have been read already.
+
+    Raises:
+        InvalidValueError: if something in it is not allowed.
+    """
+    check_sections(config)
+    seed = check_seed("seed", config.seed)
+    n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
+    split = split or instantiate(config.data, _convert_="object")
+    budget = instantiate(config.training, _convert_="object")
+    smallest = smallest_slice([*split.training.values(), *split.validation.values(), *split.test.values()])
+    maker = make_env_factory(apply_crop(config, smallest, smallest), split.training)
+    agent = make_agent(config, maker, split.training, total_env_steps=budget.env_steps, seed=seed)
+    return Experiment(
+        split=split,
+        maker=maker,
+        agent=agent,
+        budget=budget,
+        n_episodes=n_episodes,
+        seed=seed,
+        smallest_slice_px=smallest,
+    )
+
+
+def apply_crop(config: DictConfig, trained_px: tuple[int, int], here_px: tuple[int, int]) -> DictConfig:
+    """Return the configuration with images cropped alike on all volumes, as `with_crops` says."""
+    node = config.env.observation
+    rules = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node
+    cropped = config.copy()
+    cropped.env.observation = with_crops(rules, trained_px, here_px)
+    return cropped
+
+
+def make_env_factory(config: DictConfig, training: Mapping[str, LabelVolume]) -> EnvFactory:
+    """Return the maker of environments, its reward fitted to the training volumes."""
+    maker: EnvFactory = instantiate(config.env, _convert_="object")
+    return maker.fitted_to(training)
+
+
+def make_agent(
+    config: DictConfig, maker: EnvFactory, volumes: Mapping[str, LabelVolume], *, total_env_steps: int, seed: int
+) -> Agent:
+    """Return the agent, which has learned nothing yet, for environments on these volumes."""
+    env = maker.one(dict(volumes))
+    setup = AgentSetup(
+        make_envs=partial(maker.many, volumes=dict(volumes), autoreset_mode="Disabled"),
+        observation_space=env.observation_space,
+        action_names=env.get_wrapper_attr("action_names"),
+        total_env_steps=total_env_steps,
+        seed=seed,
+        compute=instantiate(config.compute, _convert_="object"),
+    )
+    algorithm = instantiate(config.agent, _convert_="object")
+    if not callable(getattr(algorithm, "agent", None)):
+        raise InvalidValueError(
+            f"agent is {algorithm!r}, but it must have the method of Algorithm, agent: give agent._target_ such a class"
+        )
+    agent: Agent = algorithm.agent(setup)
+    if hasattr(agent, "learn") and not isinstance(agent, Learner):
+        missing = [name for name in dir(Learner) if not name.startswith("_") and not hasattr(agent, name)]
+        raise InvalidValueError(
+            f"agent is {type(agent).__name__}, which learns, but it must have all methods of Learner: it has no "
+            f"{listed(missing)}"
+        )
+    return agent
+
+
+def check_keys(config: DictConfig) -> None:
+    """Raise `InvalidValueError` where a key was added that nothing reads.
+
+    Sections that objects are made of refuse such keys by themselves.
+    """
+    check_sections(config)
+    for node, where, allowed in (
+        (config, "at the top", (*SECTIONS, *SINGLE_KEYS, CLUSTER)),
+        (config.evaluation, "in evaluation", EVALUATION_KEYS),
+        (config.tracking, "in tracking", TRACKING_KEYS),
+    ):
+        if unread := [key for key in node if key not in allowed]:
+            raise InvalidValueError(f"there is no key {unread[0]!r} {where}, but only {listed(allowed)}")
+
+
+def check_sections(config: DictConfig) -> None:
+    """Raise `InvalidValueError` where a whole section of the configuration was replaced by a value."""
+    for section in SECTIONS:
+        if not isinstance(config.get(section), DictConfig):
+            raise InvalidValueError(
+                f"{section} is {config.get(section)!r}, but it must be a section of the configuration"
+            )

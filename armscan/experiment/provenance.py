@@ -1,0 +1,131 @@
+"""Provenance of a run: configuration, volumes, code, packages, command, kept from its start."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Mapping
+from operator import methodcaller
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig
+
+import armscan
+from armscan.config.defaults import to_plain
+from armscan.experiment.invocation import Invocation
+from armscan.experiment.job import JOB_TAG
+from armscan.experiment.setup import RunSetup
+from armscan.tracking import (
+    DOMAIN_TAG,
+    VERSION_TAG,
+    TrackedRun,
+    deliver_pending,
+    environment_file,
+    environment_tags,
+    open_store,
+    source,
+    tags_of,
+)
+from armscan.training import Fingerprints, TrainingDomain
+from armscan.utils.files import (
+    CONFIG_FILE,
+    DIFF_FILE,
+    ENVIRONMENT_FILE,
+    RESULTS,
+    SHA256_TAGS,
+    VOLUMES_FILE,
+    atomic_write,
+    sha256,
+)
+
+CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")
+# Of a volume's fingerprint in a tag; the whole stands in a file.
+N_PRINT_CHARS = 16
+
+
+def start_tracking(
+    config: DictConfig, invocation: Invocation, setup: RunSetup, *, retry_s: float | None = None
+) -> TrackedRun:
+    """Write the provenance files, open the tracking store and start a run in it; see `open_store`.
+
+    What an earlier run has made in the folder is replaced; `check_free` has found that it is a run's.
+    """
+    resolved = to_plain(config)
+    client, experiment_id = open_store(**resolved["tracking"], retry_s=retry_s)
+    deliver_pending(client)
+    choices, job = invocation.choices, invocation.job
+    files = provenance_files(resolved, setup)
+    # Those of an earlier run, left in a folder that somebody named: they would be taken for this one's.
+    for stale in RESULTS:
+        (invocation.folder / stale).unlink(missing_ok=True)
+    # Before the run is there: whenever it is killed, it can be resumed.
+    for name, contents in files.items():
+        atomic_write(invocation.folder / name, methodcaller("write", contents))
+    tracked = TrackedRun.start(
+        client,
+        experiment_id,
+        name=run_name(resolved, choices),
+        config=resolved,
+        tags={
+            **environment_tags(),
+            "command": invocation.command,
+            "seed": str(resolved["seed"]),
+            "overrides": " ".join(invocation.overrides),
+            **{f"choice.{group}": choices[group] for group in CHOICES_IN_TAGS},
+            **volume_tags(setup.fingerprints),
+            # Where it is applied to other volumes, later, the agent must see what it has learned to see.
+            DOMAIN_TAG: TrainingDomain.of(setup.training_env, setup.experiment.smallest_slice_px).to_json(),
+            **place_tags(invocation.folder),
+            "working_folder": str(Path.cwd()),
+            **sha256_tags(files),
+            **({JOB_TAG: str(job.number)} if job else {}),
+        },
+        folder=invocation.folder,
+        parent_id=job.parent_run_id if job else None,
+    )
+    tracked.log_files(*(invocation.folder / name for name in files))
+    return tracked
+
+
+def provenance_files(config: dict[str, Any], setup: RunSetup) -> dict[str, bytes]:
+    """Return the files that say what a run was started with, by their names: configuration, volumes, code."""
+    diff = source().diff
+    return {
+        CONFIG_FILE: yaml.safe_dump(config, sort_keys=False).encode(),
+        VOLUMES_FILE: json.dumps(setup.fingerprints, indent=1).encode(),
+        ENVIRONMENT_FILE: environment_file(),
+        **({DIFF_FILE: diff} if diff else {}),
+    }
+
+
+def sha256_tags(files: Mapping[str, bytes]) -> dict[str, str]:
+    """Return the checksums of the files that must be unchanged when a run is resumed, as its tags."""
+    return {tag: sha256(files[name]) for name, tag in SHA256_TAGS.items()}
+
+
+def volume_tags(prints: Fingerprints) -> dict[str, str]:
+    """Return the names of the volumes, each with the beginning of its fingerprint, as tags of a run."""
+    told = {
+        f"volumes.{part}": " ".join(f"{name}:{each[:N_PRINT_CHARS]}" for name, each in volumes.items())
+        for part, volumes in prints.items()
+    }
+    return tags_of(told, whole_in=VOLUMES_FILE)
+
+
+def place_tags(folder: Path) -> dict[str, str]:
+    """Return folder, host and version of a run as its tags."""
+    return {"folder": str(folder.resolve()), "host": socket.gethostname(), VERSION_TAG: armscan.__version__}
+
+
+def run_name(config: dict[str, Any], choices: dict[str, str]) -> str:
+    """Return what the UI calls a run: what most runs differ by."""
+    projection = config["projection"]
+    parts = [choices["agent"], choices["obs"], projection if isinstance(projection, str) else "+".join(projection)]
+    parts += [
+        f"{wrapper}{config[wrapper]}"
+        for wrapper, without in (("stack", 1), ("memory", 0))
+        if config[wrapper] != without
+    ]
+    return "-".join([*parts, choices["data"], f"seed{config['seed']}"])

@@ -1,0 +1,181 @@
+"""`armscan run resume=ID`: resume an interrupted run, with the results of an uninterrupted one, or complete a grid.
+
+A changed configuration, changed volumes, and checkpoints that are damaged or of another run are refused before anything
+of the run is touched.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mlflow.entities import Run
+from omegaconf import OmegaConf
+
+from armscan.agents import Learner
+from armscan.config.defaults import RESUME, TRACKING_URI, default_tracking
+from armscan.config.legacy import migrate
+from armscan.errors import InvalidValueError, ResumeError
+from armscan.experiment.job import GRID_TAG
+from armscan.experiment.provenance import place_tags, volume_tags
+from armscan.experiment.runner import run_tracked
+from armscan.experiment.setup import RunSetup
+from armscan.tracking import TrackedRun, TrackingStore, check_version, find_run, jobs_of, open_existing_store, sync
+from armscan.training import Fingerprints, check_unchanged, resume_from_checkpoint
+from armscan.utils.files import (
+    CONFIG_FILE,
+    LAST_CHECKPOINT,
+    SHA256_TAGS,
+    VOLUMES_FILE,
+    folder_lock,
+    remove_unfinished,
+    sha256,
+)
+
+
+def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -> None:
+    """Resume the run that a command line names.
+
+    Args:
+        words: of the command line.
+        repeat_grid: runs what has not finished of the grid that its words describe.
+
+    Raises:
+        InvalidValueError: if the words say anything else.
+        TrackingError: if the run is not found.
+        ResumeError: if it cannot go on.
+        FolderInUseError: if it is still going on.
+        CheckpointError: if its checkpoint is damaged or another run's.
+        ChangedVolumesError: if its volumes are not those any more that it was started with.
+    """
+    wanted, uri = _read(words)
+    client = open_existing_store(uri)
+    run = find_run(client, wanted)
+    if GRID_TAG not in run.data.tags:
+        resume_run(client, run.info.run_id)
+        return
+    if run.info.status == "FINISHED":
+        raise ResumeError(f"all jobs of the grid {run.info.run_id} have finished: there is nothing to resume")
+    _enter_working_folder(run)
+    repeat_grid(json.loads(run.data.tags[GRID_TAG]))
+
+
+def resume_run(client: TrackingStore, run_id: str, *, job_label: str | None = None) -> dict[str, dict[str, float]]:
+    """Go on with a run; see `resume`.
+
+    Args:
+        client: of the store that it is in.
+        run_id: of the run.
+        job_label: what stands before the lines of one job of several, None for a single run.
+    """
+    folder = _folder_of(client, client.get_run(run_id))
+    with folder_lock(folder):
+        # What it has left because the store was away; it may have ended just before the folder was free.
+        sync(folder, lambda _: client)
+        run = client.get_run(run_id)
+        if run.info.status == "FINISHED":
+            raise ResumeError(f"run {run_id} has finished: there is nothing to resume")
+        config = _config_of(run, folder)
+        _check_last_checkpoint(run, folder)
+        remove_unfinished(folder)
+        _enter_working_folder(run)
+        print(f"resuming {run.info.run_name}, run {run_id}", flush=True)
+        setup = RunSetup.build(OmegaConf.create(migrate(config)))
+        _check_volumes(run, folder, setup.fingerprints)
+        agent = setup.experiment.agent
+        earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id)) if isinstance(agent, Learner) else []
+        tags = volume_tags(setup.fingerprints) | place_tags(folder)
+        tracked = TrackedRun.reopen(client, run_id, folder=folder, config=config, tags=tags)
+        return run_tracked(setup, tracked, folder, client.uri, job_label=job_label, earlier=earlier)
+
+
+def _read(words: Sequence[str]) -> tuple[str, str]:
+    """Return the wanted run and the store to look in."""
+    values = {TRACKING_URI: default_tracking()["uri"]}
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not equals or key not in (RESUME, TRACKING_URI):
+            raise InvalidValueError(
+                f"{word!r} cannot be combined with {RESUME}=, because a run keeps its original configuration: "
+                f"only {TRACKING_URI}= may be added"
+            )
+        if key in values and key == RESUME and values[key] != text:
+            raise InvalidValueError(f"{RESUME} names {values[key]!r} and {text!r}, but one run is resumed at a time")
+        values[key] = text
+    return values[RESUME], values[TRACKING_URI]
+
+
+def _folder_of(client: TrackingStore, run: Run) -> Path:
+    """Return the folder of a run that this version can go on with."""
+    run_id, tags = run.info.run_id, run.data.tags
+    if "folder" not in tags:
+        if jobs := jobs_of(client, run):
+            cut_off = [job.info.run_id for job in jobs if job.info.status != "FINISHED"]
+            which = ", ".join(cut_off) if cut_off else "all of them have finished"
+            raise ResumeError(f"run {run_id} is the parent of a multirun, whose jobs are resumed one by one: {which}")
+        raise ResumeError(
+            f"run {run_id} cannot be resumed: it was not started by armscan run, which tags a run with its folder"
+        )
+    check_version(run)
+    # Asked before the folder, which may have been cleared away since.
+    if run.info.status == "FINISHED":
+        raise ResumeError(f"run {run_id} has finished: there is nothing to resume")
+    folder = Path(tags["folder"])
+    if not folder.is_dir():
+        raise ResumeError(
+            f"run {run_id} cannot be resumed: its folder {folder} is not there; it last ran on the host {tags['host']}"
+        )
+    return folder
+
+
+def _config_of(run: Run, folder: Path) -> dict[str, Any]:
+    """Return the configuration that a run was started with, as its version wrote it."""
+    config: dict[str, Any] = yaml.safe_load(_started_with(run, folder / CONFIG_FILE, "configuration"))
+    return config
+
+
+def _started_with(run: Run, file: Path, what: str) -> bytes:
+    """Return the contents of a file that a run was started with."""
+    try:
+        contents = file.read_bytes()
+    except OSError as error:
+        raise ResumeError(f"{file}: the run's {what} cannot be read ({error.strerror})") from error
+    if sha256(contents) != run.data.tags[SHA256_TAGS[file.name]]:
+        raise ResumeError(
+            f"{file}: is not the {what} that run {run.info.run_id} was started with: changed, or another run's"
+        )
+    return contents
+
+
+def _check_last_checkpoint(run: Run, folder: Path) -> None:
+    """Raise `ResumeError` where a training would begin again whose epochs are tracked already."""
+    last = folder / LAST_CHECKPOINT
+    if not last.exists() and any(name.startswith("validation/") for name in run.data.metrics):
+        raise ResumeError(
+            f"{last}: there is no such checkpoint any more, but run {run.info.run_id} has tracked epochs, which would "
+            "be trained and tracked again: put it back, or start another run"
+        )
+
+
+def _check_volumes(run: Run, folder: Path, now: Fingerprints) -> None:
+    """Raise `ChangedVolumesError` where a run would go on with other volumes, whether it has a checkpoint or not."""
+    # Of runs that were started before it was kept, the checkpoint says so.
+    if SHA256_TAGS[VOLUMES_FILE] in run.data.tags:
+        then = json.loads(_started_with(run, folder / VOLUMES_FILE, "record of its volumes"))
+        check_unchanged(then, now, f"run {run.info.run_id} was started with")
+
+
+def _enter_working_folder(run: Run) -> None:
+    """Go to where the run was started, from where its configuration names files."""
+    folder = run.data.tags["working_folder"]
+    try:
+        os.chdir(folder)
+    except OSError as error:
+        raise ResumeError(
+            f"run {run.info.run_id} was started in {folder}, from where its configuration names files, but one cannot "
+            f"go there ({error.strerror})"
+        ) from error

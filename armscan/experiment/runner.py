@@ -1,0 +1,150 @@
+"""One run from beginning to end: build, track, train, evaluate, show.
+
+The configuration is read only here, in `setup` and in `build`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from armscan.agents import Learner
+from armscan.config.command_hints import evaluate_command, resume_command
+from armscan.experiment.build import check_keys
+from armscan.experiment.console import print_results, print_where_to_look
+from armscan.experiment.invocation import Invocation
+from armscan.experiment.provenance import start_tracking
+from armscan.experiment.setup import RunSetup
+from armscan.policies.build import save_policy
+from armscan.tracking import TrackedRun
+from armscan.training import (
+    TEST,
+    TRAINING,
+    Budget,
+    Callback,
+    EpochReport,
+    Evaluation,
+    TrainingResult,
+    evaluate,
+    record_episode,
+    train,
+)
+from armscan.training.progress import progress_reporter
+from armscan.utils.files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, VIDEO_FILE, check_free, folder_lock
+
+# First seeds of the episodes that are played for each purpose, so that none is played for two.
+VALIDATION_SEED, TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED, VIDEO_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
+
+
+def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict[str, float]]:
+    """Train (if it is a `Learner`), evaluate and track an agent.
+
+    Args:
+        config: the composed configuration.
+        invocation: how it was asked for.
+
+    Returns:
+        The metrics of the final evaluations, by the name of their volumes.
+    """
+    check_keys(config)
+    job = invocation.job
+    with folder_lock(invocation.folder):
+        check_free(invocation.folder)
+        setup = RunSetup.build(config)
+        tracked = start_tracking(config, invocation, setup)
+        return run_tracked(setup, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
+
+
+def run_tracked(
+    setup: RunSetup,
+    tracked: TrackedRun,
+    folder: Path,
+    tracking_uri: str,
+    *,
+    job_label: str | None = None,
+    earlier: Sequence[EpochReport] = (),
+) -> dict[str, dict[str, float]]:
+    """Train, evaluate and print results in a tracked run.
+
+    Args:
+        setup: what is run.
+        tracked: its run.
+        folder: where it leaves its files.
+        tracking_uri: of the store.
+        job_label: prefix of the printed lines of a multirun's job; None for a single run.
+        earlier: epochs before the interruption of a resumed training.
+
+    Returns:
+        The metrics of the final evaluations, by the name of their volumes.
+    """
+    tell = partial(print, *([f"[{job_label}]"] if job_label else []), flush=True)
+    tell(f"run {tracked.run_id}: {tracked.name}")
+    with _resume_hint_on_error(tracked.run_id, tracking_uri, folder, is_told=job_label is None), tracked:
+        result = None
+        if isinstance(setup.experiment.agent, Learner):
+            _tell_of_longer_epochs(setup.experiment.agent, setup.experiment.budget, tell)
+            callbacks = [progress_reporter(job_label), tracked]
+            result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, earlier=earlier)
+        tell(f"playing {setup.experiment.n_episodes} episodes on the training volumes, and as many on the test volumes")
+        evaluations = final_evaluations(setup)
+        record_episode(
+            setup.experiment.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.experiment.seed
+        )
+        tracked.keep_results(result, evaluations, folder)
+        if isinstance(setup.experiment.agent, Learner):
+            save_policy(setup.experiment.agent, setup.test_env, tracked, folder, tell)
+    if job_label is None:
+        _show(result, evaluations, folder, tracking_uri)
+        print(f"evaluate  {evaluate_command(tracked.run_id, tracking_uri)}")
+    return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
+
+
+def train_agent(
+    setup: RunSetup, folder: Path, callbacks: Sequence[Callback], *, run_id: str, earlier: Sequence[EpochReport] = ()
+) -> TrainingResult:
+    """Train the agent of a setup, which must be a `Learner`; see `train`."""
+    agent, budget = setup.experiment.agent, setup.experiment.budget
+    assert isinstance(agent, Learner)
+    seed = VALIDATION_SEED + setup.experiment.seed
+    validate = partial(evaluate, agent, setup.validation_env, n_episodes=budget.validation_episodes, seed=seed)
+    return train(agent, budget, validate, folder, callbacks, provenance=setup.provenance(run_id), earlier=earlier)
+
+
+def _tell_of_longer_epochs(learner: Learner, budget: Budget, tell: Callable[[str], None]) -> None:
+    """Say so where an epoch is longer than the configuration has it, because the agent takes more steps at once."""
+    if (n := learner.env_steps_at_once) > budget.eval_every_env_steps:
+        tell(
+            f"validating every {n} environment steps, which the agent takes at once "
+            f"(training.eval_every_env_steps = {budget.eval_every_env_steps} is less)"
+        )
+
+
+def final_evaluations(setup: RunSetup) -> dict[str, Evaluation]:
+    """Return the final evaluations of a setup's agent, on the training and on the test volumes, by their names."""
+    agent, n_episodes, seed = setup.experiment.agent, setup.experiment.n_episodes, setup.experiment.seed
+    return {
+        TRAINING: evaluate(agent, setup.training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),
+        TEST: evaluate(agent, setup.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED + seed),
+    }
+
+
+def _show(result: TrainingResult | None, evaluations: dict[str, Evaluation], folder: Path, tracking_uri: str) -> None:
+    how = f"deterministic policy, as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
+    print_results(f"results ({how})", evaluations)
+    print_where_to_look(folder, tracking_uri, files=(LEARNING_CURVE_FILE, VIDEO_FILE) if result else (VIDEO_FILE,))
+
+
+@contextlib.contextmanager
+def _resume_hint_on_error(run_id: str, tracking_uri: str, folder: Path, *, is_told: bool) -> Iterator[None]:
+    """Print how to resume the run, if an error ends it and it has a checkpoint."""
+    try:
+        yield
+    except BaseException:
+        if is_told and (folder / LAST_CHECKPOINT).exists():
+            print(f"resume with: {resume_command(run_id, tracking_uri)}", file=sys.stderr)
+        raise

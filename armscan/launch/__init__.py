@@ -1,0 +1,1 @@
+"""Several runs: multiruns, job processes, launchers."""

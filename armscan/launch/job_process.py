@@ -1,0 +1,72 @@
+"""One job of a multirun, in a process of its own, started by the launcher's."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import traceback
+from functools import partial
+
+from omegaconf import DictConfig
+
+from armscan.config.error_messages import one_line_message
+from armscan.experiment.cleanup import remove_if_untracked
+from armscan.experiment.invocation import Invocation
+from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, Job
+from armscan.utils.processes import ParentProcess
+
+# What a job's process runs; it may be interrupted while it is still importing.
+JOB_PROGRAM = """
+try:
+    from armscan.launch.job_process import run_job
+    run_job()
+except KeyboardInterrupt:
+    raise SystemExit(130)
+"""
+
+
+def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
+    """Run a job in a process of its own.
+
+    One that is killed, for its memory say, takes neither the launcher nor the other jobs with it.
+    """
+    job.write_outcome(failure=NO_OUTCOME)
+    ended = subprocess.run([sys.executable, "-c", JOB_PROGRAM], input=pickle.dumps((config, invocation)), check=False)
+    if ended.returncode < 0:
+        job.write_outcome(failure=f"killed by {signal.Signals(-ended.returncode).name}: out of memory?")
+
+
+def run_job() -> None:
+    """One job of a multirun, handed over on standard input: a failure is noted, and does not stop the others."""
+    ParentProcess().on_exit(partial(os.kill, os.getpid(), signal.SIGTERM))
+    config, invocation = pickle.load(sys.stdin.buffer)
+    job: Job = invocation.job
+
+    def leave(*_: object) -> None:
+        """End the job at once: raised inside compiled code, an interrupt can come out as any other error."""
+        job.write_outcome(failure=INTERRUPTED)
+        os._exit(130)
+
+    for ending in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ending, leave)
+    try:
+        if job.is_repeated:
+            from armscan.launch.resume_grid import run_again
+
+            metrics = run_again(config, invocation, job)
+        else:
+            from armscan.experiment.runner import run_experiment
+
+            metrics = run_experiment(config, invocation)
+    except Exception as error:
+        line = one_line_message(error)
+        if line is None:
+            traceback.print_exc()
+        remove_if_untracked(invocation.folder, error)
+        print(f"[{job.label}] failed: {line or repr(error)}", file=sys.stderr, flush=True)
+        job.write_outcome(failure=line or repr(error))
+    else:
+        job.write_outcome(metrics=metrics)

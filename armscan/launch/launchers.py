@@ -1,0 +1,45 @@
+"""Hydra's launchers, as far as armscan has to know them."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from importlib.util import find_spec
+
+from armscan.errors import InvalidValueError
+
+LAUNCHER = "hydra/launcher"
+ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
+SLURM, RAY = "submitit_slurm", "ray"
+# The extra of armscan that installs what a launcher imports, and what that is.
+IMPORTED = {
+    SLURM: ("slurm", ("submitit", "hydra_plugins.hydra_submitit_launcher")),
+    RAY: ("ray", ("ray", "hydra_plugins.hydra_ray_launcher")),
+}
+
+
+def check_launcher(name: str) -> None:
+    """Check that a launcher can do its work on this machine.
+
+    Raises:
+        InvalidValueError: if something that it needs is not installed.
+    """
+    extra, packages = IMPORTED.get(name, ("", ()))
+    for package in packages:
+        if find_spec(package) is None:
+            raise InvalidValueError(
+                f"{LAUNCHER} is {name!r}, but {package} is not installed: pip install 'armscan[{extra}]'"
+            )
+    if name == SLURM and shutil.which("sbatch") is None:
+        raise InvalidValueError(
+            f"{LAUNCHER} is {name!r}, but this machine has no sbatch: start it where Slurm takes jobs"
+        )
+
+
+def silence_launcher(name: str) -> None:
+    """Keep off the screen what a launcher says of its waiting."""
+    if name == SLURM:
+        # Where Slurm has no accounting, submitit says so again and again. It sets its level when it is imported.
+        import submitit
+
+        logging.getLogger(submitit.__name__).setLevel(logging.ERROR)

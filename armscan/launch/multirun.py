@@ -1,0 +1,162 @@
+"""Several jobs side by side: their common parent run, and what became of each."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from armscan.config.command_hints import compare_command, resume_command, run_command, sync_command
+from armscan.config.credentials import check_address
+from armscan.config.defaults import TRACKING_URI, to_plain
+from armscan.config.error_messages import one_line_message
+from armscan.errors import InvalidValueError, TrackingError
+from armscan.experiment.cleanup import remove_run_folder
+from armscan.experiment.job import GRID_TAG, INTERRUPTED, JOB_TAG, NO_OUTCOME, OUTCOME_FOLDER, PARENT_FILE, JobOutcome
+from armscan.launch.launchers import LAUNCHER, check_launcher
+from armscan.utils.files import LAST_CHECKPOINT
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+# Hydra's own overrides that say that there are several jobs, and where.
+NOT_REPEATED = ("hydra.mode=", "hydra.sweep.dir=", "hydra.sweep.subdir=")
+
+
+class Multirun(Callback):
+    """Starts the parent run before the first job; Hydra calls it in the process that launches the jobs.
+
+    The parent also makes the store's tables, so that jobs starting side by side find them there.
+    """
+
+    folder: Path | None = None
+    # Whether what has finished of an earlier one is not run again.
+    is_repeated = False
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Check what a single run would write down."""
+        self._answered(self._check, config)
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Open the store, start the parent run and write its ID for the jobs."""
+        self._answered(self._check, config)
+        self._answered(self._start, config)
+
+    @staticmethod
+    def _answered(begin: Callable[[DictConfig], None], config: DictConfig) -> None:
+        try:
+            begin(config)
+        # Hydra would turn any exception of a callback into a warning, and start the jobs all the same.
+        except Exception as error:
+            print(f"error: {one_line_message(error) or repr(error)}", file=sys.stderr)
+            raise SystemExit(2) from error
+
+    @staticmethod
+    def _check(config: DictConfig) -> None:
+        for key in (TRACKING_URI, "study.storage"):
+            if isinstance(uri := OmegaConf.select(config, key), str):
+                check_address(key, uri)
+
+    @staticmethod
+    def _start(config: DictConfig) -> None:
+        from armscan.tracking import open_store, source_tags
+
+        if config.get("study") is not None:
+            # It has a run of its own, which outlives many starts of workers.
+            return
+        check_launcher(config.hydra.runtime.choices[LAUNCHER])
+        folder = Path(config.hydra.sweep.dir)
+        if not isinstance(config.tracking, DictConfig):
+            raise InvalidValueError(f"tracking is {config.tracking!r}, but it must be a section, such as its default")
+        tracking = to_plain(config.tracking)
+        overrides = list(config.hydra.overrides.task)
+        client, experiment_id = open_store(**tracking)
+        (folder / OUTCOME_FOLDER).mkdir(parents=True)
+        command = " ".join(overrides)
+        # Includes the tracking URI, because the environment may differ later.
+        hydra_words = [word for word in config.hydra.overrides.hydra if not word.startswith(NOT_REPEATED)]
+        again = [*overrides, *hydra_words, f"{TRACKING_URI}='{tracking['uri']}'"]
+        tags = {**source_tags(), "overrides": command, "working_folder": str(Path.cwd()), GRID_TAG: json.dumps(again)}
+        parent = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
+        word = {"run_id": parent.info.run_id, "tracking": tracking, "overrides": overrides}
+        word["is_repeated"] = Multirun.is_repeated
+        (folder / PARENT_FILE).write_text(json.dumps(word))
+        Multirun.folder = folder
+
+
+def end_multirun(*, is_interrupted: bool = False) -> int:
+    """Close the parent run and print the outcomes of the jobs.
+
+    Args:
+        is_interrupted: whether somebody stopped the multirun.
+
+    Returns:
+        The exit code: 0 where every job succeeded, or where this was no multirun; 1 otherwise.
+    """
+    if Multirun.folder is None:
+        return 0
+    files = sorted((Multirun.folder / OUTCOME_FOLDER).glob("*.json"), key=lambda file: int(file.stem))
+    outcomes = {file.stem: JobOutcome(**json.loads(file.read_text())) for file in files}
+    if is_interrupted:
+        outcomes = {number: outcome.interrupted() for number, outcome in outcomes.items()}
+    failed = {
+        number: outcome for number, outcome in outcomes.items() if outcome.is_failed(is_interrupted=is_interrupted)
+    }
+    status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
+    word = json.loads((Multirun.folder / PARENT_FILE).read_text())
+    try:
+        runs, is_known = _close_parent(Multirun.folder, word, status, failed), True
+    except TrackingError as error:
+        print(f"{error}; {sync_command(Multirun.folder)} delivers the rest", file=sys.stderr)
+        runs, is_known = [], False
+    if outcomes:
+        from armscan.experiment.console import print_jobs, print_where_to_look
+
+        print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
+        if runs:
+            print_where_to_look(Multirun.folder, word["tracking"]["uri"])
+            print(f"compare   {compare_command(word['run_id'], word['tracking']['uri'])}")
+    for number, outcome in failed.items():
+        print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
+        print(f"  again alone: {run_command([])} {outcome.overrides}", file=sys.stderr)
+    for run in runs:
+        if run.info.status != "FINISHED" and (Path(run.data.tags["folder"]) / LAST_CHECKPOINT).exists():
+            again = resume_command(run.info.run_id, word["tracking"]["uri"])
+            print(f"resume job {run.data.tags[JOB_TAG]} with: {again}", file=sys.stderr)
+    if runs and status != "FINISHED":
+        print(f"resume all with: {resume_command(word['run_id'], word['tracking']['uri'])}", file=sys.stderr)
+    if is_known and not runs:
+        remove_run_folder(Multirun.folder)
+    return 1 if failed or not outcomes else 0
+
+
+def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Mapping[str, JobOutcome]) -> list[Run]:
+    """Close the parent run and what a killed job left open; deletes it where no job got as far as a run of its own.
+
+    Returns:
+        The runs of those that got as far as that, in the order of the jobs.
+
+    Raises:
+        TrackingError: if the store is away for longer than a run waits for it at its end.
+    """
+    from armscan.tracking import note_end, open_store, sync
+
+    tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
+    note_end(folder, word["run_id"], word["tracking"]["uri"], status, tags)
+    store, experiment_id = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
+    # With what jobs have left because the store was away.
+    sync(folder, lambda _: store)
+    children = store.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
+    for child in children:
+        if child.info.status == "RUNNING":
+            is_killed = status == "KILLED"
+            store.set_tag(child.info.run_id, "failure", INTERRUPTED if is_killed else NO_OUTCOME)
+            store.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
+    if not children:
+        store.delete_run(word["run_id"])
+    return sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))

@@ -1,0 +1,70 @@
+"""`armscan run resume=ID` of a grid: it is repeated, but what has finished of it is not run again.
+
+A job's earlier run is known by its configuration and its volumes, which both have to be the same to the last value.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mlflow.entities import Run
+from omegaconf import DictConfig
+
+from armscan.config.defaults import to_plain
+from armscan.experiment.build import check_keys
+from armscan.experiment.invocation import Invocation
+from armscan.experiment.job import JOB_TAG, Job
+from armscan.experiment.provenance import provenance_files, sha256_tags
+from armscan.experiment.resume import resume_run
+from armscan.experiment.runner import run_experiment
+from armscan.experiment.setup import RunSetup
+from armscan.tracking import TrackingStore, open_store
+from armscan.training import TEST, TRAINING
+from armscan.utils.files import LAST_CHECKPOINT
+
+Metrics = dict[str, dict[str, float]]
+
+
+def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
+    """Return the metrics of a job's finished run; resume an interrupted one, or run the job.
+
+    Args:
+        config: of the job.
+        invocation: how it was asked for.
+        job: the job.
+    """
+    check_keys(config)
+    setup, tracking = RunSetup.build(config), to_plain(config.tracking)
+    client, experiment_id = open_store(**tracking)
+    earlier = _earlier_runs(client, experiment_id, setup, config)
+    for run in earlier:
+        if run.info.status == "FINISHED":
+            print(f"[{job.label}] has finished before: run {run.info.run_id}", flush=True)
+            _adopt(client, run, job)
+            return _metrics_of(run)
+    for run in earlier:
+        if run.info.status != "RUNNING" and (Path(run.data.tags["folder"]) / LAST_CHECKPOINT).exists():
+            _adopt(client, run, job)
+            return resume_run(client, run.info.run_id, job_label=job.label)
+    return run_experiment(config, invocation)
+
+
+def _earlier_runs(client: TrackingStore, experiment_id: str, setup: RunSetup, config: DictConfig) -> list[Run]:
+    """Return the runs of this configuration on these volumes, the latest first."""
+    sums = sha256_tags(provenance_files(to_plain(config), setup))
+    wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
+    return list(client.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"]))
+
+
+def _adopt(client: TrackingStore, run: Run, job: Job) -> None:
+    """Make a run a child of the grid that is repeated."""
+    client.set_tag(run.info.run_id, "mlflow.parentRunId", job.parent_run_id)
+    client.set_tag(run.info.run_id, JOB_TAG, str(job.number))
+
+
+def _metrics_of(run: Run) -> Metrics:
+    prefixes = {name: f"{name.replace(' ', '_')}/" for name in (TRAINING, TEST)}
+    return {
+        name: {key.removeprefix(prefix): value for key, value in run.data.metrics.items() if key.startswith(prefix)}
+        for name, prefix in prefixes.items()
+    }

@@ -1,0 +1,180 @@
+"""A learner's policy as a model: made, held against the learner itself, and kept with its run."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import mlflow.pyfunc
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+import armscan
+from armscan.agents import Learner
+from armscan.agents.policy import Policy, batch_of
+from armscan.agents.torch_export import OBSERVATION
+from armscan.envs.rules import Observed
+from armscan.errors import ExportError, is_interruption
+from armscan.policies.model import ONNX_FILE, Arrays, arrays_of, model_sha256, write_model
+from armscan.tracking import TrackedRun
+from armscan.tracking.client import reason_in
+from armscan.training.rollout import Env
+from armscan.utils.files import CONFIG_FILE, POLICY_FOLDER
+from armscan.volumes.plane import FloatArray
+
+# The run's tag that says whether there is a model of it.
+POLICY_TAG = "policy"
+KEPT = "kept"
+# The run's tag with the sum of the model, by which another one in its place is known.
+SUM_TAG = "policy.sha256"
+# How far the model may be from the learner, and ONNX from the model.
+TOLERANCE, ONNX_TOLERANCE = 1e-6, 1e-5
+# First seed of the episode that the observations are from, above those of all episodes that count; and how many.
+FIRST_SEED, N_OBSERVED = 6 * 10**6, 8
+
+
+def save_policy(agent: Learner, env: Env, tracked: TrackedRun, folder: Path, tell: Callable[[str], None]) -> None:
+    """Keep the policy of a trained agent as a model of its run, where its configuration does not say otherwise.
+
+    What cannot be kept stops no run: it is told, and noted in a tag.
+
+    Args:
+        agent: of the run.
+        env: that the agent can act in.
+        tracked: the run.
+        folder: of the run, with its configuration.
+        tell: hears why the policy is not kept.
+    """
+    config = yaml.safe_load((folder / CONFIG_FILE).read_bytes())
+    # Runs of earlier versions say nothing of it.
+    if not config["tracking"].get("policy", True):
+        return
+    model = folder / POLICY_FOLDER
+    try:
+        make_model(agent, env, model, facts_of(config, env, tracked.run_id))
+    except ExportError as error:
+        # Another run's, left in a folder that somebody named.
+        shutil.rmtree(model, ignore_errors=True)
+        tell(f"the policy is not kept as a model: {error}")
+        tracked.set_tags({POLICY_TAG: f"not kept: {error}"})
+    else:
+        tracked.log_folder(model)
+        tracked.set_tags(tags_of_kept(model))
+
+
+def tags_of_kept(folder: Path) -> dict[str, str]:
+    """Return the tags of a run that keeps the model in this folder."""
+    return {SUM_TAG: model_sha256(folder), POLICY_TAG: KEPT}
+
+
+def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any]) -> None:
+    """Write an agent's policy as a model, in the place of what is there; one that fails a check is not written.
+
+    Args:
+        agent: which has learned.
+        env: that it can act in.
+        folder: of the model.
+        facts: about it.
+
+    Raises:
+        ExportError: if the policy cannot be written down, or the model does not answer as the agent does.
+    """
+    policy, played = agent.policy(), _played(agent, env)
+    batch = batch_of([observation for observation, _ in played])
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as beside:
+            made = Path(beside, folder.name)
+            write_model(made, policy, batch, {**facts, "differs_from_agent": policy.differs})
+            _check(made, policy, played)
+            if folder.exists():
+                folder.replace(Path(beside, "before"))
+            made.replace(folder)
+    except OSError as error:
+        raise ExportError(f"{folder}: the model cannot be written ({error.strerror or error})") from error
+    # Any exception of MLflow or onnxruntime: a run must not fail because of its model.
+    except Exception as error:
+        if isinstance(error, ExportError) or is_interruption(error):
+            raise
+        raise ExportError(f"the model cannot be written or asked: {reason_in(error)}") from error
+
+
+def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]:
+    """Return what stays with a model: where it comes from, what it has seen, what its actions stand for.
+
+    Args:
+        config: resolved, of the run.
+        env: as it is in the configuration.
+        run_id: of the run.
+    """
+    rules = config["env"]
+    turns = dict(zip(("rz", "rx"), rules["rotation_bounds_deg"], strict=True))
+    ways: dict[str, Any] = {"tx": "the volume's size across", "ty": "the volume's size along the arm"}
+    if rules["translation_bounds_mm"] is not None:
+        ways = dict(zip(ways, rules["translation_bounds_mm"], strict=True))
+    return {
+        "armscan": armscan.__version__,
+        "run": run_id,
+        "projection": config["projection"],
+        "observation": config["obs"],
+        "stack": config["stack"],
+        "memory": config["memory"],
+        "action": {
+            name: f"times {turns[name]} degrees" if name in turns else f"(a + 1) / 2 times {ways[name]}, in mm"
+            for name in env.get_wrapper_attr("action_names")
+        },
+    }
+
+
+def _played(agent: Learner, env: Env) -> list[tuple[Observed, FloatArray]]:
+    """Return observations of the agent's episodes, with the action that it has answered each with."""
+    played: list[tuple[Observed, FloatArray]] = []
+    seed, is_over = FIRST_SEED, True
+    while len(played) < N_OBSERVED:
+        if is_over:
+            observation, info = env.reset(seed=seed)
+            agent.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
+            seed, reward = seed + 1, float(info["reward"])
+        action = agent.act(observation, reward)
+        played.append((observation, action))
+        observation, received, terminated, truncated, _ = env.step(action)
+        reward, is_over = float(received), terminated or truncated
+    return played
+
+
+def _check(folder: Path, policy: Policy, played: list[tuple[Observed, FloatArray]]) -> None:
+    """Raise `ExportError` where a model does not answer as the agent did."""
+    batch = batch_of([observation for observation, _ in played])
+    model = mlflow.pyfunc.load_model(str(folder))
+    answers = model.predict(arrays_of(batch))
+    _check_same("the model", answers, "its network", policy(batch).numpy(), TOLERANCE)
+    if policy.differs is None:
+        # One by one, as the agent was asked: in another batch torch may add up in another order.
+        alone = np.concatenate([model.predict(arrays_of(batch_of([observation]))) for observation, _ in played])
+        _check_same("the model", alone, "the agent", np.stack([action for _, action in played]), TOLERANCE)
+    _check_same("ONNX", onnx_answers(folder / ONNX_FILE, arrays_of(batch)), "the model", answers, ONNX_TOLERANCE)
+
+
+def onnx_answers(file: Path, arrays: Arrays) -> NDArray[np.float32]:
+    """Return what onnxruntime answers a batch of observations with, shape (n, n_free)."""
+    # Deferred: few commands need it.
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    inputs = arrays if isinstance(arrays, dict) else {OBSERVATION: arrays}
+    (answers,) = session.run(None, inputs)
+    actions: NDArray[np.float32] = answers
+    return actions
+
+
+def _check_same(what: str, given: NDArray[Any], of: str, wanted: NDArray[Any], tolerance: float) -> None:
+    furthest = float(np.abs(given - wanted).max())
+    # A NaN is no number that would be near enough.
+    if not furthest <= tolerance:
+        raise ExportError(
+            f"{what} answers otherwise than {of}: up to {furthest:.3g} away, but {tolerance:g} is allowed"
+        )

@@ -1,0 +1,41 @@
+"""What MLflow runs to answer with a policy: a file of its own, kept in the model, that imports nothing of armscan."""
+
+from typing import Any
+
+import mlflow
+import numpy as np
+import torch
+from mlflow.pyfunc.model import PythonModel, PythonModelContext
+from numpy.typing import NDArray
+
+
+class PyfuncPolicy(PythonModel):
+    """A batch of observations in, shape (n, k), or each part by its name, shape (n, ...); actions out."""
+
+    def load_context(self, context: PythonModelContext) -> None:
+        """Read the policy's program."""
+        self._policy = torch.export.load(context.artifacts["program"]).module()
+
+    def predict(
+        self,
+        context: PythonModelContext,
+        # Or a dict of arrays; MLflow warns of any other hint.
+        model_input: np.ndarray,
+        params: dict[str, Any] | None = None,
+    ) -> NDArray[np.float32]:
+        """Return the actions, shape (n, n_free), within [-1, 1]."""
+        with torch.no_grad():
+            if isinstance(model_input, dict):
+                actions = self._policy({name: _tensor(part) for name, part in model_input.items()})
+            else:
+                actions = self._policy(_tensor(model_input))
+        answer: NDArray[np.float32] = actions.numpy()
+        return answer
+
+
+def _tensor(part: NDArray[Any]) -> torch.Tensor:
+    # Torch warns of memory that may not be written to.
+    return torch.from_numpy(np.require(part, requirements=["C", "W"]))
+
+
+mlflow.models.set_model(PyfuncPolicy())

@@ -1,0 +1,86 @@
+"""Every number of a comparison, as rows of CSV files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+from armscan.reports.charts import Curves
+from armscan.reports.groups import Group
+from armscan.reports.html import Row
+from armscan.reports.load import TrackedTraining
+from armscan.reports.significance import Pair, evaluated_trainings, metrics_by_volume
+from armscan.training import MetricEstimates
+
+
+def all_numbers(
+    groups: Sequence[Group],
+    curves: Curves,
+    reached: Sequence[MetricEstimates | None],
+    pairs: Mapping[str, Sequence[Pair]],
+) -> dict[str, list[Row]]:
+    """Return the tables by the names of their files."""
+    return {
+        "runs": run_rows(groups),
+        "curves": list(_curve_rows(groups, curves)),
+        "seed_curves": list(_seed_rows(groups)),
+        "final": list(_final_rows(groups, reached)),
+        "final_by_volume": list(_volume_rows(groups)),
+        "improvement": list(_pair_rows(groups, pairs)),
+    }
+
+
+def run_rows(groups: Sequence[Group]) -> list[Row]:
+    """Return a row for each run that counts."""
+    return [_run_row(group, training) for group in groups for training in group.trainings]
+
+
+def _run_row(group: Group, training: TrackedTraining) -> Row:
+    return {
+        "run": training.id,
+        "name": training.name,
+        "group": group.name,
+        "seed": training.seed if training.seed is not None else "",
+        "status": training.status,
+        "environment steps": "" if math.isnan(training.env_steps) else int(training.env_steps),
+        "training, s": "" if math.isnan(training.wall_s) else round(training.wall_s, 1),
+        "not kept": ", ".join(training.missing),
+    }
+
+
+def _curve_rows(groups: Sequence[Group], curves: Curves) -> Iterator[Row]:
+    for (figure, axis, number), curve in curves.items():
+        of_curve = {"group": groups[number].name, "figure": figure, "axis": axis, "seeds": curve.n_seeds}
+        for place, value, low, high in zip(curve.places, *curve.band, strict=True):
+            yield {**of_curve, "place": place, "value": value, "low": low, "high": high}
+
+
+def _seed_rows(groups: Sequence[Group]) -> Iterator[Row]:
+    for group in groups:
+        for training in group.trainings:
+            for figure, series in training.series.items():
+                of_series = {"group": group.name, "run": training.run_id, "seed": training.seed, "figure": figure}
+                for env_steps, wall_s, value in zip(series.env_steps, series.wall_s, series.values, strict=True):
+                    yield {**of_series, "env_steps": int(env_steps), "wall_s": wall_s, "value": value}
+
+
+def _final_rows(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Iterator[Row]:
+    for group, figures in zip(groups, reached, strict=True):
+        for name, estimate in figures.estimates.items() if figures else ():
+            yield {"group": group.name, "seeds": len(evaluated_trainings(group)), "figure": name, **estimate._asdict()}
+
+
+def _volume_rows(groups: Sequence[Group]) -> Iterator[Row]:
+    for group in groups:
+        for training in group.trainings:
+            for volume, figures in metrics_by_volume(training).items():
+                yield {"group": group.name, "run": training.run_id, "seed": training.seed, "volume": volume, **figures}
+
+
+def _pair_rows(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[Row]:
+    for figure, of_figure in pairs.items():
+        for pair in of_figure:
+            if pair.probability is not None and pair.stratified is not None:
+                names = {"better": groups[pair.ours].name, "than": groups[pair.theirs].name}
+                ends = {"low_stratified": pair.stratified.low, "high_stratified": pair.stratified.high}
+                yield {"figure": figure, **names, **pair.probability._asdict(), **ends}

@@ -1,0 +1,136 @@
+"""Which runs a comparison is of: those that are named, and the trainings below them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mlflow.entities import Run
+
+from armscan.errors import InvalidValueError, TrackingError, listed
+from armscan.tracking import EVALUATED_TAG, TrackingStore, check_version, find_run
+from armscan.tracking.store import store_errors
+
+# How a whole experiment of MLflow is named, instead of runs.
+EXPERIMENT = "experiment:"
+# Only a run of `armscan run` or a training of a study has it, not its parents.
+OF_A_TRAINING = "choice.agent"
+PARENT_TAG, PRUNED_TAG, TRIAL_TAG = "mlflow.parentRunId", "pruned", "trial"
+PAGE_SIZE = 1000
+N_SHOWN = 6
+ID_CHARS = 8
+
+
+@dataclass(frozen=True)
+class SelectedRuns:
+    """A training that was found.
+
+    Args:
+        run: its run.
+        is_pruned: whether it is of a trial that was pruned.
+    """
+
+    run: Run
+    is_pruned: bool
+
+
+def read_runs(text: str) -> list[str]:
+    """Return what `--runs` names, each once, in order.
+
+    Raises:
+        InvalidValueError: if one of the names is empty.
+    """
+    named = [name.strip() for name in text.split(",")]
+    if not all(name.removeprefix(EXPERIMENT) for name in named):
+        raise InvalidValueError(
+            f"--runs is {text!r}, but it must be ids of runs, or {EXPERIMENT}NAME, with commas between"
+        )
+    return list(dict.fromkeys(named))
+
+
+def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[SelectedRuns]:
+    """Return the trainings that are meant, each once: in the order in which they are named, and then were started.
+
+    Args:
+        store: that they are in.
+        named: ids or their beginnings, of trainings or of their parents, or whole experiments; see `read_runs`.
+
+    Raises:
+        TrackingError: if one of them is not found, is an evaluation, or there is no training in it.
+    """
+    found: dict[str, SelectedRuns] = {}
+    with store_errors(store.uri):
+        for name in named:
+            trainings = _in_experiment(store, name) if name.startswith(EXPERIMENT) else _meant(store, name)
+            found |= {training.run.info.run_id: training for training in trainings}
+    return list(found.values())
+
+
+def label_of(store: TrackingStore, named: str) -> str:
+    """Return a name for what was named that does not depend on how the IDs were abbreviated."""
+    if named.startswith(EXPERIMENT):
+        return named.removeprefix(EXPERIMENT)
+    with store_errors(store.uri):
+        return str(find_run(store, named).info.run_id[:ID_CHARS])
+
+
+def _meant(store: TrackingStore, name: str) -> list[SelectedRuns]:
+    run = find_run(store, name)
+    if EVALUATED_TAG in run.data.tags:
+        raise TrackingError(
+            f"run {run.info.run_id} is an evaluation, but runs are compared: give the run that it is of"
+        )
+    trainings = list(_below(store, run, is_pruned=False))
+    if not trainings:
+        raise TrackingError(
+            f"run {run.info.run_id} ({run.info.run_name}) is no training of armscan, and has none below it"
+        )
+    return [_checked(store, training) for training in trainings]
+
+
+def _below(store: TrackingStore, run: Run, *, is_pruned: bool) -> Iterator[SelectedRuns]:
+    """Yield a run if it is a training, else those of its jobs, trials and seeds."""
+    if OF_A_TRAINING in run.data.tags:
+        yield SelectedRuns(run, is_pruned)
+        return
+    pruned = PRUNED_TAG in run.data.tags
+    for child in _runs(store, run.info.experiment_id, f"tags.{_quoted(PARENT_TAG)} = '{run.info.run_id}'"):
+        yield from _below(store, child, is_pruned=pruned)
+
+
+def _in_experiment(store: TrackingStore, name: str) -> list[SelectedRuns]:
+    wanted = name.removeprefix(EXPERIMENT)
+    experiment = store.get_experiment_by_name(wanted)
+    if experiment is None or experiment.lifecycle_stage != "active":
+        names = [each.name for each in store.search_experiments(max_results=PAGE_SIZE)][:N_SHOWN]
+        there = f"only {listed(names)}" if names else "none at all"
+        raise TrackingError(f"the experiment is {wanted!r}, but in {store.uri!r} there is {there}")
+    trainings = [run for run in _runs(store, experiment.experiment_id) if OF_A_TRAINING in run.data.tags]
+    if not trainings:
+        raise TrackingError(f"the experiment is {wanted!r}, but in {store.uri!r} it has no training of armscan")
+    return [_checked(store, SelectedRuns(run, is_pruned=False)) for run in trainings]
+
+
+def _checked(store: TrackingStore, training: SelectedRuns) -> SelectedRuns:
+    """Return a training with whether its trial was pruned; each that is meant comes by here, however it was named."""
+    check_version(training.run)
+    tags = training.run.data.tags
+    if TRIAL_TAG not in tags or training.is_pruned or PARENT_TAG not in tags:
+        return training
+    return SelectedRuns(training.run, PRUNED_TAG in store.get_run(tags[PARENT_TAG]).data.tags)
+
+
+def _runs(store: TrackingStore, experiment_id: str, condition: str = "") -> Iterator[Run]:
+    """Yield the runs of an experiment, the first that was started first."""
+    token: Any = None
+    while True:
+        order = ["attributes.start_time ASC"]
+        page = store.search_runs([experiment_id], condition, max_results=PAGE_SIZE, order_by=order, page_token=token)
+        yield from page
+        if not (token := page.token):
+            return
+
+
+def _quoted(tag: str) -> str:
+    return f"`{tag}`"

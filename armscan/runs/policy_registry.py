@@ -1,0 +1,144 @@
+"""Export the policy of a tracked run from its checkpoint, and register it in MLflow's model registry."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from functools import cache, partial
+from pathlib import Path
+
+import mlflow.pyfunc
+from mlflow.exceptions import MlflowException
+
+from armscan.agents import Learner
+from armscan.config.defaults import to_plain
+from armscan.errors import ExportError, InvalidValueError
+from armscan.evaluation import TrainedAgent, TrainingVolumes, agent_of_run, own_split, prepare
+from armscan.policies.build import SUM_TAG, facts_of, make_model, tags_of_kept
+from armscan.policies.model import model_sha256
+from armscan.runs.model_card import Card
+from armscan.tracking import FoundRun, check_artifacts, load_run
+from armscan.tracking.client import reason_in
+from armscan.tracking.run import MODEL_FILE
+from armscan.tracking.store import store_errors
+from armscan.training import TEST
+from armscan.utils.files import POLICY_FOLDER
+
+MAX_NAME_CHARS = 256
+# A policy computes its most likely action in 32 bits on the CPU, however the run trained and evaluated it.
+PLAIN_COMPUTE = {"device": "cpu", "precision": "float32", "compile": False}
+
+
+def export_policy(tracking: str, run_id: str, folder: Path) -> FoundRun:
+    """Write the policy of a tracked run as a model, from its checkpoint; return the run.
+
+    Args:
+        tracking: MLflow tracking URI.
+        run_id: MLflow run ID, or its first characters.
+        folder: folder of the model.
+
+    Raises:
+        ArmscanError: if there is no such run, its agent does not learn, or its checkpoint or volumes are missing.
+    """
+    subject = agent_of_run(tracking, run_id, {})
+    assert subject.run is not None
+    _as_it_is(subject)
+    own = cache(partial(own_split, subject, ("training", "test")))
+    evaluator = prepare(subject, {TEST: own().test}, TrainingVolumes(own))
+    if not isinstance(evaluator.agent, Learner):
+        raise InvalidValueError(f"run is {run_id!r}, but its agent does not learn and has no policy")
+    env = evaluator.envs[TEST]
+    make_model(evaluator.agent, env, folder, facts_of(to_plain(subject.config), env, subject.run.run_id))
+    return subject.run
+
+
+def _as_it_is(subject: TrainedAgent) -> None:
+    subject.config.compute.update(PLAIN_COMPUTE)
+    if "deterministic_eval" in subject.config.agent:
+        subject.config.agent.deterministic_eval = True
+
+
+def register_policy(tracking: str, run_id: str, name: str) -> str:
+    """Register the policy of a tracked run, exporting it from the checkpoint if the run has none with a SHA-256.
+
+    Args:
+        tracking: MLflow tracking URI, whose model registry is used.
+        run_id: MLflow run ID, or its first characters.
+        name: name of the registered model, which is created if it does not exist.
+
+    Returns:
+        The URI of the new version, `models:/NAME/VERSION`.
+
+    Raises:
+        ArmscanError: if the name is not allowed, or the run's policy is missing, damaged or has been replaced.
+    """
+    _check_name(name)
+    run = load_run(tracking, run_id)
+    with tempfile.TemporaryDirectory() as beside, store_errors(run.uri):
+        folder = Path(beside, POLICY_FOLDER)
+        if is_kept := _is_kept(run):
+            _check_kept(run, Path(run.client.download_artifacts(run.run_id, POLICY_FOLDER, beside)))
+        else:
+            check_artifacts(run.client, run.experiment_id)
+            export_policy(tracking, run_id, folder)
+        card = Card.of(run, Path(beside))
+        if not is_kept:
+            run.client.log_artifacts(run.run_id, str(folder), POLICY_FOLDER)
+            for tag, value in tags_of_kept(folder).items():
+                run.client.set_tag(run.run_id, tag, value)
+        return _registered(run, name, card)
+
+
+def _check_name(name: str) -> None:
+    """Raise `InvalidValueError` for a name that MLflow, or its database, refuses."""
+    if not name.strip() or set("/:") & set(name) or name == "." or name.startswith("..") or len(name) > MAX_NAME_CHARS:
+        raise InvalidValueError(
+            f"--name is {name!r}, but it must be a text of at most {MAX_NAME_CHARS} characters without '/' and ':', "
+            "other than '.', and not beginning with '..'"
+        )
+
+
+def _is_kept(run: FoundRun) -> bool:
+    if SUM_TAG not in run.tags or POLICY_FOLDER not in run.files:
+        return False
+    return f"{POLICY_FOLDER}/{MODEL_FILE}" in [
+        each.path for each in run.client.list_artifacts(run.run_id, POLICY_FOLDER)
+    ]
+
+
+def _check_kept(run: FoundRun, folder: Path) -> None:
+    """Raise `ExportError` if a model is not the one that its run saved, or cannot predict."""
+    # Checked before loading, which executes the code in the model.
+    if model_sha256(folder) != run.tags[SUM_TAG]:
+        raise _not_kept(run)
+    # It also logs what it raises.
+    logging.getLogger("torch.export").setLevel(logging.CRITICAL)
+    try:
+        model = mlflow.pyfunc.load_model(str(folder))
+        model.predict(model.input_example)
+    # A damaged file may raise anything.
+    except Exception as error:
+        raise ExportError(
+            f"run {run.run_id}: its {POLICY_FOLDER}/ is damaged, it does not answer its own example: {reason_in(error)}"
+        ) from error
+    # A SHA-256 may have been copied from another run together with its model.
+    if (model.metadata.metadata or {}).get("run") != run.run_id:
+        raise _not_kept(run)
+
+
+def _not_kept(run: FoundRun) -> ExportError:
+    return ExportError(
+        f"run {run.run_id}: its {POLICY_FOLDER}/ is not the one that it has kept: changed, or another run's; remove "
+        "it from its artifacts, and it is made anew"
+    )
+
+
+def _registered(run: FoundRun, name: str, card: Card) -> str:
+    source = f"{run.client.get_run(run.run_id).info.artifact_uri}/{POLICY_FOLDER}"
+    try:
+        run.client.create_registered_model(name)
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_ALREADY_EXISTS":
+            raise
+    version = run.client.create_model_version(name, source, run.run_id, tags=card.tags, description=card.text)
+    return f"models:/{name}/{version.version}"

@@ -1,0 +1,168 @@
+"""A tracked run, made once more: what differs from then, and whether the same came of it."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from armscan.config.command_hints import reproduce_command
+from armscan.errors import InvalidValueError, TrackingError
+from armscan.evaluation.agent_source import from_its_folder
+from armscan.experiment.cleanup import remove_if_untracked
+from armscan.experiment.invocation import Invocation
+from armscan.experiment.provenance import CHOICES_IN_TAGS, start_tracking
+from armscan.experiment.runner import run_tracked
+from armscan.experiment.setup import RunSetup
+from armscan.runs.compare import Comparison, compare_runs
+from armscan.tracking import EVALUATED_TAG, FoundRun, environment_tags, load_run, source_tags
+from armscan.tracking.environment import CONSTRAINTS_SUM, TOLD, environment
+from armscan.tracking.git import COMMIT, DIFF_SUM, DIRTY
+from armscan.training import check_unchanged
+from armscan.utils.files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
+
+# Of a run that was made again: which one it is of, and whether the same came of it.
+OF_TAG, SAME_TAG = "reproduction.of", "reproduction.is_same"
+# Packages that are named of those whose versions seldom matter.
+N_SHOWN = 8
+ENDED = ("FINISHED", "FAILED", "KILLED")
+
+
+@dataclass(frozen=True)
+class Original:
+    """A run that is to be made again.
+
+    Args:
+        run: as it is tracked.
+        config: it was started with, its files named from anywhere; tracked in the store that it is in.
+        setup: built from it, on the volumes that it was started with.
+        environment: the versions of what it was computed with, None where these were not kept.
+    """
+
+    run: FoundRun
+    config: DictConfig = field(repr=False)
+    setup: RunSetup = field(repr=False)
+    environment: Mapping[str, Any] | None = field(repr=False)
+
+
+def load_original(tracking: str, run_id: str) -> Original:
+    """Return a tracked run, ready to be made again.
+
+    Raises:
+        ArmscanError: if there is no such run, it is none of `armscan run`, it has not ended, what it has kept is gone
+            or was changed, or its volumes are not those any more that it was started with.
+    """
+    run = load_run(tracking, run_id)
+    if EVALUATED_TAG in run.tags:
+        raise InvalidValueError(f"run is {run_id!r}, but that is an evaluation, of {run.tags[EVALUATED_TAG]}")
+    if run.status not in ENDED:
+        raise InvalidValueError(f"run {run.run_id} has not ended ({run.status}): there is nothing to compare with yet")
+    with tempfile.TemporaryDirectory() as folder:
+        config = from_its_folder(OmegaConf.create(run.config(Path(folder))), run.tags)
+        volumes = run.volumes(Path(folder))
+        text = run.text(ENVIRONMENT_FILE, Path(folder))
+    config.tracking.uri, config.tracking.experiment = tracking, run.experiment_name
+    setup = RunSetup.build(config)
+    if volumes is not None:
+        check_unchanged(volumes, setup.fingerprints, f"run {run.run_id} was started with")
+    return Original(run, config, setup, None if text is None else _environment(text, run))
+
+
+def _environment(text: str, run: FoundRun) -> Mapping[str, Any]:
+    """Return what a run has kept of its environment."""
+    try:
+        kept = json.loads(text)
+    except ValueError:
+        kept = None
+    if not isinstance(kept, dict) or not isinstance(kept.get("packages"), dict):
+        raise TrackingError(f"run {run.run_id}: its {ENVIRONMENT_FILE} is damaged, or another file")
+    return kept
+
+
+def differences(original: Original) -> list[str]:
+    """Return what is not as it was when a run was made, in a line each: code, packages, machine."""
+    tags, now = original.run.tags, {**source_tags(), **environment_tags()}
+    lines = [
+        f"{what} was {tags.get(tag, 'not kept')}, and is {now.get(tag, 'not kept')}"
+        for tag, what in ((COMMIT, "the git commit"), (CONSTRAINTS_SUM, "the sum of constraints.txt"))
+        if tags.get(tag) != now.get(tag)
+    ]
+    if any(tags.get(tag) != now.get(tag) for tag in (DIFF_SUM, DIRTY)):
+        kept = f"; its {DIFF_FILE} is among its artifacts" if DIFF_SUM in tags else ""
+        lines.append(f"changes since the commit {_changes(tags)}, and {_changes(now)} now{kept}")
+    if "resumed" in tags:
+        lines.append(f"the run was cut off and resumed {tags['resumed']} times, which changes no figure by itself")
+    if original.environment is None:
+        return [*lines, "the versions of its packages were not kept"]
+    before, here = original.environment, environment()
+    lines += [
+        f"{key} was {before.get(key)}, and is {here[key]}"
+        for key in ("python", "platform", "machine")
+        if before.get(key) != here[key]
+    ]
+    pairs = {name: (before["packages"].get(name), here["packages"].get(name)) for name in _names(before, here)}
+    changed = {
+        name: f"{then or 'not installed'}, and is {now or 'not installed'}"
+        for name, (then, now) in pairs.items()
+        if then != now
+    }
+    lines += [f"{name} was {how}" for name, how in changed.items() if name in TOLD]
+    if others := [name for name in changed if name not in TOLD]:
+        shown = ", ".join(others[:N_SHOWN]) + (", ..." if len(others) > N_SHOWN else "")
+        lines.append(f"{len(others)} other packages have other versions, or are there in one case only: {shown}")
+    return lines
+
+
+def _changes(tags: Mapping[str, str]) -> str:
+    if DIFF_SUM in tags:
+        return f"had the sum {tags[DIFF_SUM][:8]}"
+    return {"false": "were none", "true": "were some"}.get(tags.get(DIRTY, ""), "were not kept")
+
+
+def _names(*environments: Mapping[str, Any]) -> Sequence[str]:
+    # This project's own version says nothing that the commit does not.
+    return sorted(set().union(*(each["packages"] for each in environments)) - {"armscan"})
+
+
+def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Comparison:
+    """Make a run again, and compare what came of it.
+
+    Args:
+        original: the run.
+        folder: takes the files of the new one; made where there is none.
+        differing: see `differences`; kept with the new run.
+
+    Returns:
+        All metrics but those of time and machine, compared.
+    """
+    run = original.run
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InvalidValueError(
+            f"--out is {str(folder)!r}, but that is there already, and no empty folder: name another"
+        )
+    is_ours = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    choices = {group: run.tags.get(f"choice.{group}", "unknown") for group in CHOICES_IN_TAGS}
+    overrides = run.tags.get("overrides", "").split()
+    uri = original.config.tracking.uri
+    invocation = Invocation(folder, overrides, reproduce_command(run.run_id, uri), choices, None)
+    try:
+        with folder_lock(folder):
+            tracked = start_tracking(original.config, invocation, original.setup)
+            tracked.set_tags({OF_TAG: run.run_id})
+            run_tracked(original.setup, tracked, folder, uri)
+    except BaseException as error:
+        if is_ours:
+            remove_if_untracked(folder, error)
+        raise
+    comparison = compare_runs(run.client, run.run_id, tracked.run_id)
+    facts = {"of": run.run_id, "run": tracked.run_id, "differences": list(differing), **comparison.to_dict()}
+    (folder / REPRODUCTION_FILE).write_text(json.dumps(facts, indent=1))
+    run.client.set_tag(tracked.run_id, SAME_TAG, str(comparison.is_same).lower())
+    run.client.log_artifact(tracked.run_id, str(folder / REPRODUCTION_FILE))
+    return comparison

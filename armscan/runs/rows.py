@@ -1,0 +1,132 @@
+"""A line of a list: a run with what is known of it, and the runs that are folded into it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import cached_property
+
+from mlflow.entities import Run
+
+from armscan.runs.disk_usage import Size, Sizes
+from armscan.tracking.sync import ENDED
+
+PARENT_TAG = "mlflow.parentRunId"
+Children = Mapping[str, Sequence[Run]]
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """A run of a list.
+
+    Args:
+        run: the run.
+        sizes: measures it, when it is asked for.
+        below: the runs that it has called forth, and theirs, as far as they are meant.
+        depth: 0 where it stands by itself, 1 for a child that is shown below its parent, and so on.
+        is_unfolded: whether those below have lines of their own.
+    """
+
+    run: Run
+    sizes: Sizes = field(repr=False)
+    below: tuple[Run, ...] = ()
+    depth: int = 0
+    is_unfolded: bool = True
+
+    @cached_property
+    def size(self) -> Size:
+        """Of the run, and of those that are folded into it."""
+        return sum((self.sizes.of(run) for run in (() if self.is_unfolded else self.below)), self.sizes.of(self.run))
+
+    @property
+    def started(self) -> datetime:
+        """When it was started."""
+        return datetime.fromtimestamp(self.run.info.start_time / 1000).astimezone()
+
+    @property
+    def duration_s(self) -> float | None:
+        """How long it took; None where it has not ended."""
+        # MLflow keeps the end of a run that goes on again.
+        end = self.run.info.end_time if self.run.info.status in ENDED else None
+        return None if end is None else (end - self.run.info.start_time) / 1000
+
+    @property
+    def success_rate(self) -> float | None:
+        """On the test volumes; None where it was not judged."""
+        return self._metric("test_volumes/success_rate")
+
+    @property
+    def mean_steps(self) -> float | None:
+        """Likewise."""
+        return self._metric("test_volumes/mean_steps")
+
+    def value_of(self, sort: str) -> float | None:
+        """Return what it is sorted by, `started`, `duration`, `success`, `steps` or `size`; None where it has none."""
+        match sort:
+            case "duration":
+                return self.duration_s
+            case "success":
+                return self.success_rate
+            case "steps":
+                return self.mean_steps
+            case "size":
+                return self.size.n_bytes
+            case _:
+                return float(self.run.info.start_time)
+
+    def _metric(self, name: str) -> float | None:
+        value: float | None = self.run.data.metrics.get(name)
+        return value
+
+
+def collapse(runs: Sequence[Run], sizes: Sizes) -> list[RunRow]:
+    """Return runs without those whose parent is among them, which are folded into it."""
+    children, tops = _family(runs)
+    return [RunRow(run, sizes, tuple(_beneath(run, children)), is_unfolded=False) for run in tops]
+
+
+def expand(entries: Sequence[RunRow], runs: Sequence[Run]) -> list[RunRow]:
+    """Return entries with those below them, each below its parent, the earliest first.
+
+    Args:
+        entries: as `collapse` returns them, in any order.
+        runs: that they were folded from.
+    """
+    children, _ = _family(runs)
+
+    def lines(run: Run, sizes: Sizes, depth: int) -> Iterator[RunRow]:
+        yield RunRow(run, sizes, tuple(_beneath(run, children)), depth)
+        for child in children[run.info.run_id]:
+            yield from lines(child, sizes, depth + 1)
+
+    return [line for entry in entries for line in lines(entry.run, entry.sizes, 0)]
+
+
+def sort_rows(entries: Sequence[RunRow], sort: str, *, is_down: bool) -> list[RunRow]:
+    """Return entries sorted by what `RunRow.value_of` takes; those without come last, whatever the direction."""
+    values = {entry.run.info.run_id: entry.value_of(sort) for entry in entries}
+    known = [entry for entry in entries if values[entry.run.info.run_id] is not None]
+    known.sort(key=lambda entry: values[entry.run.info.run_id] or 0.0, reverse=is_down)
+    return known + [entry for entry in entries if values[entry.run.info.run_id] is None]
+
+
+def _family(runs: Sequence[Run]) -> tuple[Children, list[Run]]:
+    """Return the children of each run by its id, and the runs whose parent is not among them."""
+    ids = {run.info.run_id for run in runs}
+    children: dict[str, list[Run]] = defaultdict(list)
+    tops = []
+    for run in sorted(runs, key=lambda run: run.info.start_time):
+        parent = run.data.tags.get(PARENT_TAG)
+        if parent is not None and parent in ids and parent != run.info.run_id:
+            children[parent].append(run)
+        else:
+            tops.append(run)
+    return children, tops
+
+
+def _beneath(run: Run, children: Children) -> Iterator[Run]:
+    for child in children[run.info.run_id]:
+        yield child
+        yield from _beneath(child, children)

@@ -1,0 +1,156 @@
+"""Everything of one run, in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mlflow.entities import Run
+from rich.console import Console
+from rich.text import Text
+
+from armscan.config.command_hints import evaluate_command, resume_command, video_command
+from armscan.experiment.console import ID_CHARS, RESULT_ROWS
+from armscan.runs.disk_usage import Sizes
+from armscan.runs.query import experiment_ids, search
+from armscan.runs.rows import PARENT_TAG, RunRow
+from armscan.runs.run_folder import FolderNotOwnedError, OwnFolder, RunSkippedError, check_at_rest
+from armscan.runs.tables import format_bytes, format_duration, narrow_table
+from armscan.tracking import EVALUATED_TAG, TrackingStore
+from armscan.tracking.run import FAILURE_TAG
+from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
+
+# How a run was started, as far as it has kept it; the first that is there is shown.
+STARTED_BY = ("command", "overrides")
+# Groups with this metric were evaluated; they come first.
+EVALUATED = "/success_rate"
+FIRST = ("validation", "training_volumes")
+MAX_VALUE_CHARS = 200
+
+
+def show(client: TrackingStore, run: Run, uri: str) -> None:
+    """Print how a run was started and ended, its figures, files, children, and what can be done with it.
+
+    Args:
+        client: of its store.
+        run: the run.
+        uri: of the store, as somebody would type it.
+    """
+    console, sizes = Console(), Sizes(client)
+    entry = RunRow(run, sizes)
+    tags = {name: value for name, value in run.data.tags.items() if value}
+    _print_pairs(console, _facts(run, entry))
+    _print_figures(console, run)
+    console.print("\ntags", style="bold")
+    shown = {*STARTED_BY, FAILURE_TAG, PARENT_TAG}
+    _print_pairs(console, {name: tags[name] for name in sorted(tags) if name not in shown and not _is_mlflows(name)})
+    _print_files(console, run, sizes)
+    children = search(client, experiment_ids(client), f"tags.mlflow.parentRunId = '{run.info.run_id}'")
+    _print_children(console, children)
+    _print_commands(console, uri, run, sizes)
+
+
+def _facts(run: Run, entry: RunRow) -> dict[str, str]:
+    """Return how a run was started, and how it has ended."""
+    tags, info = run.data.tags, run.info
+    how = next((name for name in STARTED_BY if tags.get(name)), None)
+    ended = "" if entry.duration_s is None else f" after {format_duration(entry.duration_s)}"
+    facts = {
+        "run": info.run_id,
+        "name": info.run_name,
+        "status": f"{info.status.lower()}{ended}",
+        "failure": tags.get(FAILURE_TAG, ""),
+        "started": f"{entry.started:%Y-%m-%d %H:%M:%S}",
+        how or "": tags.get(how or "", ""),
+        "parent": tags.get(PARENT_TAG, ""),
+    }
+    return {name: value for name, value in facts.items() if name and value}
+
+
+def _is_mlflows(tag: str) -> bool:
+    return tag.startswith("mlflow.")
+
+
+def _print_pairs(console: Console, pairs: dict[str, str]) -> None:
+    table = narrow_table("", "")
+    table.show_header = False
+    for name, value in pairs.items():
+        whole = " ".join(value.split())
+        cut = f"{whole[:MAX_VALUE_CHARS]}…" if len(whole) > MAX_VALUE_CHARS and name not in STARTED_BY else whole
+        table.add_row(Text(name), Text(cut))
+    console.print(table)
+
+
+def _print_figures(console: Console, run: Run) -> None:
+    """Print the last validation and the final evaluations beside each other; not those of single volumes."""
+    found = [name.removesuffix(EVALUATED) for name in run.data.metrics if name.endswith(EVALUATED)]
+    groups = [group for group in FIRST if group in found]
+    groups += sorted(group for group in found if group not in FIRST and "/" not in group)
+    if not groups:
+        return
+    console.print("\nfigures", style="bold")
+    headings = ("last validation" if group == FIRST[0] else group.replace("_", " ") for group in groups)
+    table = narrow_table("", *(f"{heading}>" for heading in headings))
+    for text, key, form in RESULT_ROWS:
+        values = [run.data.metrics.get(f"{group}/{key}") for group in groups]
+        if any(value is not None for value in values):
+            table.add_row(text, *("-" if value is None else form.format(value) for value in values))
+    console.print(table)
+
+
+def _print_files(console: Console, run: Run, sizes: Sizes) -> None:
+    """Print what lies in the run's folder, and among its artifacts."""
+    try:
+        ours = OwnFolder.of(run)
+    except FolderNotOwnedError as error:
+        console.print(f"\nfolder: {error}", style="bold", soft_wrap=True)
+    else:
+        console.print(Text(f"\nfolder {ours.path}, {format_bytes(ours.n_bytes)}", style="bold"), soft_wrap=True)
+        _print_sizes(console, {str(file.relative_to(ours.path)): file.lstat().st_size for file in ours.files})
+        try:
+            check_at_rest(run)
+        except RunSkippedError as error:
+            console.print(Text(str(error)), soft_wrap=True)
+    artifacts = sizes.artifacts(run)
+    if artifacts is None:
+        console.print(f"\nartifacts in {run.info.artifact_uri}: their store does not answer", style="bold")
+        return
+    total = format_bytes(sum(artifacts.values()))
+    console.print(Text(f"\nartifacts in {run.info.artifact_uri}, {total}", style="bold"), soft_wrap=True)
+    _print_sizes(console, artifacts)
+
+
+def _print_sizes(console: Console, files: dict[str, int]) -> None:
+    table = narrow_table("", ">")
+    table.show_header = False
+    for name, n_bytes in sorted(files.items()):
+        table.add_row(Text(name), format_bytes(n_bytes))
+    console.print(table)
+
+
+def _print_children(console: Console, children: Sequence[Run]) -> None:
+    if not children:
+        return
+    console.print("\nchildren", style="bold")
+    table = narrow_table("id", "name", "status")
+    for child in sorted(children, key=lambda child: child.info.start_time):
+        table.add_row(child.info.run_id[:ID_CHARS], Text(child.info.run_name), child.info.status.lower())
+    console.print(table)
+
+
+def _print_commands(console: Console, uri: str, run: Run, sizes: Sizes) -> None:
+    """Print the commands that resume a run, evaluate and record its agent, if it has kept what they need."""
+    run_id = run.info.run_id
+    commands = {}
+    try:
+        is_resumable = (OwnFolder.of(run).path / LAST_CHECKPOINT).exists() and run.info.status != "FINISHED"
+    except FolderNotOwnedError:
+        is_resumable = False
+    if is_resumable:
+        commands["resume"] = resume_command(run_id, uri)
+    is_evaluation = EVALUATED_TAG in run.data.tags
+    if not is_evaluation and BEST_CHECKPOINT in (sizes.artifacts(run) or ()):
+        commands |= {"evaluate": evaluate_command(run_id, uri), "record": video_command(run_id, uri)}
+    if commands:
+        console.print()
+    for what, command in commands.items():
+        console.print(Text(f"{what:10}{command}"), soft_wrap=True)

@@ -1,0 +1,143 @@
+"""Runs as a table for a terminal, and as CSV and JSON for a script."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections.abc import Sequence
+from datetime import datetime
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from armscan.experiment.console import ID_CHARS
+from armscan.runs.prune_plan import PruneItem
+from armscan.runs.rows import PARENT_TAG, RunRow
+
+UNITS = ("B", "kB", "MB", "GB", "TB")
+MISSING = "-"
+# Of a name, which a multirun's words may be.
+MAX_NAME_CHARS = 80
+
+
+def format_bytes(n_bytes: float) -> str:
+    """Return bytes as a person reads them: 1.2 MB."""
+    for unit in UNITS[:-1]:
+        if n_bytes < 999.5:
+            return f"{n_bytes:.0f} {unit}" if unit == "B" or n_bytes >= 99.95 else f"{n_bytes:.3g} {unit}"
+        n_bytes /= 1000
+    return f"{n_bytes:.3g} {UNITS[-1]}"
+
+
+def format_duration(seconds: float | None) -> str:
+    """Return a time as a person reads it: 1:05:10, 3d 4h."""
+    if seconds is None:
+        return MISSING
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours >= 24:
+        return f"{hours // 24}d {hours % 24}h"
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def format_time(moment: datetime) -> str:
+    """Return when it was: the day, or the time where it was today."""
+    is_today = moment.date() == datetime.now().astimezone().date()
+    return f"{moment:%H:%M}" if is_today else f"{moment:%Y-%m-%d}"
+
+
+def write_entries(entries: Sequence[RunRow], form: str) -> None:
+    """Print runs.
+
+    Args:
+        entries: the lines, in their order.
+        form: `table`, `csv` or `json`.
+    """
+    if form == "table":
+        Console().print(_table(entries))
+        return
+    rows = [_row(entry) for entry in entries]
+    if form == "json":
+        print(json.dumps(rows, indent=1))
+        return
+    writer = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+
+
+def _table(entries: Sequence[RunRow]) -> Table:
+    """Return a table that fits 80 columns: names have what is left, in as many lines as they need."""
+    table = narrow_table("id", "name", "status", "started", "took>", "success>", "steps>", "size>", "below>")
+    for entry in entries:
+        success, steps = entry.success_rate, entry.mean_steps
+        size = format_bytes(entry.size.n_bytes) + ("" if entry.size.in_store is not None else "+?")
+        table.add_row(
+            entry.run.info.run_id[:ID_CHARS],
+            Text("  " * entry.depth + shortened(entry.run.info.run_name)),
+            entry.run.info.status.lower(),
+            format_time(entry.started),
+            format_duration(entry.duration_s),
+            MISSING if success is None else f"{success:.0%}",
+            MISSING if steps is None else f"{steps:.1f}",
+            size,
+            str(len(entry.below) or ""),
+        )
+    return table
+
+
+def shortened(name: str) -> str:
+    """Return a name that is not too long for a line of a list."""
+    return name if len(name) <= MAX_NAME_CHARS else f"{name[: MAX_NAME_CHARS - 1]}…"
+
+
+def narrow_table(*headings: str) -> Table:
+    """Return a table without lines; a heading with > at its end is of numbers."""
+    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    for heading in headings:
+        is_name = heading in ("name", "")
+        table.add_column(
+            heading.rstrip(">"),
+            justify="right" if heading.endswith(">") else "left",
+            no_wrap=not is_name,
+            overflow="fold",
+        )
+    return table
+
+
+COLUMNS = (
+    *("run_id", "name", "status", "experiment_id", "parent", "started", "duration_s", "success_rate", "mean_steps"),
+    *("size_bytes", "folder_bytes", "artifact_bytes", "below", "agent", "obs", "projection", "folder", "host"),
+)
+
+
+def _row(entry: RunRow) -> dict[str, Any]:
+    info, tags = entry.run.info, entry.run.data.tags
+    values = (
+        *(info.run_id, info.run_name, info.status, info.experiment_id, tags.get(PARENT_TAG)),
+        *(entry.started.isoformat(timespec="seconds"), entry.duration_s, entry.success_rate, entry.mean_steps),
+        *(entry.size.n_bytes, entry.size.in_folder, entry.size.in_store, len(entry.below)),
+        *(tags.get("choice.agent"), tags.get("choice.obs"), entry.run.data.params.get("projection")),
+        *(tags.get("folder"), tags.get("host")),
+    )
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def print_plan(cases: Sequence[PruneItem]) -> None:
+    """Print what would be removed, and why the rest would not."""
+    console = Console()
+    taken = [case for case in cases if case.left is None]
+    if taken:
+        table = narrow_table("id", "name", "status", "started", "frees>")
+        for case in taken:
+            info = case.run.info
+            started = datetime.fromtimestamp(info.start_time / 1000).astimezone()
+            row = (info.run_id[:ID_CHARS], Text(shortened(info.run_name)), info.status.lower(), format_time(started))
+            table.add_row(*row, format_bytes(case.n_bytes))
+        console.print(table)
+    for case in cases:
+        if case.left or case.note:
+            what = f"stays: {case.left}" if case.left else f"all but its folder: {case.note}"
+            console.print(Text(f"{case.run.info.run_id[:ID_CHARS]} {what}"), soft_wrap=True)

@@ -1,0 +1,152 @@
+"""What trainings with several seeds say together, as Agarwal et al. 2021 (arXiv:2108.13264) recommend.
+
+Intervals are percentile bootstraps of the seeds, with generators of their own: the same numbers give the same interval.
+With two or three seeds such an interval is just the range from the lowest to the highest; with four or more it is an
+interval, though somewhat too narrow for few.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import bootstrap, trim_mean
+
+from armscan.errors import InvalidValueError
+from armscan.stats.bootstrap import LEVEL, MOST_VALUES, N_RESAMPLES, Estimate
+from armscan.volumes.plane import FloatArray
+
+# What is cut from each end of the sorted values in an interquartile mean.
+QUARTER = 0.25
+# With fewer seeds an interval is no more than their range.
+FEWEST_SEEDS = 4
+
+Mean = Callable[..., Any]
+
+
+class Band(NamedTuple):
+    """A figure at several points with its interval at each, shape (points,); the ends are NaN where there is none."""
+
+    values: FloatArray
+    lows: FloatArray
+    highs: FloatArray
+
+
+def interquartile_mean(values: ArrayLike, axis: int | None = None) -> Any:
+    """Return the mean without the lowest and the highest quarter, by default of all values; of fewer than four of all.
+
+    Args:
+        values: of any shape.
+        axis: over which; None for all of them.
+    """
+    return trim_mean(values, QUARTER, axis=axis)
+
+
+def mean_for(figure: str) -> Mean:
+    """Return what a figure's values are put together by: of success rates, where every failure counts, the mean."""
+    return np.mean if "success_rate" in figure else interquartile_mean
+
+
+def over_seeds(scores: FloatArray, mean: Mean, *, is_stratified: bool = False, seed: int = 0) -> Estimate:
+    """Return the mean over seeds and volumes, with an interval that draws seeds, each with all its volumes.
+
+    Args:
+        scores: shape (seeds, volumes).
+        mean: see `mean_for`.
+        is_stratified: draw the seeds of each volume by itself; see `probability_of_improvement` for when that is right.
+        seed: of the resamples.
+
+    Returns:
+        The estimate, without an interval where there is one seed or a score is NaN.
+    """
+    value = float(mean(scores))
+    if len(scores) < 2 or np.isnan(scores).any():
+        return Estimate(value, np.nan, np.nan)
+    if is_stratified:
+        ends = _ends(tuple(scores.T), lambda *of_volumes: mean(np.array(of_volumes)), seed, vectorized=False)
+    else:
+        ends = _ends((np.arange(len(scores)),), lambda drawn: mean(scores[drawn]), seed, vectorized=False)
+    return Estimate(value, float(ends[0]), float(ends[1]))
+
+
+def band_over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Band:
+    """Return the mean over the seeds at each point, with an interval; a resample has the same seeds at all points.
+
+    Args:
+        scores: shape (seeds, points), all finite.
+        mean: see `mean_for`.
+        seed: of the resamples.
+
+    Returns:
+        The band, without an interval where there is one seed.
+    """
+    values = np.asarray(mean(scores, axis=0), dtype=float)
+    if len(scores) < 2 or not scores.size:
+        return Band(values, *(np.full(len(values), np.nan) for _ in range(2)))
+    at_once = max(1, MOST_VALUES // scores.size)
+    low, high = _ends((scores,), mean, seed, vectorized=True, axis=0, batch=at_once)
+    return Band(values, np.asarray(low), np.asarray(high))
+
+
+def probability_of_improvement(
+    ours: FloatArray, theirs: FloatArray, *, is_stratified: bool = False, seed: int = 0
+) -> Estimate:
+    """Return how likely a training of ours is better than one of theirs on the same volume, averaged over the volumes.
+
+    The share of pairs of seeds in which ours is greater, where ties count half: the statistic of Mann and Whitney.
+
+    Args:
+        ours: shape (seeds, volumes), greater is better, all finite.
+        theirs: shape (seeds, the same volumes).
+        is_stratified: draw the seeds of each volume by itself, which is right where each volume has had trainings of
+            its own. Where a training was judged on all volumes such an interval is far too narrow, and a seed is drawn
+            with all of them.
+        seed: of the resamples.
+
+    Returns:
+        The estimate, without an interval where either has one seed.
+
+    Raises:
+        InvalidValueError: if the volumes are not as many.
+    """
+    if ours.shape[1:] != theirs.shape[1:]:
+        raise InvalidValueError(
+            f"scores are of {ours.shape[1]} and of {theirs.shape[1]} volumes, but they must be of the same ones"
+        )
+    wins = _wins(ours.T, theirs.T).mean(axis=0)
+    value = float(wins.mean())
+    if min(wins.shape) < 2:
+        return Estimate(value, np.nan, np.nan)
+
+    def of_drawn(our_seeds: NDArray[np.intp], their_seeds: NDArray[np.intp], axis: int) -> Any:
+        return wins[our_seeds[..., :, None], their_seeds[..., None, :]].mean(axis=(-2, -1))
+
+    drawn: tuple[NDArray[Any], ...] = tuple(np.arange(n) for n in wins.shape)
+    how: dict[str, Any] = {"vectorized": True, "axis": -1, "batch": max(1, MOST_VALUES // wins.size)}
+    if is_stratified:
+        low, high = _ends((*ours.T, *theirs.T), _improvement, seed, **how)
+    else:
+        low, high = _ends(drawn, of_drawn, seed, **how)
+    return Estimate(value, float(low), float(high))
+
+
+def _improvement(*samples: FloatArray, axis: int) -> Any:
+    """Return the probability from the seeds of each volume, ours and then theirs, each of shape (..., seeds)."""
+    n_volumes = len(samples) // 2
+    pairs = zip(samples[:n_volumes], samples[n_volumes:], strict=True)
+    return sum(_wins(ours, theirs).mean(axis=(-2, -1)) for ours, theirs in pairs) / n_volumes
+
+
+def _wins(ours: FloatArray, theirs: FloatArray) -> FloatArray:
+    """Return 1 where ours is greater, 0.5 where they are equal, of shape (..., our seeds, their seeds)."""
+    ours, theirs = ours[..., :, None], theirs[..., None, :]
+    return np.asarray((ours > theirs) + 0.5 * (ours == theirs))
+
+
+def _ends(samples: tuple[NDArray[Any], ...], statistic: Mean, seed: int, **how: Any) -> tuple[Any, Any]:
+    draw = partial(bootstrap, n_resamples=N_RESAMPLES, confidence_level=LEVEL, method="percentile")
+    interval = draw(samples, statistic, rng=np.random.default_rng(seed), **how).confidence_interval
+    return interval.low, interval.high

@@ -1,0 +1,145 @@
+"""How sure a figure is: percentile bootstrap intervals of episodes that come from volumes.
+
+Whoever reads a success rate wants to know it for *other* volumes, and episodes on one volume are alike. So volumes are
+drawn with replacement first, and then, in each of them, as many of its episodes as it has, with replacement too. Where
+there is one volume, that leaves a bootstrap of its episodes, which speaks of that volume alone. Whoever wants to know
+it for other *seeds* of a training as well has several of them: these are drawn before the volumes, and all that are
+drawn meet the same drawn volumes, as all have met the same ones.
+
+With K volumes this is a little too wide where volumes are alike, and too narrow, by about sqrt((K - 1) / K) and more
+for few, where they differ; no resampling can know volumes that it has never seen. Where every episode has the same
+value, as at a success rate of 100 %, it has no width at all; `wilson` has one then, of episodes taken as independent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.errors import InvalidValueError
+from armscan.volumes.plane import FloatArray
+
+LEVEL = 0.95
+N_RESAMPLES = 2000
+# The standard normal's quantile of (1 + LEVEL) / 2.
+NORMAL_QUANTILE = 1.959963984540054
+# Resampled values that are in memory at once.
+MOST_VALUES = 2_000_000
+
+Statistic = Callable[[FloatArray], FloatArray]
+
+
+class Estimate(NamedTuple):
+    """A figure, and the interval that it lies in at 95 % confidence; all NaN where nothing was measured."""
+
+    value: float
+    low: float
+    high: float
+
+
+def mean(samples: FloatArray) -> FloatArray:
+    """Return the mean over the last axis, ignoring NaN; NaN: all values are NaN."""
+    counts = (~np.isnan(samples)).sum(axis=-1)
+    return np.where(counts > 0, np.nansum(samples, axis=-1) / np.maximum(counts, 1), np.nan)
+
+
+def quantile(share: float) -> Statistic:
+    """Return the statistic that gives a quantile over the last axis as `mean` gives the mean, by interpolation."""
+
+    def statistic(samples: FloatArray) -> FloatArray:
+        # NaNs come last.
+        ordered = np.sort(samples, axis=-1)
+        last = (~np.isnan(samples)).sum(axis=-1, keepdims=True) - 1
+        place = np.maximum(last, 0) * share
+        below = np.floor(place).astype(np.intp)
+        above = np.minimum(below + 1, np.maximum(last, 0))
+        low, high = np.take_along_axis(ordered, below, axis=-1), np.take_along_axis(ordered, above, axis=-1)
+        return np.asarray((low + (high - low) * (place - below))[..., 0])
+
+    return statistic
+
+
+def estimates(
+    columns: Mapping[str, tuple[Statistic, Sequence[float]]],
+    volumes: Sequence[Hashable],
+    *,
+    trainings: Sequence[Hashable] | None = None,
+    seed: int = 0,
+) -> dict[str, Estimate]:
+    """Return figures with their intervals, by name; all of them from the same resamples.
+
+    Args:
+        columns: by the name of the figure, its statistic and the value of each episode, NaN for those left out.
+        volumes: which volume each episode is on.
+        trainings: which training each episode is of; None where all are of one.
+        seed: of the resampling; the same one gives the same intervals.
+
+    Raises:
+        InvalidValueError: if a column has another length than `volumes`, or there is no episode.
+    """
+    trainings = [None] * len(volumes) if trainings is None else trainings
+    lengths = {len(trainings), *(len(values) for _, values in columns.values())}
+    if not volumes or lengths != {len(volumes)}:
+        raise InvalidValueError("every figure must have one value for each episode, and there must be an episode")
+    arrays = {name: np.asarray(values, dtype=float) for name, (_, values) in columns.items()}
+    resampled: dict[str, list[FloatArray]] = {name: [] for name in columns}
+    for places in _resamples(trainings, volumes, np.random.default_rng(seed)):
+        for name, (statistic, _) in columns.items():
+            # The place after the last, which is also that before the first, holds what is nobody's.
+            resampled[name].append(statistic(np.append(arrays[name], np.nan)[places]))
+    return {
+        name: _estimate(float(statistic(arrays[name])), np.concatenate(resampled[name]))
+        for name, (statistic, _) in columns.items()
+    }
+
+
+def wilson(n_successes: int, n_trials: int) -> Estimate:
+    """Return a rate with Wilson's interval, as if all trials were independent."""
+    if n_trials == 0:
+        return Estimate(math.nan, math.nan, math.nan)
+    rate, z2 = n_successes / n_trials, NORMAL_QUANTILE**2
+    middle = (rate + z2 / (2 * n_trials)) / (1 + z2 / n_trials)
+    half = NORMAL_QUANTILE / (1 + z2 / n_trials) * math.sqrt(rate * (1 - rate) / n_trials + z2 / (4 * n_trials**2))
+    return Estimate(rate, max(0.0, middle - half), min(1.0, middle + half))
+
+
+def _estimate(value: float, resampled: FloatArray) -> Estimate:
+    known = resampled[~np.isnan(resampled)]
+    if not len(known):
+        return Estimate(value, math.nan, math.nan)
+    low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Estimate(value, float(low), float(high))
+
+
+def _resamples(
+    trainings: Sequence[Hashable], volumes: Sequence[Hashable], rng: np.random.Generator
+) -> Iterator[NDArray[np.intp]]:
+    """Yield the places of the episodes of all resamples, shape (n_resamples, n_places), -1 for nobody's."""
+    of_training, of_volume = _numbered(trainings), _numbered(volumes)
+    shape = int(of_training.max()) + 1, int(of_volume.max()) + 1
+    sizes = np.zeros(shape, dtype=np.intp)
+    np.add.at(sizes, (of_training, of_volume), 1)
+    members = np.full((*shape, sizes.max()), -1)
+    filled = np.zeros(shape, dtype=np.intp)
+    for place, cell in enumerate(zip(of_training, of_volume, strict=True)):
+        members[(*cell, filled[cell])] = place
+        filled[cell] += 1
+    at_once = max(1, MOST_VALUES // members.size)
+    for first in range(0, N_RESAMPLES, at_once):
+        n_resamples = min(at_once, N_RESAMPLES - first)
+        drawn_trainings = rng.integers(shape[0], size=(n_resamples, shape[0], 1, 1))
+        drawn = drawn_trainings, rng.integers(shape[1], size=(n_resamples, 1, shape[1], 1))
+        within = (rng.random((n_resamples, *members.shape)) * sizes[drawn]).astype(np.intp)
+        # What has fewer episodes than another leaves the rest of its row empty.
+        chosen = np.where(np.arange(members.shape[-1]) < sizes[drawn], members[(*drawn, within)], -1)
+        yield chosen.reshape(n_resamples, -1)
+
+
+def _numbered(labels: Sequence[Hashable]) -> NDArray[np.intp]:
+    """Return the number of each label, in the order in which they come."""
+    numbers: dict[Hashable, int] = {}
+    return np.array([numbers.setdefault(label, len(numbers)) for label in labels], dtype=np.intp)

@@ -1,0 +1,157 @@
+"""The report of a study: one HTML file that needs no server, and every number of it as CSV beside it."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import optuna
+from optuna.trial import FrozenTrial, TrialState
+
+from armscan.reports.html import table, video_address, write_page
+from armscan.sweeps.results.charts import charts, importances
+from armscan.sweeps.results.summary import ConfigResult, final_results, shown_of
+from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINALIST, METRICS, RETRIED, RETRY_OF, StudyState
+from armscan.sweeps.space.overrides import overrides_of
+from armscan.sweeps.study.finalists import best_trials
+from armscan.sweeps.tasks.attempt import FOLDER, RUN
+
+
+def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folder: Path) -> Path:
+    """Write the report of a study.
+
+    Args:
+        study: in its storage.
+        final_trials: those of the final evaluation; empty without one.
+        folder: takes `report.html` and the CSV files.
+
+    Returns:
+        The HTML file.
+    """
+    objectives = list(study.user_attrs["objectives"])
+    trials, found = study.get_trials(deepcopy=False), final_results(final_trials)
+    tables = {
+        "trials": [_trial_row(trial, objectives) for trial in trials],
+        "reports": [
+            {"trial": trial.number, "step": step, "value": value}
+            for trial in trials
+            for step, value in trial.intermediate_values.items()
+        ],
+        "endings": _endings(trials),
+        "failures": [_failure_row(trial) for trial in trials if trial.state == TrialState.FAIL],
+        "result": [row for result in found for row in _metric_rows(result)],
+        "importances": importances(study, objectives),
+    }
+    parts = [
+        _summary(study, trials, objectives),
+        "<h2>Result</h2><p>The best settings with seeds that chose nothing, on the test volumes: "
+        "interquartile means over seeds and volumes, of success rates means, and 95 % intervals.</p>",
+        table(_result_rows(found, trials)) if found else "<p>No final evaluation yet.</p>",
+        _videos(final_trials),
+        *charts(study, objectives, tables["importances"]),
+        "<h2>How trials have ended</h2>",
+        table(tables["endings"]) if trials else "<p>No trial has been begun.</p>",
+        "<h2>Failures</h2>",
+        table(tables["failures"]) if tables["failures"] else "<p>No trial has failed.</p>",
+    ]
+    return write_page(folder, f"Study {study.study_name}", parts, tables)
+
+
+def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
+    state = StudyState.of(trials)
+    n_pruned = sum(trial.state == TrialState.PRUNED for trial in state.finished)
+    best = best_trials(study, 1)
+    found = (
+        ", ".join(f"{name} {value:.4g}" for name, value in zip(objectives, best[0].values, strict=True)) if best else ""
+    )
+    return (
+        f"<p>{len(state.finished)} trials finished, {n_pruned} of them pruned; {len(state.failed)} failed, "
+        f"{len(state.retried)} retried after their worker died. {state.env_steps:,} environment steps, "
+        f"{state.busy_hours:.2f} hours."
+        + (
+            f" Best in the search: trial {best[0].number}, {html.escape(found)} (optimistically biased)."
+            if best
+            else ""
+        )
+        + "</p>"
+    )
+
+
+def _videos(final_trials: Sequence[FrozenTrial]) -> str:
+    """Return a video of each finally evaluated configuration, of its first training that has one here."""
+    films: dict[int, str] = {}
+    for trial in final_trials:
+        files = sorted(Path(trial.user_attrs.get(FOLDER, "nowhere")).glob("seed_*/episode.gif"))
+        if files and trial.user_attrs[FINALIST] not in films:
+            address = video_address(files[0].read_bytes())
+            films[trial.user_attrs[FINALIST]] = f'<img alt="an episode" src="{address}">'
+    return "".join(f"<h3>Trial {number}: an episode on a test volume</h3>{film}" for number, film in films.items())
+
+
+def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> dict[str, Any]:
+    values = dict(zip(objectives, trial.values or (), strict=False)) if trial.state == TrialState.COMPLETE else {}
+    seconds = trial.duration.total_seconds() if trial.duration is not None else None
+    metrics = {f"figure/{name}": value for name, value in trial.user_attrs.get(METRICS, {}).items()}
+    return {
+        "trial": trial.number,
+        "state": trial.state.name.lower(),
+        **values,
+        "seconds": seconds,
+        "env_steps": trial.user_attrs.get(ENV_STEPS),
+        "retry_of": trial.user_attrs.get(RETRY_OF),
+        "mlflow_run": trial.user_attrs.get(RUN),
+        **trial.params,
+        **metrics,
+    }
+
+
+def _endings(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
+    """Return how many trials have ended in each way, and for which cause."""
+    of_ending: dict[tuple[str, str], list[int]] = {}
+    for trial in trials:
+        cause = ""
+        if trial.state == TrialState.FAIL:
+            cause = str(trial.user_attrs.get(FAILURE, "not known")) + (
+                ", retried" if RETRIED in trial.user_attrs else ""
+            )
+        elif trial.state == TrialState.PRUNED:
+            cause = f"behind the others at environment step {trial.last_step}"
+        of_ending.setdefault((trial.state.name.lower(), cause), []).append(trial.number)
+    return [
+        {"ending": ending, "cause": cause, "trials": len(numbers), "which": " ".join(map(str, numbers))}
+        for (ending, cause), numbers in sorted(of_ending.items())
+    ]
+
+
+def _failure_row(trial: FrozenTrial) -> dict[str, Any]:
+    return {
+        "trial": trial.number,
+        "cause": trial.user_attrs.get(FAILURE, "not known"),
+        "values": " ".join(overrides_of(trial.params)),
+    }
+
+
+def _metric_rows(result: ConfigResult) -> Iterable[dict[str, Any]]:
+    for name, (mean, low, high) in result.means.items():
+        yield {
+            "trial": result.number,
+            "seeds": result.n_seeds,
+            "figure": name,
+            "mean": mean,
+            "low": low,
+            "high": high,
+        }
+
+
+def _result_rows(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
+    return [
+        {
+            "trial": result.number,
+            "values": " ".join(overrides_of(trials[result.number].params)),
+            "seeds": result.n_seeds,
+            **{name.removeprefix("test/"): result.text(name) for name in shown_of(result)},
+        }
+        for result in found
+    ]

@@ -1,0 +1,47 @@
+"""The values that a trial tries: as Optuna keeps them, and as the command line has them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from armscan.config.legacy import renamed
+
+PLAIN_TEXT = re.compile(r"[A-Za-z_][\w./\-]*")
+BEFORE_QUOTE = re.compile(r"(\\+)('|$)")
+OTHER_THAN_TEXTS = ("true", "false", "null", "nan", "inf")
+Value = bool | int | float | str | None
+
+
+def as_kept(value: Any) -> Value:
+    """Return a value as Optuna keeps it: a number or a text; of a list how it is written."""
+    kept: Value = written(value) if isinstance(value, list | tuple | Mapping) else value
+    return kept
+
+
+def overrides_of(chosen: Mapping[str, Value]) -> list[str]:
+    """Return values as they are written on the command line, those of earlier versions by their new names."""
+    return [f"{name}={written(value)}" for name, value in renamed(chosen).items()]
+
+
+def written(value: Any) -> str:
+    """Return a value as Hydra reads it on the command line."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(written, value))}]"
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{written(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, str) and not _is_plain(value):
+        # Hydra takes a backslash for itself, but before a quote.
+        escaped = BEFORE_QUOTE.sub(r"\1\1\2", value).replace("'", "\\'")
+        return f"'{escaped}'"
+    return str(value)
+
+
+def _is_plain(text: str) -> bool:
+    """Whether a text needs no quotes, because nothing but a text is read in it, or because it is that of a list."""
+    return text.startswith(("[", "{")) or (bool(PLAIN_TEXT.fullmatch(text)) and text.lower() not in OTHER_THAN_TEXTS)

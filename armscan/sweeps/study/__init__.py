@@ -1,0 +1,1 @@
+"""A study: settings, arguments, phases."""

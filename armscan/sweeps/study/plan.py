@@ -1,0 +1,81 @@
+"""What a study would do, without doing it: what is searched, how far it is, and what the rest will take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import optuna
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.space.space import Parameter
+from armscan.sweeps.study.settings import StudySettings
+
+BYTES_A_MIB = 2**20
+
+
+def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
+    """Print the space, how far the study is and what it has cost, and from that what the rest will take.
+
+    Args:
+        settings: of the study.
+        study: as far as it is; None where it has not been begun.
+    """
+    console = Console()
+    state = StudyState.of(study.get_trials(deepcopy=False)) if study is not None else None
+    table = Table(title=f"study {settings.name}: what is searched", title_justify="left")
+    for heading in ("key", "values", "where"):
+        table.add_column(heading)
+    for parameter in settings.space.parameters:
+        table.add_row(*map(Text, (parameter.name, _values(parameter), _conditions(parameter))))
+    console.print(table)
+    objectives = ", ".join(f"{direction} {name}" for name, direction in settings.objectives.items())
+    limits = [f"{settings.n_trials} trials"]
+    limits += [f"{settings.timeout_hours:g} hours"] if settings.timeout_hours is not None else []
+    limits += [f"{settings.max_env_steps:,} environment steps"] if settings.max_env_steps is not None else []
+    n_final = settings.final_eval.top_k * settings.final_eval.n_seeds
+    console.print(f"objective  {objectives}, over the seeds {', '.join(map(str, settings.seeds))}")
+    console.print(f"limits     {', '.join(limits)}; {settings.workers} workers; then {n_final} final trainings")
+    done = len(state.finished) if state else 0
+    others = {"failed": state.failed, "requeued": state.waiting} if state else {}
+    also = "".join(f", {len(trials)} {what}" for what, trials in others.items() if trials)
+    console.print(f"done       {done} trials{also}")
+    if not state or not done:
+        console.print("cost       not known before the first trial has finished")
+        return
+    seconds = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
+    mean_s, spent_mib = sum(seconds) / len(seconds), _mib(Path(settings.folder))
+    left = max(0, settings.n_trials - done)
+    hours = (left + n_final / max(1, len(settings.seeds))) * mean_s / settings.workers / 3600
+    console.print(
+        f"cost       {sum(seconds) / 3600:.2f} hours of workers, {state.busy_hours:.2f} hours in all, "
+        f"{state.env_steps:,} environment steps, {spent_mib:.0f} MiB"
+    )
+    console.print(
+        f"the rest   {left} trials and the final evaluation, about {hours:.2f} hours and "
+        f"{spent_mib / done * left:.0f} MiB ({mean_s:.0f} s a trial so far)"
+    )
+
+
+def _values(parameter: Parameter) -> str:
+    distribution = parameter.distribution
+    if isinstance(distribution, CategoricalDistribution):
+        return ", ".join(map(str, distribution.choices))
+    assert isinstance(distribution, FloatDistribution | IntDistribution)
+    spacing = ", log" if distribution.log else ""
+    if distribution.step is not None and distribution.step != 1:
+        spacing += f", in steps of {distribution.step:g}"
+    whole = ", whole" if isinstance(distribution, IntDistribution) else ""
+    return f"{distribution.low:g} to {distribution.high:g}{whole}{spacing}"
+
+
+def _conditions(parameter: Parameter) -> str:
+    return ", ".join(f"{name} is {' or '.join(map(str, values))}" for name, values in parameter.when.items())
+
+
+def _mib(folder: Path) -> float:
+    files = folder.rglob("*") if folder.is_dir() else ()
+    return sum(file.stat().st_size for file in files if file.is_file()) / BYTES_A_MIB

@@ -1,0 +1,132 @@
+"""A study in its storage: made, or found and compared with what is asked for now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import optuna
+from optuna.study import StudyDirection
+
+from armscan.config.defaults import NOT_COMPARED
+from armscan.config.legacy import migrate, renamed
+from armscan.errors import StudyError
+from armscan.sweeps.storage.storage import Storage, existing_storage
+from armscan.sweeps.study.components import make_pruner
+from armscan.sweeps.study.settings import StudySettings
+from armscan.tracking import flattened
+
+# User attributes of a study.
+SPACE, FIXED, STUDY_RUN, DASHBOARD_OBJECTIVES = "space", "fixed_config", "mlflow_run", "objectives"
+N_SHOWN = 5
+
+
+def open_study(storage: Storage, settings: StudySettings, name: str | None = None) -> optuna.Study:
+    """Open a study that exists.
+
+    Args:
+        storage: that it is in.
+        settings: of it.
+        name: its name; that of the settings where it is None.
+    """
+    pruner = make_pruner(settings.pruner)
+    return optuna.load_study(study_name=name or settings.name, storage=storage.optuna, pruner=pruner)
+
+
+def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study:
+    """Make a study, or finds the one that exists.
+
+    Args:
+        storage: that it is or will be in.
+        settings: of it.
+        fixed: the configuration of its trials, without what they try.
+
+    Raises:
+        StudyError: if the study that exists searches another space, has other objectives, or has trials with another
+            configuration.
+    """
+    wanted = _wanted(settings, fixed)
+
+    def made() -> optuna.Study:
+        if settings.name not in optuna.get_all_study_names(storage.optuna):
+            directions = [StudyDirection[each.upper()] for each in settings.objectives.values()]
+            optuna.create_study(study_name=settings.name, storage=storage.optuna, directions=directions)
+        study = open_study(storage, settings)
+        # Also where whoever has just made it died before it could say what it is.
+        if not study.user_attrs.keys() >= wanted.keys() and not study.get_trials(deepcopy=False):
+            for key, value in wanted.items():
+                study.set_user_attr(key, value)
+        return study
+
+    study = storage.exclusive(made)
+    _check_same(settings, study, wanted)
+    return study
+
+
+def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study | None:
+    """Return the study that these settings would go on with, to look at; None where they would begin one.
+
+    Raises:
+        StudyError: see `open_storage` and `make_study`.
+    """
+    storage = existing_storage(settings.storage)
+    if storage is None or settings.name not in optuna.get_all_study_names(storage.optuna):
+        return None
+    study = open_study(storage, settings)
+    if not settings.allow_config_changes:
+        _check_same(settings, study, _wanted(settings, fixed))
+    return study
+
+
+def _wanted(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a study says of itself, by which it is compared."""
+    of_trials = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
+    return {
+        SPACE: settings.space.to_plain(),
+        DASHBOARD_OBJECTIVES: dict(settings.objectives),
+        FIXED: comparable_config(fixed, settings) | of_trials,
+    }
+
+
+def is_ours(study: optuna.Study) -> bool:
+    """Whether a study was made here, and not by somebody else's program in the same storage."""
+    there = study.user_attrs
+    if not {SPACE, FIXED, DASHBOARD_OBJECTIVES} <= there.keys():
+        return False
+    return [direction.name.lower() for direction in study.directions] == [*there[DASHBOARD_OBJECTIVES].values()]
+
+
+def comparable_config(config: Mapping[str, Any], settings: StudySettings) -> dict[str, Any]:
+    """Return the leaves of a configuration that trials of one study have in common."""
+    searched = {parameter.name for parameter in settings.space.parameters}
+    left_out = (*NOT_COMPARED, *searched)
+    return {
+        key: value
+        for key, value in flattened(config).items()
+        if not any(key == each or key.startswith(f"{each}.") for each in left_out)
+    }
+
+
+def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[str, Any]) -> None:
+    there = study.user_attrs
+    if not is_ours(study):
+        raise StudyError(f"study.name is {settings.name!r}, but that study in its storage was not made by armscan")
+    whose = f"the study {settings.name} in {settings.storage if '://' not in settings.storage else 'its storage'}"
+    other = "; give study.name another value"
+    for key, what in ((SPACE, "searches another space"), (DASHBOARD_OBJECTIVES, "has other objectives")):
+        if differences := _differences(renamed(there.get(key, {})), wanted[key]):
+            raise StudyError(f"{whose} {what}: {differences}{other}")
+    differences = _differences(migrate(there.get(FIXED, {})), wanted[FIXED])
+    if differences and settings.allow_config_changes:
+        study.set_user_attr(FIXED, wanted[FIXED])
+    elif differences:
+        raise StudyError(
+            f"{whose} has trials with another configuration: {differences}; study.allow_config_changes=true accepts "
+            f"that{other}"
+        )
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    keys = [key for key in {**before, **now} if before.get(key) != now.get(key) or (key in before) != (key in now)]
+    shown = [f"{key} was {before.get(key, 'not there')}, is {now.get(key, 'not there')}" for key in keys[:N_SHOWN]]
+    return ", ".join(shown) + (f", and {len(keys) - N_SHOWN} others" if len(keys) > N_SHOWN else "")

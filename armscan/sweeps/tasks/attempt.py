@@ -1,0 +1,178 @@
+"""One attempt at a trial: what it tries, what it reports, and what ties it to its tracked run and its folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import optuna
+from omegaconf import DictConfig, open_dict
+from optuna.trial import Trial
+
+from armscan.config.compose import compose
+from armscan.config.defaults import CLUSTER, to_plain
+from armscan.config.sources import SWEEP
+from armscan.errors import InvalidValueError
+from armscan.sweeps.scheduling.outcome import PendingWrites
+from armscan.sweeps.scheduling.state import ENV_STEPS, RETRY_OF, SEEDS
+from armscan.sweeps.space.overrides import Value, overrides_of
+from armscan.tracking import TrackedRun
+
+# User attributes of a trial.
+RUN, FOLDER, CONFIG_SHA256 = "mlflow_run", "folder", "config_sha256"
+TRIAL_DIGITS = 4
+
+
+@dataclass
+class Attempt:
+    """One attempt at a trial.
+
+    Args:
+        trial: as it stands in the storage.
+        chosen: its values by name.
+        composed: its configuration, but for the seed, and what was chosen of each group.
+        command: that started the worker.
+        seeds: it is run with, one after another.
+        study_folder: of the study.
+        run_id: of its tracked run.
+        objective: metric reported to the pruner while it runs; None without pruning.
+        report_progress: takes what is known of how far it is.
+        opened: takes the tracked run of a training while it goes on, and None when it has ended.
+        show_picture: takes a file that the dashboard is to show.
+        reported: steps that have been reported, also before the trial was requeued.
+        writes: of the trial.
+        transaction: see `Storage.transaction`.
+    """
+
+    trial: Trial
+    chosen: Mapping[str, Value]
+    composed: tuple[DictConfig, dict[str, str]]
+    command: str
+    seeds: tuple[int, ...]
+    study_folder: Path
+    run_id: str
+    objective: str | None
+    report_progress: Callable[[dict[str, Any]], None]
+    opened: Callable[[TrackedRun | None], None]
+    show_picture: Callable[[Path], None]
+    reported: set[int]
+    writes: PendingWrites
+    transaction: Callable[[Callable[[], bool]], bool]
+    env_steps: int = field(default=0, init=False)
+    _of_seeds: dict[str, Mapping[str, float]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._of_seeds = dict(self.trial.user_attrs.get(SEEDS, {}))
+
+    @property
+    def folder(self) -> Path:
+        """Where it leaves its files."""
+        return trial_folder(self.study_folder, self.trial.number)
+
+    @property
+    def folder_before(self) -> Path | None:
+        """That of the attempt whose place it takes; None where it is the first."""
+        number = self.trial.user_attrs.get(RETRY_OF)
+        return None if number is None else trial_folder(self.study_folder, number)
+
+    @property
+    def overrides(self) -> list[str]:
+        """What tells its configuration from that of other trials."""
+        return overrides_of(self.chosen)
+
+    def config(self, seed: int) -> tuple[DictConfig, dict[str, str]]:
+        """Return the configuration of one of its trainings, and what was chosen of each group."""
+        config, choices = self.composed
+        # Much quicker than to compose it once more.
+        seeded = config.copy()
+        seeded.seed = seed
+        return seeded, choices
+
+    @property
+    def seeds_done(self) -> dict[int, Mapping[str, float]]:
+        """The metrics of the seeds that have been run to their end, also by an attempt before."""
+        return {int(seed): metrics for seed, metrics in self._of_seeds.items()}
+
+    def keep_seed(self, seed: int, metrics: Mapping[str, float]) -> None:
+        """Keep the metrics of a seed that has been run to its end."""
+        self._of_seeds = self._of_seeds | {str(seed): dict(metrics)}
+        self.writes.add(partial(self.trial.set_user_attr, SEEDS, self._of_seeds))
+        if any(each not in self.seeds_done for each in self.seeds):
+            # The next report may be long in coming, and a retry must not train this seed again.
+            self.writes.flush_with(self.transaction, lambda: True)
+
+    def report(self, metrics: Mapping[str, float], *, seed: int, n_env_steps: int, grid: int, total: int) -> None:
+        """Report how a training is going.
+
+        Args:
+            metrics: of the last validation: the objective, and `mean_return` for the screen, where it is known.
+            seed: of the training.
+            n_env_steps: it has taken.
+            grid: environment steps between two reports: trials are compared at the same step, whatever theirs are.
+            total: environment steps of a whole training.
+
+        Raises:
+            optuna.TrialPruned: if the trial is pruned.
+        """
+        done = [one for each, one in self.seeds_done.items() if each in self.seeds]
+        self.env_steps = sum(int(one[ENV_STEPS]) for one in done) + n_env_steps
+        progress = {"seed": seed, ENV_STEPS: self.env_steps}
+        self.report_progress(progress | ({"return": metrics["mean_return"]} if "mean_return" in metrics else {}))
+        if self.objective is None or self.objective not in metrics:
+            return
+        step = self.seeds.index(seed) * total + n_env_steps // grid * grid
+        if step in self.reported:
+            return
+        self.reported.add(step)
+        values = [one[self.objective] for one in done] + [metrics[self.objective]]
+        if self.writes.flush_with(self.transaction, partial(self._is_to_be_pruned, step, sum(values) / len(values))):
+            raise optuna.TrialPruned
+
+    def _is_to_be_pruned(self, step: int, value: float) -> bool:
+        # Not by the trial's own method, which reports nothing twice: the storage may have lost it with its connection.
+        self.trial.storage.set_trial_intermediate_value(self.trial._trial_id, step, value)
+        return self.trial.should_prune()
+
+
+def trial_folder(study_folder: Path, number: int) -> Path:
+    """Return the folder of a trial."""
+    return study_folder / "trials" / f"{number:0{TRIAL_DIGITS}}"
+
+
+def composed(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+    """Return the configuration of a run, without the section of the study, and what was chosen of each group."""
+    config = compose(words, return_hydra_config=True)
+    choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
+    with open_dict(config):
+        # Where runs are tracked is the same whatever said so.
+        config.tracking = to_plain(config.tracking)
+        for section in ("study", "hydra", CLUSTER):
+            config.pop(section, None)
+    return config, choices
+
+
+def study_section(words: Sequence[str]) -> dict[str, Any]:
+    """Return the section `study` of a configuration as plain values.
+
+    Raises:
+        InvalidValueError: if the file of the study does not say that it is for the whole configuration.
+    """
+    config = compose(words)
+    if config.get(SWEEP) is not None:
+        raise InvalidValueError(
+            f"what {SWEEP}= names is a section {SWEEP} of the configuration, and not all of it: its file must begin "
+            "with the line '# @package _global_'"
+        )
+    section = config.get("study")
+    return to_plain(section) if section is not None else {}
+
+
+def config_sha256(config: Mapping[str, Any]) -> str:
+    """Return a sum of a configuration's values, but for the seed, which the runs of one trial differ by."""
+    values = {key: value for key, value in config.items() if key != "seed"}
+    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()

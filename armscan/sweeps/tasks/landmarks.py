@@ -1,0 +1,83 @@
+"""A trial that trains nothing: how well one way of clustering tells the labelled planes from the rest of the arm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from statistics import fmean
+
+import numpy as np
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from armscan.anatomy import PlaneScorer
+from armscan.anatomy.tissues import Tissues, check_tissues
+from armscan.errors import InvalidValueError
+from armscan.experiment.build import check_keys
+from armscan.sweeps.tasks.attempt import Attempt
+from armscan.sweeps.tasks.base import VolumesInMemory
+from armscan.volumes import LabelVolume
+from armscan.volumes.plane import ManipulatorAction
+
+METRICS = ("separation", "labelled_reward", "elsewhere_reward", "worst_labelled_reward")
+# Planes nearer to the labelled one than this are neither right nor wrong; the others are looked at in these steps.
+NEAR_MM, STEP_MM = 15.0, 2.5
+
+
+class LandmarksTask:
+    """The task of clustering: rewards at the labelled planes, and at planes along the rest of the arm.
+
+    What is searched are keys of `env.clustering`, written in full.
+    """
+
+    def __init__(self) -> None:
+        self._volumes = VolumesInMemory()
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """The means of both rewards over the volumes, their difference, and the worst at a labelled plane."""
+        return METRICS
+
+    @property
+    def final_metric(self) -> str:
+        """The difference, on the test volumes."""
+        return "test/separation"
+
+    def check(self, config: DictConfig) -> None:
+        """See `Task.check`."""
+        check_keys(config)
+        if not isinstance(config.env.clustering, DictConfig):
+            raise InvalidValueError(
+                f"env.clustering is {config.env.clustering!r}, but this study searches its parts: write it in full"
+            )
+        self._tissues(config)
+        self._volumes.of(config)
+
+    def run(self, attempt: Attempt) -> dict[str, float]:
+        """Look at the training volumes. See `Task.run`."""
+        config, _ = attempt.config(attempt.seeds[0])
+        return self._run_task(config, self._volumes.of(config).training)
+
+    def evaluate(self, attempt: Attempt) -> dict[str, float]:
+        """Look at the test volumes. See `Task.evaluate`."""
+        config, _ = attempt.config(attempt.seeds[0])
+        metrics = self._run_task(config, self._volumes.of(config).test)
+        return {f"test/{name}": value for name, value in metrics.items()}
+
+    def _run_task(self, config: DictConfig, volumes: Mapping[str, LabelVolume]) -> dict[str, float]:
+        reward, tissues = instantiate(config.reward, _convert_="object"), self._tissues(config)
+        at_plane, elsewhere = [], []
+        for volume in volumes.values():
+            judge, labelled = PlaneScorer(volume, reward.fitted_to([volume], tissues), tissues), volume.optimal_action
+            if labelled is None:
+                raise InvalidValueError(f"{volume.name}: has no labelled plane, which clusterings are judged by")
+            at_plane.append(judge.seen(labelled)[0])
+            tx_mm, ty_mm = labelled.translation
+            places = np.arange(0.0, volume.size_mm[1], STEP_MM)
+            far = [place for place in places if abs(place - ty_mm) > NEAR_MM]
+            planes = [ManipulatorAction(labelled.rotation, (tx_mm, float(place))) for place in far]
+            elsewhere.append(fmean(judge.seen(plane)[0] for plane in planes))
+        right, wrong = fmean(at_plane), fmean(elsewhere)
+        return dict(zip(METRICS, (right - wrong, right, wrong, min(at_plane)), strict=True))
+
+    def _tissues(self, config: DictConfig) -> Tissues:
+        return check_tissues(instantiate(config.env.clustering, _convert_="object"))

@@ -1,0 +1,219 @@
+"""A trial that trains agents: one after another, with each of its seeds."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import optuna
+from omegaconf import DictConfig
+
+from armscan.agents import Learner
+from armscan.config.defaults import to_plain
+from armscan.errors import CheckpointError, InvalidValueError
+from armscan.experiment.build import build_experiment, check_keys
+from armscan.experiment.invocation import Invocation
+from armscan.experiment.job import Job
+from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
+from armscan.experiment.runner import VIDEO_SEED, final_evaluations, train_agent
+from armscan.experiment.setup import RunSetup
+from armscan.policies.build import save_policy
+from armscan.stats.aggregation import interquartile_mean
+from armscan.sweeps.scheduling.state import ENV_STEPS
+from armscan.sweeps.tasks.attempt import Attempt
+from armscan.sweeps.tasks.base import VolumesInMemory
+from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
+from armscan.training import TEST, EpochReport, Evaluation, record_episode, resume_from_checkpoint
+from armscan.utils.files import (
+    EVALUATION_FILE,
+    LAST_CHECKPOINT,
+    LEARNING_CURVE_FILE,
+    RUN_FILE,
+    VIDEO_FILE,
+    atomic_write,
+    folder_lock,
+)
+from armscan.utils.log import log
+from armscan.utils.retry import RETRY_S
+
+# Of each training, beside the metrics of its best validation.
+TRAINING_METRICS = (ENV_STEPS, "training_s", "solved")
+Conclude = Callable[[RunSetup, TrackedRun, Path], dict[str, float]]
+
+
+@dataclass
+class Reporter:
+    """A training callback that reports to the study.
+
+    Args:
+        attempt: at the trial.
+        seed: of the training.
+        grid: environment steps between two reports.
+        total: environment steps of a whole training.
+    """
+
+    attempt: Attempt
+    seed: int
+    grid: int
+    total: int
+    reports: list[EpochReport] = field(default_factory=list)
+
+    def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
+        """Report again what an attempt before has reported."""
+        for report in earlier:
+            self.on_epoch(report)
+
+    def on_epoch(self, report: EpochReport) -> None:
+        """Report an epoch.
+
+        Raises:
+            optuna.TrialPruned: if the trial is not worth going on with.
+        """
+        self.reports.append(report)
+        metrics = report.evaluation.metrics()
+        at = {"n_env_steps": report.n_env_steps, "grid": self.grid, "total": self.total}
+        self.attempt.report(metrics, seed=self.seed, **at)
+
+    def on_end(self) -> None:
+        """Has reported everything."""
+
+
+class TrainingTask:
+    """The task of training an agent, with each of a trial's seeds."""
+
+    def __init__(self) -> None:
+        self._volumes = VolumesInMemory()
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """Those of the best validation, and those of the training."""
+        return (*Evaluation(()).metrics(), *TRAINING_METRICS)
+
+    @property
+    def final_metric(self) -> str:
+        """The mean steps of an episode."""
+        return "test/mean_steps"
+
+    def check(self, config: DictConfig) -> None:
+        """See `Task.check`."""
+        check_keys(config)
+        experiment = build_experiment(config, self._volumes.of(config))
+        if not isinstance(experiment.agent, Learner):
+            raise InvalidValueError(
+                f"agent is {config.agent.get('_target_')!r}, but the trials of this study need one that learns"
+            )
+
+    def run(self, attempt: Attempt) -> dict[str, float]:
+        """Train with each seed; returns the interquartile means of the metrics over the seeds. See `Task.run`."""
+        for seed in attempt.seeds:
+            if seed not in attempt.seeds_done:
+                attempt.keep_seed(seed, trained(attempt, seed))
+        of_seeds = [attempt.seeds_done[seed] for seed in attempt.seeds]
+        return {name: float(interquartile_mean([metrics[name] for metrics in of_seeds])) for name in of_seeds[0]}
+
+    def evaluate(self, attempt: Attempt) -> dict[str, float]:
+        """Train, evaluate, record a video and keep the policy; returns the metrics of the test."""
+        (seed,) = attempt.seeds
+        return trained(attempt, seed, _concluded)
+
+
+def _concluded(setup: RunSetup, tracked: TrackedRun, folder: Path) -> dict[str, float]:
+    evaluations = final_evaluations(setup)
+    contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
+    (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
+    agent, seed = setup.experiment.agent, VIDEO_SEED + setup.experiment.seed
+    record_episode(agent, setup.video_env, folder / VIDEO_FILE, seed=seed)
+    assert isinstance(agent, Learner)
+    save_policy(agent, setup.test_env, tracked, folder, log)
+    metrics = {f"test/{name}": value for name, value in evaluations[TEST].metrics().items()}
+    for volume, evaluation in evaluations[TEST].by_volume().items():
+        metrics |= {f"test/volume/{volume}/{name}": value for name, value in evaluation.metrics().items()}
+    return metrics
+
+
+def trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:
+    """Train with one seed, from the last checkpoint where there is one.
+
+    Args:
+        attempt: at the trial.
+        seed: one of its seeds.
+        conclude: what is done with the trained agent; returns further metrics.
+
+    Returns:
+        The metrics of the best validation, of the training, and those that `conclude` returns.
+
+    Raises:
+        optuna.TrialPruned: if the trial is not worth going on with.
+    """
+    config, choices = attempt.config(seed)
+    setup = RunSetup.build(config)
+    folder = attempt.folder / f"seed_{seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    budget = setup.experiment.budget
+    reporter = Reporter(attempt, seed, grid=budget.eval_every_env_steps, total=budget.env_steps)
+    pruned, concluded = None, {}
+    with folder_lock(folder):
+        setup, tracked, earlier = _begun(attempt, seed, setup, config, choices, folder)
+        attempt.opened(tracked)
+        with tracked:
+            try:
+                result = train_agent(setup, folder, [tracked, reporter], run_id=tracked.run_id, earlier=earlier)
+            except optuna.TrialPruned as error:
+                pruned = error
+            else:
+                concluded = conclude(setup, tracked, folder) if conclude else {}
+            draw_learning_curve(reporter.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
+            attempt.show_picture(folder / LEARNING_CURVE_FILE)
+            # A finished training is not resumed; the best checkpoint stays.
+            (folder / LAST_CHECKPOINT).unlink(missing_ok=True)
+            tracked.log_results(folder)
+            tracked.log_files(folder / RUN_FILE)
+        attempt.opened(None)
+    if pruned is not None:
+        raise pruned
+    best = result.best.evaluation.metrics()
+    measured = (result.reports[-1].n_env_steps, result.wall_s, float(result.is_solved))
+    return best | dict(zip(TRAINING_METRICS, measured, strict=True)) | concluded
+
+
+def _begun(
+    attempt: Attempt, seed: int, setup: RunSetup, config: DictConfig, choices: dict[str, str], folder: Path
+) -> tuple[RunSetup, TrackedRun, list[EpochReport]]:
+    """Open the tracked run of a training, and takes the agent to where an attempt before has left it."""
+    _take_over(attempt, folder)
+    begun, agent = folder / RUN_FILE, setup.experiment.agent
+    assert isinstance(agent, Learner)
+    if begun.exists() and (folder / LAST_CHECKPOINT).exists():
+        run_id = json.loads(begun.read_text())["run_id"]
+        try:
+            earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id))
+        except CheckpointError:
+            # Whatever has happened to it, the trial can be begun again, with an agent that has learned nothing.
+            setup = RunSetup.build(config)
+        else:
+            client, _ = open_store(**to_plain(config.tracking), retry_s=RETRY_S)
+            tags = volume_tags(setup.fingerprints) | place_tags(folder)
+            tags["mlflow.parentRunId"] = attempt.run_id
+            return setup, TrackedRun.reopen(client, run_id, folder=folder, config=to_plain(config), tags=tags), earlier
+    job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
+    invocation = Invocation(folder, attempt.overrides, attempt.command, choices, job)
+    tracked = start_tracking(config, invocation, setup, retry_s=RETRY_S)
+    tracked.set_tags({"study": attempt.trial.study.study_name, "trial": str(attempt.trial.number)})
+    atomic_write(begun, lambda file: file.write(json.dumps({"run_id": tracked.run_id}).encode()))
+    return setup, tracked, []
+
+
+def _take_over(attempt: Attempt, folder: Path) -> None:
+    """Copy what the attempt before has left, where this one has nothing of its own yet."""
+    before = attempt.folder_before / folder.name if attempt.folder_before else None
+    if before is None or (folder / RUN_FILE).exists() or not (before / RUN_FILE).exists():
+        return
+    for file in before.iterdir():
+        if file.is_file() and not file.name.startswith(".") and file.name != RUN_FILE:
+            shutil.copyfile(file, folder / file.name)
+    take_over(json.loads((before / RUN_FILE).read_text())["run_id"], before, folder)
+    # Last: from then on this folder counts.
+    shutil.copyfile(before / RUN_FILE, folder / RUN_FILE)

@@ -1,0 +1,207 @@
+"""Heartbeat of a worker: it renews the lease of its trial, and reclaims the trials of dead workers."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from optuna.trial import FrozenTrial, Trial
+
+from armscan.sweeps.scheduling.outcome import PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import HOLDER, LEASE
+from armscan.utils.log import log
+from armscan.utils.processes import process_start
+
+HEARTBEAT_S, POLL_S = 10.0, 0.25
+# Without a heartbeat for so long a worker counts as dead: a busy storage may delay some.
+DEAD_AFTER_S = 40.0
+# Up to so many running trials, each worker checks all at each heartbeat, and less often with more of them: a check
+# costs the storage something for each running trial.
+MAX_CHECKERS = 64
+# Longest time between two checks that counts as silence, in expected intervals: in a longer one the storage was away
+# for all, and nobody could renew a lease.
+MAX_UNSEEN = 1.5
+# If the storage is away, the trial cannot be requeued: it is reclaimed later, because its process is gone.
+REQUEUE_TIMEOUT_S = 5.0
+
+
+class LimitReachedError(Exception):
+    """The study's time or environment steps are spent: the current trial is requeued."""
+
+
+class LivenessCheck:
+    """Tells dead workers from living ones, by its own clock: clocks of machines differ."""
+
+    def __init__(self) -> None:
+        # Between two checks.
+        self.interval_s = HEARTBEAT_S
+        # By trial: its last heartbeat, when it was last checked, and for how long it had been the same by then.
+        self._seen: dict[int, tuple[Any, float, float]] = {}
+        self._host = socket.gethostname()
+
+    def is_dead(self, trial: FrozenTrial) -> bool:
+        """Whether the worker of a running trial has ended, or has not renewed its lease for long."""
+        lease = trial.user_attrs.get(LEASE, {})
+        if lease.get("host") == self._host and Path("/proc/self/stat").exists():
+            return process_start(lease["pid"]) != str(lease["started"])
+        heartbeat = lease.get("worker"), lease.get("beat")
+        now_s = time.monotonic()
+        before, checked_s, silent_s = self._seen.get(trial.number, (None, now_s, 0.0))
+        if before == heartbeat:
+            silent_s += min(now_s - checked_s, MAX_UNSEEN * self.interval_s)
+        else:
+            silent_s = 0.0
+        self._seen[trial.number] = heartbeat, now_s, silent_s
+        return silent_s > DEAD_AFTER_S
+
+
+class Heartbeat:
+    """Renews the lease of the current trial, reclaims the trials of dead workers, and leaves when asked to.
+
+    Args:
+        scheduler: of the study.
+        worker: name of this worker.
+        is_told_to_leave: polled several times a second.
+        leave: ends the process, once the current trial is requeued; mostly called in another thread than the worker's.
+        on_death: called with each reclaimed trial.
+        is_told_to_leave_soon: polled when a trial is claimed and when it reports progress, where it loses nothing.
+    """
+
+    def __init__(
+        self,
+        scheduler: TrialScheduler,
+        worker: str,
+        *,
+        is_told_to_leave: Callable[[], bool],
+        leave: Callable[[], None],
+        on_death: Callable[[FrozenTrial], None],
+        is_told_to_leave_soon: Callable[[], bool] = lambda: False,
+    ) -> None:
+        pid = os.getpid()
+        self._lease: dict[str, Any] = {
+            "worker": worker,
+            "host": socket.gethostname(),
+            "pid": pid,
+            "started": process_start(pid),
+            "beat": 0,
+        }
+        self._scheduler, self._liveness = scheduler, LivenessCheck()
+        self._is_told_to_leave, self._leave, self._on_death = is_told_to_leave, leave, on_death
+        self._is_told_to_leave_soon = is_told_to_leave_soon
+        self._trial: Trial | None = None
+        self._cleanup: Callable[[], None] | None = None
+        # Of the current trial.
+        self.writes = PendingWrites()
+        self._limit: str | None = None
+        self._next_check_s = 0.0
+        # Held while a trial is claimed or requeued, so that leaving in between forgets none.
+        self._changing, self._cleaning = threading.Lock(), threading.Lock()
+        self._stopped = threading.Event()
+        # Two: heartbeats wait for a storage that is away, and leaving does not.
+        self._threads = [threading.Thread(target=each, daemon=True) for each in (self._watch, self._beat)]
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Run the heartbeat inside the context."""
+        for thread in self._threads:
+            thread.start()
+        try:
+            yield
+        finally:
+            self._stopped.set()
+            for thread in self._threads:
+                thread.join()
+
+    def claim(self, outcome: TrialOutcome | None = None, cleanup: Callable[[], None] | None = None) -> Trial | None:
+        """Claim a trial as `TrialScheduler.claim` does, and hold it from then on.
+
+        Args:
+            outcome: of the trial before, which is not held any more.
+            cleanup: of the trial before; see `clean_up`.
+        """
+        with self._changing:
+            # The progress of the trial before is not this one's.
+            self._lease = {key: self._lease[key] for key in (*HOLDER, "beat")}
+            self._trial = self._scheduler.claim(self._lease, outcome)
+            self._cleanup, self.writes = cleanup, PendingWrites()
+        self._leave_if_told_to()
+        return self._trial
+
+    def set_cleanup(self, cleanup: Callable[[], None] | None) -> None:
+        """Set what closes the trial's open runs if the process is told to leave."""
+        self._cleanup = cleanup
+
+    def clean_up(self) -> None:
+        """Run the cleanup, once; another thread that calls this waits until it is done."""
+        with self._cleaning:
+            cleanup, self._cleanup = self._cleanup, None
+            if cleanup is not None:
+                cleanup()
+
+    def report_progress(self, progress: dict[str, Any]) -> None:
+        """Keep the trial's progress for the next renewal of the lease.
+
+        Raises:
+            LimitReachedError: if the study's time or environment steps are spent.
+        """
+        self._lease = self._lease | progress
+        self._leave_if_told_to()
+        if self._limit is not None:
+            raise LimitReachedError(self._limit)
+
+    def requeue(self) -> None:
+        """Requeue the current trial, if there is one."""
+        with self._changing:
+            if self._trial is not None:
+                self._scheduler.requeue(self._trial, self._lease, self.writes)
+                log(f"trial {self._trial.number} is requeued")
+            self.clean_up()
+            self._trial = None
+
+    def _leave_if_told_to(self) -> None:
+        if self._is_told_to_leave_soon():
+            self.requeue()
+            self._leave()
+
+    def _watch(self) -> None:
+        while not self._stopped.wait(POLL_S):
+            if self._is_told_to_leave():
+                late = threading.Timer(REQUEUE_TIMEOUT_S, self._leave)
+                late.daemon = True
+                late.start()
+                try:
+                    self.requeue()
+                finally:
+                    late.cancel()
+                    self._leave()
+
+    def _beat(self) -> None:
+        while True:
+            try:
+                self._renew()
+            # Whatever a storage raises that is away for long: the next heartbeat may find it there again.
+            except Exception as error:
+                log(f"heartbeat failed: {error!r}")
+            if self._stopped.wait(HEARTBEAT_S):
+                return
+
+    def _renew(self) -> None:
+        with self._changing:
+            self._lease = self._lease | {"beat": self._lease["beat"] + 1}
+            is_checking = time.monotonic() >= self._next_check_s
+            state = self._scheduler.renew(self._trial, self._lease, is_checking=is_checking)
+        if state is None:
+            return
+        self._liveness.interval_s = HEARTBEAT_S * max(1.0, len(state.running) / MAX_CHECKERS)
+        # An interval is never quite as long as it should be.
+        self._next_check_s = time.monotonic() + self._liveness.interval_s - HEARTBEAT_S / 2
+        for trial in self._scheduler.reclaim(self._liveness.is_dead, state):
+            self._on_death(trial)
+        self._limit = self._scheduler.spent(state)

@@ -1,0 +1,203 @@
+"""Launch the workers of a study, wait for them wherever they run, and leave none behind."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
+from pathlib import Path
+
+from armscan.config.command_hints import sync_command
+from armscan.config.defaults import TRACKING_URI
+from armscan.config.error_messages import one_line_message
+from armscan.config.sources import working_folder
+from armscan.errors import ArmscanError, AwayError, StorageAwayError, StudyError
+from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, silence_launcher
+from armscan.sweeps.results.progress import ProgressDisplay
+from armscan.sweeps.space.overrides import written
+from armscan.sweeps.study.arguments import STORAGE, USUAL_LAUNCHER, WORKER_KEY, StudyCommand, fixed_by
+from armscan.sweeps.study.open import OpenedStudy
+from armscan.sweeps.workers.heartbeat import LivenessCheck
+from armscan.sweeps.workers.monitor import StudyMonitor
+from armscan.sweeps.workers.supervisor import (
+    LAUNCHER_FILE,
+    STOP_FILE,
+    WORKER_FILES,
+    ProcessInfo,
+    keep_gpus,
+    local_workers,
+)
+from armscan.tracking import TrackedRun, sync
+from armscan.tracking.run import SHORT_WAIT_S
+from armscan.utils.processes import process_start
+from armscan.utils.retry import no_retry
+
+# Time that workers have to leave before their launcher is interrupted and those on this machine are killed; through a
+# shared folder other machines learn late that they are asked to.
+LEAVE_S, LEAVE_ELSEWHERE_S = 4.0, 20.0
+# Ten years: a study has limits of its own.
+MINUTES_WITHOUT_END = 5_256_000
+MAX_REASON_CHARS = 500
+Launch = Callable[[Sequence[str]], object]
+
+
+def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch: Launch) -> None:
+    """Launch the workers of a study, and wait for their end.
+
+    Args:
+        opened: the study.
+        given: its command line.
+        launcher: the choice of `hydra/launcher`.
+        launch: runs the command with Hydra, with the words it is given.
+
+    Raises:
+        KeyboardInterrupt: if it is interrupted; the workers have been asked to leave.
+        StudyError: if the launcher has failed, and no worker is alive.
+    """
+    started = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
+    folder = working_folder() / opened.folder / "workers" / started
+    folder.mkdir(parents=True)
+    ProcessInfo.current().write(folder / LAUNCHER_FILE)
+    words = _words(opened, given, launcher, folder)
+    tracked = TrackedRun.joined(opened.client, opened.run_id, name=opened.settings.name, folder=folder)
+    tracked.set_status("RUNNING")
+    leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
+    with _leaving(opened, folder, tracked, leave_s), ProgressDisplay(opened, folder):
+        if launcher not in ON_THIS_MACHINE:
+            _launch_elsewhere(opened, folder, launcher, lambda: launch(words))
+        elif launcher == USUAL_LAUNCHER:
+            keep_gpus()
+            with _block_sigint():
+                launch(words)
+        else:
+            launch(words)
+
+
+def _words(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: Path) -> list[str]:
+    """Return the words that the workers are launched with."""
+    n_workers = opened.settings.workers
+    words = ["-m", *given.launching, *_addresses(opened, given)]
+    words += [f"{WORKER_KEY}={','.join(map(str, range(n_workers)))}", f"hydra.sweep.dir={written(str(folder))}"]
+    if launcher == USUAL_LAUNCHER:
+        # Before the others, which may say something else.
+        words.insert(1, f"hydra.launcher.timeout_min={MINUTES_WITHOUT_END}")
+    if launcher == "joblib":
+        words.append(f"hydra.launcher.n_jobs={n_workers}")
+    return words
+
+
+def _addresses(opened: OpenedStudy, given: StudyCommand) -> list[str]:
+    """Return overrides with the addresses of storage and tracking that only this machine's environment has."""
+    fixed = fixed_by(given.words)
+    addresses = {STORAGE: opened.settings.storage, TRACKING_URI: opened.config.tracking.uri}
+    return [f"{key}={written(uri)}" for key, uri in addresses.items() if key not in fixed]
+
+
+def _launch_elsewhere(opened: OpenedStudy, folder: Path, launcher: str, launch: Callable[[], object]) -> None:
+    """Launch workers on other machines, and wait for the end of the study, with the launcher or without."""
+    monitor = StudyMonitor(opened)
+    silence_launcher(launcher)
+    try:
+        with monitor.interrupting():
+            launch()
+    except SystemExit:
+        # What Ray has put in the place of our answer to SIGTERM.
+        signal.raise_signal(signal.SIGINT)
+        monitor.wait_for_requeue()
+    # What a worker's machine has said, after all of them have ended.
+    except ArmscanError as error:
+        print(f"error: {error}", file=sys.stderr)
+    # Whatever a launcher raises: for one job that was cancelled, too, while all others go on.
+    except Exception as error:
+        line = one_line_message(error) or " ".join(str(error).split()) or repr(error)
+        failed = StudyError(f"{LAUNCHER} is {launcher!r}, which has failed: {line[:MAX_REASON_CHARS]}")
+        if not any(folder.glob(WORKER_FILES)):
+            raise failed from error
+        print(f"{failed}; waiting for workers that are still there", file=sys.stderr)
+        if not monitor.wait_until_over():
+            raise failed from error
+
+
+@contextlib.contextmanager
+def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: float) -> Iterator[None]:
+    """Leave no worker and no open run behind; a context to launch the workers in."""
+    status, is_asked = "FINISHED", threading.Event()
+    deadline = threading.Timer(leave_s, os.kill, (os.getpid(), signal.SIGINT))
+    deadline.daemon = True
+
+    def ask(*_: object) -> None:
+        """Ask the workers to leave; an interrupted launcher may kill them before they can."""
+        if is_asked.is_set():
+            raise KeyboardInterrupt
+        is_asked.set()
+        (folder / STOP_FILE).touch()
+        deadline.start()
+
+    asking = [signal.SIGINT, signal.SIGTERM]
+    # Its terminal was closed; where `nohup` has it go on, it does.
+    asking += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else []
+    before = {each: signal.signal(each, ask) for each in asking}
+    try:
+        yield
+    except BaseException:
+        status = "KILLED"
+        raise
+    finally:
+        deadline.cancel()
+        for each in before:
+            signal.signal(each, signal.SIG_IGN)
+        (folder / STOP_FILE).touch()
+        _end_workers(folder)
+        # If the storage is away, the next start does it.
+        with contextlib.suppress(StorageAwayError), no_retry():
+            for phase in opened.phases:
+                for trial in phase.scheduler.reclaim(LivenessCheck().is_dead):
+                    phase.close_runs_of(trial)
+        _deliver(opened, tracked, "KILLED" if is_asked.is_set() else status)
+        for each, handler in before.items():
+            signal.signal(each, handler)
+    if is_asked.is_set():
+        raise KeyboardInterrupt
+
+
+def _deliver(opened: OpenedStudy, tracked: TrackedRun, status: str) -> None:
+    """End the study's own run, and upload what its trials buffered while their store was away."""
+    is_there = tracked.end(status, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
+    left = []
+    if is_there:
+        left = [each.folder for each in sync(opened.folder, lambda _: opened.client) if each.left]
+        with contextlib.suppress(AwayError), no_retry():
+            for phase in opened.phases:
+                phase.close_orphaned_runs()
+    if not is_there or left:
+        print(f"not all is tracked: {sync_command(opened.folder)} delivers the rest", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _block_sigint() -> Iterator[None]:
+    """Keep a Ctrl-C from a launcher's processes, which would each print a traceback.
+
+    They inherit this thread's blocked SIGINT. Another thread receives the signal, and this one is interrupted within a
+    second.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_workers(folder: Path) -> None:
+    """Wait for the workers on this machine to leave, and kill those that do not."""
+    until_s = time.monotonic() + LEAVE_S
+    while (alive := local_workers(folder)) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    for worker in alive:
+        if process_start(worker.pid) == worker.started:
+            os.kill(worker.pid, signal.SIGKILL)

@@ -1,0 +1,116 @@
+"""Monitor of a study whose workers run on other machines, from its storage."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+
+from armscan.errors import StorageAwayError
+from armscan.sweeps.study.finalists import missing_final_trials
+from armscan.sweeps.study.open import OpenedStudy
+from armscan.sweeps.workers.heartbeat import LivenessCheck
+from armscan.utils.retry import no_retry
+
+LOOK_S = 5.0
+# A launcher that waits for longer after the end of a study waits for a lost worker.
+OVER_S = 20.0
+# There is no heartbeat between two trials, nor while a worker starts.
+LIFELESS_S = 120.0
+
+
+class StudyMonitor:
+    """Monitors a study.
+
+    Args:
+        opened: the study.
+    """
+
+    def __init__(self, opened: OpenedStudy) -> None:
+        self._opened = opened
+        # One for each phase: trials of both have the same numbers.
+        self._liveness: dict[str, LivenessCheck] = defaultdict(LivenessCheck)
+
+    def is_over(self) -> bool:
+        """Whether no trial is running, and none is missing."""
+        for phase in self._opened.phases:
+            state = phase.scheduler.state()
+            if state.running or phase.scheduler.end(state) is None:
+                return False
+        search, final = self._opened.search.scheduler, self._opened.final_eval
+        if final is None or search.broken(search.state()):
+            return True
+        return not missing_final_trials(self._opened.settings, search.study, final.scheduler.study)
+
+    def is_alive(self) -> bool:
+        """Whether the worker of any trial is."""
+        return any(
+            not self._liveness[phase.name].is_dead(trial)
+            for phase in self._opened.phases
+            for trial in phase.scheduler.state().running
+        )
+
+    def wait_until_over(self) -> bool:
+        """Wait as long as any worker is alive; returns whether the study is over then."""
+        seen_s = time.monotonic()
+        with no_retry():
+            while time.monotonic() - seen_s < LIFELESS_S:
+                try:
+                    if self.is_over():
+                        return True
+                    is_alive = self.is_alive()
+                except StorageAwayError:
+                    # The workers wait for it, too.
+                    is_alive = True
+                if is_alive:
+                    seen_s = time.monotonic()
+                time.sleep(LOOK_S)
+        return False
+
+    def wait_for_requeue(self) -> None:
+        """Wait until the workers, which have been asked to leave, have requeued their trials."""
+        with contextlib.suppress(StorageAwayError), no_retry():
+            while any(phase.scheduler.state().running for phase in self._opened.phases):
+                time.sleep(1.0)
+
+    @contextlib.contextmanager
+    def interrupting(self) -> Iterator[None]:
+        """Interrupt a launcher that still waits when the study is over; a context to launch in."""
+        is_over, is_left = threading.Event(), threading.Event()
+
+        def interrupt(*_: object) -> None:
+            if not is_left.is_set():
+                # Every launcher lets this through.
+                raise KeyboardInterrupt
+
+        def watch() -> None:
+            with no_retry():
+                if self._seen_over(is_left):
+                    is_over.set()
+                    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
+
+        before = signal.signal(signal.SIGUSR1, interrupt)
+        watching = threading.Thread(target=watch, daemon=True)
+        watching.start()
+        try:
+            yield
+        except KeyboardInterrupt:
+            if not is_over.is_set():
+                raise
+        finally:
+            is_left.set()
+            watching.join()
+            signal.signal(signal.SIGUSR1, before)
+
+    def _seen_over(self, is_left: threading.Event) -> bool:
+        """Return True once the study has been over for a while, False if the launcher returns before."""
+        over_s = 0.0
+        while over_s < OVER_S:
+            if is_left.wait(LOOK_S):
+                return False
+            with contextlib.suppress(StorageAwayError):
+                over_s = over_s + LOOK_S if self.is_over() else 0.0
+        return True

@@ -1,0 +1,277 @@
+"""A worker of a study: it claims a trial, runs it, tells its outcome, and claims the next, until the study ends."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.trial import Trial, TrialState
+
+from armscan.config.command_hints import run_command
+from armscan.config.defaults import MULTIRUN, to_plain
+from armscan.config.error_messages import one_line_message, silence_library_warnings
+from armscan.errors import StorageAwayError, TrackingAwayError
+from armscan.sweeps.scheduling.outcome import TrialOutcome
+from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF
+from armscan.sweeps.space.overrides import overrides_of
+from armscan.sweeps.study.components import make_sampler
+from armscan.sweeps.study.dashboard import note_run, show_picture
+from armscan.sweeps.study.finalists import enqueue_final_trials
+from armscan.sweeps.study.open import open_for_work, read_settings
+from armscan.sweeps.study.phase import Phase
+from armscan.sweeps.tasks.attempt import CONFIG_SHA256, FOLDER, RUN, Attempt, composed, config_sha256, trial_folder
+from armscan.sweeps.tasks.base import check_metrics
+from armscan.sweeps.workers.heartbeat import Heartbeat, LimitReachedError
+from armscan.tracking import TrackedRun
+from armscan.tracking.run import SHORT_WAIT_S
+from armscan.utils.files import CONFIG_FILE, SHA256_TAGS
+from armscan.utils.log import log
+
+WAIT_S = 1.0
+MAX_REASON_CHARS = 2000
+
+
+class Worker:
+    """Runs trials of one phase of a study, one after another.
+
+    Args:
+        phase: of the study.
+        words: overrides of the command line, which each trial adds its values to.
+        heartbeat: of this worker; holds the current trial.
+    """
+
+    def __init__(self, phase: Phase, words: Sequence[str], heartbeat: Heartbeat) -> None:
+        self._phase, self._words, self._heartbeat = phase, words, heartbeat
+        self._tracked: TrackedRun | None = None
+
+    def work(self) -> str:
+        """Run trials until none is left, and those of other workers have ended; returns why."""
+        outcome: TrialOutcome | None = None
+        conclude: Callable[[], None] | None = None
+        while True:
+            # One round trip for the trial before and the next: with many workers these add up.
+            trial = self._heartbeat.claim(outcome, conclude)
+            self._heartbeat.clean_up()
+            outcome, conclude = None, None
+            if trial is not None:
+                outcome = self._run(trial)
+                conclude = partial(self._conclude, outcome, self._tracked) if outcome else None
+                self._tracked = None
+            elif reason := self._wait_for_trial():
+                return reason
+
+    def _wait_for_trial(self) -> str | None:
+        """Wait until a trial can be claimed; returns None then, or why there will be none."""
+        scheduler = self._phase.scheduler
+        while True:
+            state = scheduler.state()
+            reason = scheduler.end(state)
+            # A running trial may yet have to be retried.
+            if reason is not None and not state.running:
+                return reason
+            if scheduler.has_more(state):
+                return None
+            time.sleep(WAIT_S)
+
+    def _run(self, trial: Trial) -> TrialOutcome | None:
+        """Run a trial; returns its outcome, None if it was requeued or taken over."""
+        log(f"{self._phase.name}: {_beginning(trial)}")
+        writes = self._heartbeat.writes
+        try:
+            metrics = check_metrics(self._run_task(trial), self._phase.objectives)
+        except optuna.TrialPruned:
+            return TrialOutcome(trial, TrialState.PRUNED, writes)
+        except UpdateFinishedTrialError:
+            # This worker was taken for dead: the trial is another's.
+            self._let_go(trial, self._tracked)
+            self._heartbeat.set_cleanup(None)
+        except LimitReachedError as limit:
+            log(f"trial {trial.number} is requeued: {limit}")
+            self._heartbeat.requeue()
+        except TrackingAwayError:
+            self._heartbeat.requeue()
+            raise
+        except StorageAwayError:
+            raise
+        # Whatever else a trial raises fails the trial, not the study; this process is told to leave in other ways.
+        except (Exception, SystemExit, KeyboardInterrupt) as error:
+            line = one_line_message(error)
+            if line is None:
+                traceback.print_exc()
+            reason = (line or repr(error))[:MAX_REASON_CHARS]
+            return TrialOutcome(trial, TrialState.FAIL, writes, attributes={FAILURE: reason})
+        else:
+            values = [metrics[name] for name in self._phase.objectives]
+            return TrialOutcome(trial, TrialState.COMPLETE, writes, values, {METRICS: metrics})
+        return None
+
+    def _run_task(self, trial: Trial) -> dict[str, float]:
+        phase, writes = self._phase, self._heartbeat.writes
+        # By the trial's number: parallel workers draw different points, and a single worker is reproducible.
+        seed = np.random.SeedSequence((phase.seed, trial.number)).generate_state(1)[0]
+        trial.study.sampler = make_sampler(phase.sampler, int(seed))
+        chosen = self._suggest(trial)
+        config, choices = composed([*self._words, *overrides_of(chosen)])
+        folder = trial_folder(phase.folder, trial.number)
+        folder.mkdir(parents=True, exist_ok=True)
+        config_sum = config_sha256(to_plain(config))
+        is_resumed = RUN in trial.user_attrs
+        self._tracked = self._begun(trial, chosen, folder, config_sum)
+        self._opened(None)
+        for name, value in ((FOLDER, str(folder)), (CONFIG_SHA256, config_sum)):
+            if trial.user_attrs.get(name) != value:
+                writes.add(partial(trial.set_user_attr, name, value))
+        attempt = Attempt(
+            trial=trial,
+            chosen=chosen,
+            composed=(config, choices),
+            command=run_command([MULTIRUN[0], *self._words]),
+            seeds=phase.seeds_of(trial),
+            study_folder=phase.folder,
+            run_id=self._tracked.run_id,
+            objective=phase.reported,
+            report_progress=self._heartbeat.report_progress,
+            opened=self._opened,
+            show_picture=lambda picture: writes.add(partial(show_picture, trial, picture, phase.artifacts)),
+            reported=_steps_of(trial) if is_resumed else set(),
+            writes=writes,
+            transaction=phase.scheduler.transaction,
+        )
+        try:
+            return phase.run(attempt)
+        finally:
+            writes.add(partial(trial.set_user_attr, ENV_STEPS, attempt.env_steps))
+
+    def _suggest(self, trial: Trial) -> dict[str, Any]:
+        """Return the values of a trial, drawn and written in one transaction."""
+
+        def suggest() -> dict[str, Any]:
+            # A new object each time: what the trial believes written may have been lost with the connection.
+            return self._phase.space.suggest(Trial(trial.study, trial._trial_id))
+
+        return self._phase.scheduler.transaction(suggest)
+
+    def _begun(self, trial: Trial, chosen: dict[str, Any], folder: Path, config_sum: str) -> TrackedRun:
+        """Open the tracked run of a trial, or resume that of a requeued one."""
+        phase, attributes = self._phase, trial.user_attrs
+        tags = {
+            "study": phase.name,
+            "study.storage": phase.storage_uri,
+            "trial": str(trial.number),
+            SHA256_TAGS[CONFIG_FILE]: config_sum,
+            "folder": str(folder.resolve()),
+            "overrides": " ".join(overrides_of(chosen)),
+        }
+        if RETRY_OF in attributes:
+            tags["trial.retry_of"] = str(attributes[RETRY_OF])
+        if RUN in attributes:
+            tracked = TrackedRun.reopen(phase.client, attributes[RUN], folder=folder, config={}, tags=tags)
+        else:
+            tracked = TrackedRun.start(
+                phase.client,
+                phase.experiment_id,
+                name=f"{phase.name}-{trial.number:04d}",
+                config=chosen,
+                tags=tags,
+                folder=folder,
+                parent_id=phase.run_id,
+            )
+            # Before the trial knows its run: a resumed trial writes no note.
+            note = partial(note_run, trial, phase.client, phase.experiment_id, tracked.run_id, folder)
+            for write in (note, partial(trial.set_user_attr, RUN, tracked.run_id)):
+                self._heartbeat.writes.add(write)
+        return tracked
+
+    def _opened(self, training: TrackedRun | None) -> None:
+        open_runs = [run for run in (training, self._tracked) if run is not None]
+        self._heartbeat.set_cleanup(partial(_close, open_runs))
+
+    def _conclude(self, outcome: TrialOutcome, tracked: TrackedRun | None) -> None:
+        """Log and track the outcome of a trial, once the storage has it."""
+        trial, state = outcome.trial, outcome.state
+        if not outcome.is_told:
+            self._let_go(trial, tracked)
+            return
+        metrics = outcome.attributes.get(METRICS, {})
+        shown = ", ".join(f"{name} {metrics[name]:.4g}" for name in self._phase.objectives if name in metrics)
+        reason = outcome.attributes.get(FAILURE)
+        log(f"trial {trial.number} " + (f"failed: {reason}" if reason else f"{state.name.lower()} {shown}".rstrip()))
+        if tracked is None:
+            return
+        tracked.log_figures(metrics, n_env_steps=0)
+        if state == TrialState.PRUNED:
+            tracked.set_tags({"pruned": "true"})
+        tracked.end("FAILED" if reason else "FINISHED", reason=reason)
+
+    def _let_go(self, trial: Trial, tracked: TrackedRun | None) -> None:
+        log(f"trial {trial.number} was taken over by another worker")
+        if tracked is not None:
+            tracked.end("FAILED", reason="taken over by another worker")
+
+
+def _steps_of(trial: Trial) -> set[int]:
+    return set(trial.storage.get_trial(trial._trial_id).intermediate_values)
+
+
+def _beginning(trial: Trial) -> str:
+    attributes = trial.user_attrs
+    if RUN in attributes:
+        return f"trial {trial.number} is resumed"
+    again = f", a retry of trial {attributes[RETRY_OF]}" if RETRY_OF in attributes else ""
+    return f"trial {trial.number} begins{again}"
+
+
+def _close(runs: Sequence[TrackedRun]) -> None:
+    for run in runs:
+        run.end("KILLED", reason="requeued", wait_s=SHORT_WAIT_S)
+
+
+def work(
+    words: Sequence[str],
+    name: str,
+    is_told_to_leave: Callable[[], bool],
+    *,
+    is_told_to_leave_soon: Callable[[], bool],
+    leave: Callable[[], None],
+) -> None:
+    """Works at a study until it is over.
+
+    Args:
+        words: of the study.
+        name: of the worker.
+        is_told_to_leave: see `Heartbeat`.
+        is_told_to_leave_soon: likewise.
+        leave: likewise.
+
+    Raises:
+        AwayError: if the storage or the tracking store is away for longer than a worker waits.
+    """
+    silence_library_warnings()
+    opened = open_for_work(*read_settings(words), words, retry=True)
+
+    def run_phase(phase: Phase) -> None:
+        heartbeat = Heartbeat(
+            phase.scheduler,
+            name,
+            is_told_to_leave=is_told_to_leave,
+            is_told_to_leave_soon=is_told_to_leave_soon,
+            leave=leave,
+            on_death=phase.close_runs_of,
+        )
+        with heartbeat.running():
+            reason = Worker(phase, words, heartbeat).work()
+        log(f"{phase.name}: {reason}")
+
+    search, final = opened.search, opened.final_eval
+    run_phase(search)
+    state = search.scheduler.state()
+    if final is not None and state.finished and not search.scheduler.broken(state):
+        enqueue_final_trials(opened.storage, opened.settings, search.scheduler.study, final.scheduler.study)
+        run_phase(final)

@@ -1,0 +1,191 @@
+"""A run in the store by its id or the beginning of it, and what it has kept: configuration and checkpoint."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mlflow.entities import Run
+
+import armscan
+from armscan.config.legacy import migrate
+from armscan.errors import TrackingError, listed
+from armscan.tracking.client import TrackingStore
+from armscan.tracking.store import open_existing_store, store_errors
+from armscan.training import Fingerprints
+from armscan.utils.files import BEST_CHECKPOINT, CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
+
+# What a run's agent was trained on, as `armscan.training.TrainingDomain` writes it.
+DOMAIN_TAG = "trained_on"
+# Which run an evaluation is of; only evaluations have it.
+EVALUATED_TAG = "evaluation.of"
+# Which version of armscan a run was made by.
+VERSION_TAG = "armscan.version"
+ID = re.compile(r"[0-9a-f]{1,32}")
+MAX_EXPERIMENTS = 1000
+N_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class FoundRun:
+    """A run in the store.
+
+    Args:
+        client: of the store.
+        uri: of the store.
+        experiment_id: that the run is in.
+        experiment_name: of that one.
+        run_id: of the run.
+        name: what the UI calls it.
+        status: how it ended, or that it is RUNNING.
+        tags: of the run.
+        files: its artifacts, by their paths.
+    """
+
+    client: TrackingStore = field(repr=False)
+    uri: str
+    experiment_id: str
+    experiment_name: str
+    run_id: str
+    name: str
+    status: str
+    tags: dict[str, str] = field(repr=False)
+    files: tuple[str, ...]
+
+    def config(self, folder: Path) -> dict[str, Any]:
+        """Return the resolved configuration, with the keys of this version; `folder` takes the file.
+
+        Raises:
+            TrackingError: if the run has kept none, it is damaged, or not the one that the run was started with.
+        """
+        try:
+            config = yaml.safe_load(self._started_with(CONFIG_FILE, folder))
+        except yaml.YAMLError as error:
+            raise TrackingError(f"run {self.run_id}: its {CONFIG_FILE} is damaged") from error
+        if not isinstance(config, dict):
+            raise TrackingError(f"run {self.run_id}: its {CONFIG_FILE} holds no configuration")
+        return migrate(config)
+
+    def checkpoint(self, folder: Path) -> Path | None:
+        """Return the best checkpoint, fetched into `folder`; None where the run has kept none."""
+        return self._fetched(BEST_CHECKPOINT, folder) if BEST_CHECKPOINT in self.files else None
+
+    def volumes(self, folder: Path) -> Fingerprints | None:
+        """Return the fingerprints of its volumes; None where the run was made before these were kept.
+
+        Raises:
+            TrackingError: if they are gone, or not those that the run was started with.
+        """
+        if SHA256_TAGS[VOLUMES_FILE] not in self.tags:
+            return None
+        volumes: Fingerprints = json.loads(self._started_with(VOLUMES_FILE, folder))
+        return volumes
+
+    def text(self, file: str, folder: Path) -> str | None:
+        """Return what an artifact says, fetched into `folder`; None where the run has none of this name."""
+        return self._fetched(file, folder).read_text(errors="replace") if file in self.files else None
+
+    def _started_with(self, file: str, folder: Path) -> bytes:
+        if file not in self.files:
+            raise TrackingError(
+                f"run {self.run_id} has no {file} among its artifacts, as each run of armscan run has from its start: "
+                "it was removed, or this is something else"
+            )
+        contents = self._fetched(file, folder).read_bytes()
+        if sha256(contents) != self.tags.get(SHA256_TAGS[file], sha256(contents)):
+            raise TrackingError(
+                f"run {self.run_id}: its {file} is not the one that it was started with: changed, or another run's"
+            )
+        return contents
+
+    def _fetched(self, file: str, folder: Path) -> Path:
+        with store_errors(self.uri):
+            return Path(self.client.download_artifacts(self.run_id, file, str(folder)))
+
+
+def load_run(uri: str, run_id: str) -> FoundRun:
+    """Return a run with what it has kept.
+
+    Args:
+        uri: of the store.
+        run_id: as in `find_run`.
+
+    Raises:
+        TrackingError: if no run is meant, or several are, or the store does not exist or cannot be used.
+    """
+    client = open_existing_store(uri)
+    with store_errors(uri):
+        run = find_run(client, run_id)
+        check_version(run)
+        if jobs := jobs_of(client, run):
+            ids = listed([job.info.run_id for job in jobs])
+            raise TrackingError(f"run {run.info.run_id} is the parent of a multirun: give one of its jobs, {ids}")
+        return _found(client, uri, run)
+
+
+def find_run(client: TrackingStore, run_id: str) -> Run:
+    """Return the run of an id.
+
+    Args:
+        client: of an open store.
+        run_id: the id, or a beginning of it that no other run's has, in any experiment of the store.
+
+    Raises:
+        TrackingError: if no run is meant, or several are.
+    """
+    if not ID.fullmatch(run_id):
+        raise TrackingError(
+            f"the run is {run_id!r}, but it must be an id as MLflow shows it, or its beginning: up to 32 of 0-9 and a-f"
+        )
+    experiments = client.search_experiments(max_results=MAX_EXPERIMENTS)
+    found = client.search_runs(
+        [experiment.experiment_id for experiment in experiments],
+        filter_string=f"attributes.run_id LIKE '{run_id}%'",
+        max_results=N_SHOWN + 1,
+    )
+    if not found:
+        raise TrackingError(f"the run is {run_id!r}, but no run of {client.uri} has an id that begins so")
+    if len(found) > 1:
+        ids = [run.info.run_id for run in found[:N_SHOWN]] + (["others"] if len(found) > N_SHOWN else [])
+        raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the id")
+    run: Run = found[0]
+    return run
+
+
+def check_version(run: Run) -> None:
+    """Raise `TrackingError` where a run was made by a newer version, which may have kept it otherwise."""
+    version = run.data.tags.get(VERSION_TAG, armscan.__version__)
+    if release(version) > release(armscan.__version__):
+        raise TrackingError(
+            f"run {run.info.run_id} was made by armscan {version}, but this is {armscan.__version__}: "
+            "it needs that version or a newer one"
+        )
+
+
+def release(version: str) -> tuple[int, ...]:
+    """Return a version of armscan as numbers, to be compared."""
+    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
+
+
+def jobs_of(client: TrackingStore, run: Run) -> list[Run]:
+    """Return the runs of a multirun's jobs, by its parent run; none where the run is another."""
+    children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
+    return [child for child in children if EVALUATED_TAG not in child.data.tags]
+
+
+def _found(client: TrackingStore, uri: str, run: Run) -> FoundRun:
+    return FoundRun(
+        client=client,
+        uri=uri,
+        experiment_id=run.info.experiment_id,
+        experiment_name=client.get_experiment(run.info.experiment_id).name,
+        run_id=run.info.run_id,
+        name=run.info.run_name,
+        status=run.info.status,
+        tags=dict(run.data.tags),
+        files=tuple(artifact.path for artifact in client.list_artifacts(run.info.run_id)),
+    )

@@ -1,0 +1,225 @@
+"""The outbox of a run: a file in its folder that buffers everything to upload to the tracking store.
+
+A line is an entry: metrics, parameters, tags, a file to upload, or the run's status. A second file says how far the
+entries are uploaded. So nothing is lost when the store is unavailable or the process is killed; an entry that is
+uploaded twice, because only the answer was lost, changes nothing in the store.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from filelock import FileLock, Timeout
+
+from armscan.errors import FolderInUseError, TrackingError
+from armscan.utils.files import OUTBOX_FOLDER, OUTBOX_SUFFIXES, atomic_write, truncate_torn_line
+
+Entry = dict[str, Any]
+# Uploaded independently: metrics arrive although the disk of the artifacts is full.
+Channel = Literal["figures", "files"]
+CHANNELS: tuple[Channel, ...] = ("files", "figures")
+DELIVERED, LOCK, SUFFIX = OUTBOX_SUFFIXES
+# The process that had the run before may still be ending.
+LOCK_TIMEOUT_S = 20.0
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the entries of an outbox belong.
+
+    Args:
+        run_id: the run's ID.
+        uri: address of its tracking store.
+    """
+
+    run_id: str
+    uri: str
+
+
+class OutboxFile:
+    """An outbox, read only.
+
+    Args:
+        file: with an `Address` in its first line.
+
+    Raises:
+        TrackingError: if the file is damaged.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self._delivered_file = file.with_suffix(DELIVERED)
+        try:
+            self.address = Address(**next(self.entries())["address"])
+        except (StopIteration, TypeError, KeyError) as error:
+            raise TrackingError(f"{file}: does not begin with the run that it is of") from error
+        self._delivered: dict[Channel, int] = dict.fromkeys(CHANNELS, 0) | self._read_delivered()
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder, to which the names of files are relative."""
+        return self.file.parent.parent
+
+    def entries(self) -> Iterator[Entry]:
+        """Iterate over all entries, uploaded or not.
+
+        Raises:
+            TrackingError: if a line is damaged.
+        """
+        with self.file.open("rb") as lines:
+            for line in lines:
+                yield self._read(line)
+
+    def next_entries(self, channel: Channel, at_most: int) -> tuple[list[Entry], int]:
+        """Return the next entries to upload.
+
+        Args:
+            channel: their channel.
+            at_most: maximum number of entries.
+
+        Returns:
+            The entries, and the position behind them, for `mark`.
+        """
+        entries: list[Entry] = []
+        end = self._delivered[channel]
+        with self.file.open("rb") as lines:
+            lines.seek(end)
+            while len(entries) < at_most and (line := lines.readline()).endswith(b"\n"):
+                end = lines.tell()
+                entry = self._read(line)
+                if ("file" in entry) == (channel == "files"):
+                    entries.append(entry)
+        return entries, end
+
+    @property
+    def is_delivered(self) -> bool:
+        """Whether everything is uploaded."""
+        return all(not self.next_entries(channel, 1)[0] for channel in CHANNELS)
+
+    @property
+    def status(self) -> str | None:
+        """The last status of the run; None if there is none yet."""
+        said = [entry["status"][0] for entry in self.entries() if "status" in entry]
+        return said[-1] if said else None
+
+    def _read(self, line: bytes) -> Entry:
+        try:
+            entry = json.loads(line)
+        except ValueError as error:
+            raise TrackingError(f"{self.file}: a line of it is damaged: {line[:50]!r}") from error
+        if not isinstance(entry, dict):
+            raise TrackingError(f"{self.file}: a line of it is damaged: {line[:50]!r}")
+        return entry
+
+    def _read_delivered(self) -> dict[Channel, int]:
+        """Return how far each channel is uploaded; an impossible position is ignored: uploading twice does no harm."""
+        try:
+            said = json.loads(self._delivered_file.read_bytes())
+        except (FileNotFoundError, ValueError):
+            said = None
+        ends = said if isinstance(said, dict) else {}
+        return {channel: ends[channel] for channel in CHANNELS if self._is_end_of_a_line(ends.get(channel))}
+
+    def _is_end_of_a_line(self, end: Any) -> bool:
+        if type(end) is not int or not 0 < end <= self.file.stat().st_size:
+            return False
+        with self.file.open("rb") as lines:
+            lines.seek(end - 1)
+            return lines.read(1) == b"\n"
+
+
+class Outbox(OutboxFile):
+    """An outbox, locked by this process.
+
+    Args:
+        file: with an `Address` in its first line.
+        timeout_s: seconds to wait for another process that has locked it.
+
+    Raises:
+        TrackingError: if the file is damaged.
+        FolderInUseError: if another process holds it.
+        FileNotFoundError: if there is no such file; nothing is made in its place.
+    """
+
+    def __init__(self, file: Path, *, timeout_s: float = LOCK_TIMEOUT_S) -> None:
+        # The lock would make the folder of a run again that was removed.
+        if not file.exists():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(file))
+        # Also who is told to leave closes it, in another thread.
+        self._lock = FileLock(file.with_suffix(LOCK), timeout=timeout_s, thread_local=False)
+        try:
+            self._lock.acquire()
+        except Timeout as error:
+            raise FolderInUseError(f"{file}: another process tracks this run") from error
+        try:
+            truncate_torn_line(file)
+            super().__init__(file)
+            self._appending, self._adding = file.open("ab", buffering=0), threading.Lock()
+        except BaseException:
+            self._lock.release()
+            raise
+
+    @classmethod
+    def begin(cls, folder: Path, address: Address) -> Self:
+        """Open the outbox of a run in a folder; create it if there is none."""
+        file = file_of(folder, address.run_id)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if not file.exists():
+            first = json.dumps({"address": asdict(address)}).encode() + b"\n"
+            atomic_write(file, lambda opened: opened.write(first))
+        return cls(file)
+
+    def add(self, **entry: Any) -> None:
+        """Append an entry. It survives this process and failures of the store."""
+        line = json.dumps(entry).encode() + b"\n"
+        with self._adding:
+            size = os.fstat(self._appending.fileno()).st_size
+            if self._appending.write(line) != len(line):
+                # A full disk; half a line would be in the way of the next.
+                os.truncate(self._appending.fileno(), size)
+                raise OSError(f"{self.file}: cannot be written to: no space is left")
+
+    def mark(self, channel: Channel, end: int) -> None:
+        """Note how far a channel is uploaded."""
+        self._delivered[channel] = end
+        text = json.dumps(self._delivered)
+        atomic_write(self._delivered_file, lambda opened: opened.write(text.encode()))
+
+    def close(self) -> None:
+        """Close and unlock the outbox."""
+        self._appending.close()
+        self._lock.release()
+
+
+def now_ms() -> int:
+    """Return the time as MLflow has it."""
+    return time.time_ns() // 1_000_000
+
+
+def file_of(folder: Path, run_id: str) -> Path:
+    """Return the path of a run's outbox, which may not exist."""
+    return folder / OUTBOX_FOLDER / f"{run_id}{SUFFIX}"
+
+
+def outbox_files(folder: Path) -> list[Path]:
+    """Return the paths of all outboxes in a folder, recursively."""
+    return sorted(folder.rglob(f"{OUTBOX_FOLDER}/*{SUFFIX}"))
+
+
+def take_over(run_id: str, before: Path, folder: Path) -> None:
+    """Move the outbox of a run, if there is one, to the folder in which the run is resumed."""
+    old, new = file_of(before, run_id), file_of(folder, run_id)
+    if old.exists():
+        new.parent.mkdir(parents=True, exist_ok=True)
+        # What is not noted as delivered is delivered again, which changes nothing; so the order matters little.
+        if old.with_suffix(DELIVERED).exists():
+            old.with_suffix(DELIVERED).replace(new.with_suffix(DELIVERED))
+        old.replace(new)

@@ -1,0 +1,46 @@
+"""The picture of a learning curve."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from armscan.training import EpochReport
+
+
+def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: str) -> None:
+    """Draw steps to success and success rate by environment step.
+
+    Args:
+        reports: of the training's epochs.
+        path: the PNG file.
+        title: above the picture.
+    """
+    steps = [report.n_env_steps for report in reports]
+    figure = Figure(figsize=(8, 5.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    lengths, successes = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+    lengths.plot(
+        steps, [report.evaluation.mean_steps for report in reports], marker="o", label="validation, deterministic"
+    )
+    trained = [
+        (report.n_env_steps, report.metrics["train/length"]) for report in reports if "train/length" in report.metrics
+    ]
+    if trained:
+        lengths.plot(*zip(*trained, strict=True), marker=".", alpha=0.6, label="training, exploring")
+    best = [report for report in reports if report.is_best][-1]
+    lengths.axvline(best.n_env_steps, color="grey", linestyle=":", label=f"best epoch, kept: step {best.n_env_steps}")
+    lengths.set_ylabel("mean steps an episode")
+    lengths.set_ylim(bottom=0)
+    lengths.legend()
+    successes.plot(steps, [100 * report.evaluation.success_rate for report in reports], marker="o", color="tab:green")
+    successes.set_ylabel("success in validation (%)")
+    successes.set_ylim(-3, 103)
+    successes.set_xlabel("environment steps")
+    for axes in (lengths, successes):
+        axes.grid(alpha=0.3)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,66 @@
+"""What the machine does while a run trains: MLflow's system metrics, delivered as all else that is tracked."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from mlflow.system_metrics.metrics.cpu_monitor import CPUMonitor
+from mlflow.system_metrics.metrics.disk_monitor import DiskMonitor
+from mlflow.system_metrics.metrics.gpu_monitor import GPUMonitor
+from mlflow.system_metrics.metrics.network_monitor import NetworkMonitor
+
+# As MLflow names them; its UI shows these on a page of their own.
+PREFIX = "system/"
+MONITORS: tuple[type[Any], ...] = (CPUMonitor, DiskMonitor, NetworkMonitor, GPUMonitor)
+
+
+class SystemMetrics:
+    """A thread that looks at CPU, memory, disk, network and GPUs, every so often and once at its end.
+
+    MLflow's own thread would ask the store each time, and write there itself: it ends where the store is away.
+
+    Args:
+        take: takes the figures by name, and the number of the look, which MLflow has in place of a step.
+        every_s: seconds between two looks.
+        first: number of the first look.
+    """
+
+    def __init__(self, take: Callable[[Mapping[str, float], int], None], *, every_s: float, first: int = 0) -> None:
+        self._take, self._every_s, self._number = take, every_s, first
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="system metrics", daemon=True)
+        self._thread.start()
+
+    def finish(self) -> None:
+        """Look once more, and end the thread."""
+        self._is_over.set()
+        self._thread.join()
+
+    def _work(self) -> None:
+        monitors, is_over = _monitors(), False
+        while not is_over:
+            is_over = self._is_over.wait(self._every_s)
+            figures: dict[str, float] = {}
+            for monitor in monitors:
+                monitor.collect_metrics()
+                figures |= {f"{PREFIX}{name}": float(value) for name, value in monitor.aggregate_metrics().items()}
+                monitor.clear_metrics()
+            self._take(figures, self._number)
+            self._number += 1
+
+
+def _monitors() -> list[Any]:
+    monitors = []
+    for kind in MONITORS:
+        try:
+            monitor = kind()
+            # That of the CPU says how busy it was since this thread has looked last.
+            monitor.collect_metrics()
+            monitor.clear_metrics()
+        # Whatever a machine without such a thing raises, as one without a GPU does.
+        except Exception:
+            continue
+        monitors.append(monitor)
+    return monitors

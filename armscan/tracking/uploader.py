@@ -1,0 +1,206 @@
+"""Upload the entries of an outbox in the background, while the run trains."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from mlflow import MlflowClient
+from mlflow.entities import Metric, Param, RunTag
+from mlflow.exceptions import MlflowException
+
+from armscan.errors import TrackingError
+from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, why_away
+from armscan.tracking.outbox import CHANNELS, Channel, Outbox
+from armscan.utils.log import log
+from armscan.utils.retry import FIRST_PAUSE_S
+
+# MLflow takes no more of each in one request.
+AT_ONCE = {"metrics": 1000, "params": 100, "tags": 100}
+ENTRIES_AT_ONCE = 200
+LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
+
+
+class Uploader:
+    """A thread that uploads a run's entries as they are added.
+
+    Args:
+        outbox: the run's outbox.
+        store: the run's tracking store.
+    """
+
+    def __init__(self, outbox: Outbox, store: TrackingStore) -> None:
+        self._outbox, self._store = outbox, store
+        self._changing = threading.Lock()
+        self._woken, self._stopped, self._is_done = threading.Event(), threading.Event(), threading.Event()
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._work, name="uploader", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_away(self) -> bool:
+        """Whether the store is unavailable, as far as is known, rather than refusing entries."""
+        return self._failure is None or why_away(self._failure) is not None
+
+    def wake(self) -> None:
+        """Signal that an entry was added."""
+        with self._changing:
+            self._is_done.clear()
+            self._woken.set()
+
+    def finish(self, wait_s: float) -> str | None:
+        """Wait until everything is uploaded, and end the thread.
+
+        Args:
+            wait_s: seconds to wait at most; a store that refuses entries is not waited for.
+
+        Returns:
+            Why not everything is uploaded; None if it is.
+        """
+        until_s, is_told = time.monotonic() + wait_s, False
+        while not self._is_done.wait(min(LOOK_S, max(0.0, until_s - time.monotonic()))):
+            if not self.is_away or time.monotonic() > until_s:
+                break
+            if self._failure is not None and not is_told:
+                is_told = True
+                log(f"run {self._outbox.address.run_id}: waiting up to {wait_s:g} s for {self._store.uri}")
+        self._stopped.set()
+        self._woken.set()
+        # The thread may hang in a request, which this process does not wait for.
+        self._thread.join(0.5)
+        if self._is_done.is_set():
+            return None
+        return "the store has not answered in time" if self._failure is None else reason_in(self._failure)
+
+    def _work(self) -> None:
+        pause_s = FIRST_PAUSE_S
+        while not self._stopped.is_set():
+            self._woken.clear()
+            failure = self._failed()
+            self._tell(failure)
+            if failure is not None:
+                self._stopped.wait(pause_s)
+                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+                continue
+            pause_s = FIRST_PAUSE_S
+            with self._changing:
+                if not self._woken.is_set():
+                    self._is_done.set()
+            self._woken.wait()
+
+    def _failed(self) -> Exception | None:
+        """Upload what there is; return the last error."""
+        failure = None
+        for channel in CHANNELS:
+            try:
+                deliver(self._outbox, self._store.mlflow, channel)
+            # Whatever a store raises: the entries stay in the outbox, and the training goes on.
+            except Exception as error:
+                failure = error
+        return failure
+
+    def _tell(self, failure: Exception | None) -> None:
+        """Log once that the store is unavailable or refuses entries, and once that it is back."""
+        before, self._failure = self._failure, failure
+        if failure is not None and before is None:
+            is_away = why_away(failure) is not None
+            said = "cannot be reached or written to" if is_away else "refuses what it is given"
+            log(f"{self._store.uri} {said} ({reason_in(failure)}): what is tracked is kept in {self._outbox.file}")
+        elif failure is None and before is not None:
+            log(f"{self._store.uri} is back: everything is delivered")
+
+
+def deliver(outbox: Outbox, client: MlflowClient, channel: Channel, *, is_whole: bool = True) -> int:
+    """Upload the pending entries of one channel.
+
+    Args:
+        outbox: the run's outbox.
+        client: client of its store.
+        channel: the channel.
+        is_whole: whether the run's folder is complete, so that a missing file was removed on purpose.
+
+    Returns:
+        The number of entries.
+
+    Raises:
+        FileNotFoundError: if a file is missing, and the folder may be an incomplete copy.
+    """
+    n_delivered = 0
+    while True:
+        entries, end = outbox.next_entries(channel, ENTRIES_AT_ONCE if channel == "figures" else 1)
+        if not entries:
+            return n_delivered
+        for entry in entries if channel == "files" and not is_whole else ():
+            if not (file := outbox.folder / _file_of(entry["file"])[0]).exists():
+                raise FileNotFoundError(f"{file} is not there")
+        for kind, group in itertools.groupby(entries, key=lambda entry: next(iter(entry))):
+            _deliver(client, outbox, kind, [entry[kind] for entry in group])
+        outbox.mark(channel, end)
+        n_delivered += len(entries)
+
+
+def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any]) -> None:
+    run_id = outbox.address.run_id
+    match kind:
+        case "metrics":
+            for batch in _batches(itertools.chain(*values), AT_ONCE[kind]):
+                client.log_batch(run_id, metrics=[Metric(*point) for point in batch])
+        case "params":
+            for batch in _batches(itertools.chain(*(each.items() for each in values)), AT_ONCE[kind]):
+                client.log_batch(run_id, params=[Param(*pair) for pair in batch])
+        case "tags":
+            for batch in _batches(itertools.chain(*(each.items() for each in values)), AT_ONCE[kind]):
+                client.log_batch(run_id, tags=[RunTag(*pair) for pair in batch])
+        case "untagged":
+            for tag in values:
+                _delete_tag(client, run_id, tag)
+        case "status":
+            for status, at_ms in values:
+                _set_status(client, run_id, status, at_ms)
+        case "file":
+            for name, place in map(_file_of, values):
+                _keep_file(client, run_id, outbox.folder / name, place)
+        case "address":
+            return
+        case _:
+            raise TrackingError(f"{outbox.file}: holds {kind!r}, which this version of armscan does not know")
+
+
+def _batches(values: Iterable[Any], size: int) -> Iterable[Sequence[Any]]:
+    rest = iter(values)
+    while batch := list(itertools.islice(rest, size)):
+        yield batch
+
+
+def _delete_tag(client: MlflowClient, run_id: str, tag: str) -> None:
+    try:
+        client.delete_tag(run_id, tag)
+    except MlflowException as error:
+        if error.error_code != NOT_THERE:
+            raise
+
+
+def _set_status(client: MlflowClient, run_id: str, status: str, at_ms: int) -> None:
+    if status == "RUNNING":
+        client.update_run(run_id, status=status)
+    else:
+        client.set_terminated(run_id, status, end_time=at_ms)
+
+
+def _file_of(value: str | list[str]) -> tuple[str, str | None]:
+    """Return the name of a file to upload, and its folder among the artifacts."""
+    if isinstance(value, str):
+        return value, None
+    name, place = value
+    return name, place
+
+
+def _keep_file(client: MlflowClient, run_id: str, path: Path, place: str | None) -> None:
+    if not path.exists():
+        log(f"run {run_id}: {path} was removed before the store could keep it")
+        return
+    client.log_artifact(run_id, str(path), place)

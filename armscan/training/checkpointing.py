@@ -1,0 +1,136 @@
+"""Checkpointing: save the training after each epoch, resume it from the last checkpoint.
+
+`last.pt` holds the learner's full state and the reports of all epochs. It is written first, then `best.pt`, then the
+callbacks are called. After a kill at any moment `last.pt` is therefore complete, and the rest is restored from it: if
+its epoch is the best, it contains the weights of `best.pt`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from armscan.agents.protocols import Learner
+from armscan.errors import CheckpointError
+from armscan.training.callbacks import EpochReport
+from armscan.training.checkpoint import load_checkpoint, save_checkpoint
+from armscan.training.fingerprints import Fingerprints, check_unchanged
+from armscan.training.rollout import EpisodeResult, Evaluation
+from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
+
+EPISODE_FIELDS = tuple(each.name for each in fields(EpisodeResult))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckpointProvenance:
+    """Provenance of a checkpoint: a training is resumed only from its own checkpoint, on the same volumes.
+
+    Args:
+        run_id: of the run.
+        volumes: fingerprints of the volumes, by split and name.
+    """
+
+    run_id: str = ""
+    volumes: Fingerprints = field(default_factory=dict)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the facts written into a checkpoint."""
+        return {"run_id": self.run_id, "volumes": self.volumes}
+
+    def check(self, path: Path, facts: dict[str, Any]) -> None:
+        """Check that a checkpoint comes from this.
+
+        Raises:
+            CheckpointError: if it is another run's.
+            ChangedVolumesError: if it is of other volumes.
+        """
+        if facts.get("run_id") != self.run_id:
+            raise CheckpointError(
+                f"{path}: is a checkpoint of run {facts.get('run_id')!r}, but this is {self.run_id!r}"
+            )
+        check_unchanged(facts.get("volumes", {}), self.volumes, f"{path} was trained with")
+
+
+def save_checkpoints(
+    learner: Learner, reports: Sequence[EpochReport], folder: Path, provenance: CheckpointProvenance | None
+) -> None:
+    """Write the last checkpoint, and the best one where the last epoch is better than all before."""
+    facts = _facts(reports[-1], provenance)
+    save_checkpoint(folder / LAST_CHECKPOINT, learner.state(), facts | {"reports": _written(reports)})
+    if reports[-1].is_best:
+        save_checkpoint(folder / BEST_CHECKPOINT, learner.weights(), facts)
+
+
+def resume_from_checkpoint(learner: Learner, folder: Path, provenance: CheckpointProvenance) -> list[EpochReport]:
+    """Restore a learner to the state of its last checkpoint.
+
+    Args:
+        learner: that has learned nothing yet.
+        folder: with the checkpoints.
+        provenance: of this training.
+
+    Returns:
+        The reports of the epochs so far, for `train`; none where there is no checkpoint yet.
+
+    Raises:
+        CheckpointError: if a checkpoint is damaged or another run's, or the best one is missing.
+        ChangedVolumesError: if a checkpoint is of other volumes.
+    """
+    last, best = folder / LAST_CHECKPOINT, folder / BEST_CHECKPOINT
+    if not last.exists():
+        return []
+    state, facts = load_checkpoint(last)
+    provenance.check(last, facts)
+    reports = _read(facts.get("reports"), last)
+    learner.load_state(state)
+    best_report = [report for report in reports if report.is_best][-1]
+    if best_report is reports[-1]:
+        # A kill may have come before this was written.
+        save_checkpoint(best, learner.weights(), _facts(best_report, provenance))
+        return reports
+    # Better refused now than when the training is done.
+    best_facts = load_checkpoint(best)[1]
+    provenance.check(best, best_facts)
+    if best_facts.get("epoch") != best_report.epoch:
+        raise CheckpointError(
+            f"{best}: is of epoch {best_facts.get('epoch')}, but the best epoch of {last} is {best_report.epoch}"
+        )
+    return reports
+
+
+def _facts(report: EpochReport, provenance: CheckpointProvenance | None) -> dict[str, Any]:
+    of_epoch = {"n_env_steps": report.n_env_steps, "epoch": report.epoch, **report.evaluation.metrics()}
+    return (provenance or CheckpointProvenance()).facts() | of_epoch
+
+
+def _written(reports: Sequence[EpochReport]) -> str:
+    """Return reports as a text, which takes a checkpoint's reader no time; JSON keeps every digit of a number."""
+    return json.dumps(
+        [
+            {
+                **{name: getattr(report, name) for name in ("epoch", "n_env_steps", "wall_s", "metrics", "is_best")},
+                "episodes": {
+                    name: [getattr(episode, name) for episode in report.evaluation.episodes] for name in EPISODE_FIELDS
+                },
+            }
+            for report in reports
+        ]
+    )
+
+
+def _read(text: Any, path: Path) -> list[EpochReport]:
+    try:
+        reports = []
+        for record in json.loads(text):
+            columns = record.pop("episodes")
+            rows = zip(*(columns[name] for name in EPISODE_FIELDS), strict=True)
+            episodes = tuple(EpisodeResult(**dict(zip(EPISODE_FIELDS, row, strict=True))) for row in rows)
+            reports.append(EpochReport(**record, evaluation=Evaluation(episodes)))
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise CheckpointError(f"{path}: holds no reports of the epochs so far, which resuming needs") from error
+    if not any(report.is_best for report in reports):
+        raise CheckpointError(f"{path}: holds no reports of the epochs so far, which resuming needs")
+    return reports

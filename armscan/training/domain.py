@@ -1,0 +1,162 @@
+"""Training domain of an agent: shapes of observations, sizes of pixels and volumes."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+from gymnasium import spaces
+
+from armscan.envs.observation_registry import named_observations
+from armscan.errors import InvalidValueError
+from armscan.training.rollout import Env
+from armscan.volumes import LabelVolume
+
+# By which share a size may lie outside the range of the training volumes without a word about it.
+USUAL_DIFFERENCE = 0.1
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class TrainingDomain:
+    """What environments on some volumes show, and in which range the volumes' sizes are.
+
+    Args:
+        observed: the shape of each part of an observation, of the one vector under the name `vector`.
+        slice_px: shape (across, depth) in pixels that every slice has at least, and images are cropped to.
+        pixel_mm: lowest and highest size of a pixel, (across, depth).
+        size_mm: lowest and highest size of a volume, (across, along): what a normalised translation goes over.
+    """
+
+    observed: dict[str, tuple[int, ...]]
+    slice_px: tuple[int, int]
+    pixel_mm: tuple[Range, Range]
+    size_mm: tuple[Range, Range]
+
+    @classmethod
+    def of(cls, env: Env, slice_px: tuple[int, int] | None = None) -> Self:
+        """Return what an environment is like.
+
+        Args:
+            env: the environment.
+            slice_px: crop of its images if the configuration gives none; default: the smallest slice.
+        """
+        space, volumes = env.observation_space, env.get_wrapper_attr("volumes").values()
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"vector": space}
+        return cls(
+            observed={name: tuple(part.shape or ()) for name, part in parts.items()},
+            slice_px=slice_px or smallest_slice(volumes),
+            pixel_mm=(_range(v.pixel_mm[0] for v in volumes), _range(v.pixel_mm[1] for v in volumes)),
+            size_mm=(_range(v.size_mm[0] for v in volumes), _range(v.size_mm[1] for v in volumes)),
+        )
+
+    def to_json(self) -> str:
+        """Return it as a text that `from_json` reads."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Read what `to_json` wrote."""
+        stored: Mapping[str, Any] = json.loads(text)
+        across, depth = stored["slice_px"]
+        pixel, size = stored["pixel_mm"], stored["size_mm"]
+        return cls(
+            observed={name: tuple(shape) for name, shape in stored["observed"].items()},
+            slice_px=(across, depth),
+            pixel_mm=(_range(pixel[0]), _range(pixel[1])),
+            size_mm=(_range(size[0]), _range(size[1])),
+        )
+
+    def check_observed(self, other: TrainingDomain) -> None:
+        """Raise `InvalidValueError` where other environments show something of another shape than these."""
+        for name in self.observed.keys() | other.observed.keys():
+            here, there = self.observed.get(name), other.observed.get(name)
+            if here != there:
+                raise InvalidValueError(
+                    f"the agent was trained on observations whose part {name!r} has the shape {here}, but on these "
+                    f"volumes it has {there}: it cannot be applied to them; obs.shape=[ACROSS,DEPTH] at training gives "
+                    "images of one shape, and obs=cluster none"
+                )
+
+    def differences(self, other: TrainingDomain) -> list[str]:
+        """Return in a sentence each what is silently different for an agent that is applied to other volumes."""
+        notes = []
+        for what, here, there, means in (
+            ("a pixel", self.pixel_mm, other.pixel_mm, "images and plain cluster numbers are of another scale"),
+            ("a volume", self.size_mm, other.size_mm, "the same normalised translation goes another way in mm"),
+        ):
+            axes = ("across", "in depth" if what == "a pixel" else "along the arm")
+            unusual = [
+                f"{_shown(seen)} mm {axis} (trained on {_shown(known)})"
+                for axis, known, seen in zip(axes, here, there, strict=True)
+                if seen[0] < known[0] * (1 - USUAL_DIFFERENCE) or seen[1] > known[1] * (1 + USUAL_DIFFERENCE)
+            ]
+            if unusual:
+                notes.append(f"{what} is {' and '.join(unusual)}: {means}")
+        return notes
+
+
+def smallest_slice(volumes: Collection[LabelVolume]) -> tuple[int, int]:
+    """Return the shape that the slices of all volumes have at least, (across, depth) in pixels."""
+    return min(v.slice_shape[0] for v in volumes), min(v.slice_shape[1] for v in volumes)
+
+
+def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> Any:
+    """Return the configuration of an observation with images cropped as those that an agent was trained on.
+
+    Without a crop in the configuration, images have the smallest slice of the volumes at hand, which differs between
+    data sets. Images that are resized to one shape keep that rule if slices are smaller.
+
+    Args:
+        rules: plain dictionaries and lists, or the name of an observation.
+        trained: the smallest slice of the training volumes, (across, depth) in pixels.
+        here: that of the volumes that the agent is applied to.
+
+    Raises:
+        InvalidValueError: if images would have to be larger than the slices.
+    """
+    return _cropped(_spelled_out(rules), trained, here)
+
+
+def _spelled_out(rules: Any) -> Any:
+    """Return the configuration of an observation with images that are named in it written in full."""
+    named = named_observations().get(rules) if isinstance(rules, str) else None
+    if named and "crop" in inspect.signature(named).parameters:
+        return {"_target_": f"armscan.envs.{named.__name__}", "crop": None, "shape": None}
+    if isinstance(rules, list):
+        return [_spelled_out(each) for each in rules]
+    if isinstance(rules, dict) and "observations" in rules:
+        return rules | {"observations": _spelled_out(rules["observations"])}
+    return rules
+
+
+def _cropped(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> Any:
+    if isinstance(rules, list):
+        return [_cropped(each, trained, here) for each in rules]
+    if not isinstance(rules, dict):
+        return rules
+    changed = {name: _cropped(each, trained, here) for name, each in rules.items()}
+    if not {"crop", "shape"} <= rules.keys() or rules["crop"] is not None:
+        return changed
+    if trained[0] <= here[0] and trained[1] <= here[1]:
+        return changed | {"crop": list(trained)}
+    if rules["shape"] is None:
+        raise InvalidValueError(
+            f"the agent was trained on images of {trained[0]} x {trained[1]} pixels (across, depth), but slices of "
+            f"these volumes have {here[0]} x {here[1]}: it cannot be applied to them; an agent trained with "
+            "obs.shape=[ACROSS,DEPTH] takes slices of every size"
+        )
+    return changed
+
+
+def _range(values: Iterable[float]) -> Range:
+    known = list(values)
+    return min(known), max(known)
+
+
+def _shown(span: Range) -> str:
+    low, high = (f"{end:.3g}" for end in span)
+    return low if low == high else f"{low} to {high}"

@@ -1,0 +1,87 @@
+"""Progress of a training in the terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column
+
+from armscan.training.callbacks import Callback, EpochReport
+
+
+def progress_reporter(label: str | None = None) -> Callback:
+    """Return a progress bar on a terminal; one line per epoch elsewhere, and for a job of a multirun.
+
+    Args:
+        label: of the job, printed before each line; None for a single run.
+    """
+    return ProgressBar() if label is None and sys.stdout.isatty() else ProgressLines(label)
+
+
+class ProgressBar:
+    """A bar with environment steps, return, success rate, episode length and time left."""
+
+    def __init__(self) -> None:
+        # On a narrow terminal the numbers keep their width; the bar shrinks.
+        fixed = Column(no_wrap=True)
+        self._progress = Progress(
+            BarColumn(bar_width=None, table_column=Column(ratio=1, min_width=4)),
+            *(MofNCompleteColumn(table_column=fixed), TextColumn("{task.fields[metrics]}", table_column=fixed)),
+            TimeRemainingColumn(table_column=fixed),
+            expand=True,
+        )
+
+    def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
+        """Show the bar, at the last epoch of a training that is resumed."""
+        self._task = self._progress.add_task("training", total=total_env_steps, metrics="")
+        for report in earlier[-1:]:
+            self.on_epoch(report)
+        self._progress.start()
+
+    def on_epoch(self, report: EpochReport) -> None:
+        """Move the bar."""
+        self._progress.update(self._task, completed=report.n_env_steps, metrics=_summary(report))
+
+    def on_end(self) -> None:
+        """Stop the bar."""
+        self._progress.stop()
+
+
+class ProgressLines:
+    """One line per epoch, for logs and for jobs side by side.
+
+    Args:
+        label: printed before each line; None for none.
+    """
+
+    def __init__(self, label: str | None) -> None:
+        self._label = f"[{label}] " if label else ""
+
+    def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
+        """Print how long the training is."""
+        self._total = total_env_steps
+        self._start_s = time.perf_counter() - (earlier[-1].wall_s if earlier else 0.0)
+        after = f", {earlier[-1].n_env_steps} of them taken" if earlier else ""
+        print(f"{self._label}training for at most {total_env_steps} environment steps{after}", flush=True)
+
+    def on_epoch(self, report: EpochReport) -> None:
+        """Print the epoch's line."""
+        elapsed_s = time.perf_counter() - self._start_s
+        left_s = elapsed_s * (self._total / report.n_env_steps - 1)
+        minutes, seconds = divmod(round(max(0.0, left_s)), 60)
+        line = f"{report.n_env_steps:>{len(str(self._total))}}/{self._total} steps  {_summary(report)}"
+        print(f"{self._label}{line}  {minutes}:{seconds:02d} left", flush=True)
+
+    def on_end(self) -> None:
+        """Do nothing."""
+
+
+def _summary(report: EpochReport) -> str:
+    metrics = report.evaluation.metrics()
+    return (
+        f"return {metrics['mean_return']:6.2f}  success {metrics['success_rate']:4.0%}  "
+        f"length {metrics['mean_steps']:5.2f}"
+    )

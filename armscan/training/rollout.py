@@ -1,0 +1,210 @@
+"""How good an agent is: whole episodes on given volumes, played without exploration."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any, Self, get_type_hints
+
+import gymnasium as gym
+
+from armscan.agents.protocols import Agent
+from armscan.anatomy import tissue_dice
+from armscan.envs.rules import Observed
+from armscan.errors import InvalidValueError
+from armscan.utils.validation import check_int
+from armscan.volumes.plane import FloatArray
+
+# What evaluations are called by, after the volumes that they are on.
+TRAINING, VALIDATION, TEST = "training volumes", "validation volumes", "test volumes"
+
+# Above any number of an episode; sums of such are finite.
+LARGEST = 1e100
+
+Env = gym.Env[Observed, FloatArray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeResult:
+    """How one episode went.
+
+    Args:
+        volume: name of its volume.
+        seed: it was reset with.
+        n_steps: steps taken.
+        is_success: whether it ended on a rewarded plane.
+        starts_solved: whether it also began on one.
+        episode_return: sum of the rewards.
+        final_reward: of the last plane.
+        best_reward: of the planes that were chosen; the start is not among them.
+        distance_mm: of the last plane from the optimal one.
+        distance_deg: likewise.
+        dice_bones: how far the last slice shows the bones where the optimal plane's slice does, as `tissue_dice` says.
+        dice_tendons: likewise.
+        dice_artery: likewise.
+        seconds_per_plane: mean wall time of choosing a plane and looking at it; two episodes that differ in nothing
+            else are equal.
+    """
+
+    volume: str
+    seed: int
+    n_steps: int
+    is_success: bool
+    starts_solved: bool
+    episode_return: float
+    final_reward: float
+    best_reward: float
+    distance_mm: float
+    distance_deg: float
+    dice_bones: float
+    dice_tendons: float
+    dice_artery: float
+    seconds_per_plane: float = field(compare=False)
+
+    @property
+    def mean_dice(self) -> float:
+        """Mean over the three tissues."""
+        return statistics.fmean((self.dice_bones, self.dice_tendons, self.dice_artery))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes and what they add up to; every mean is over all episodes unless its name says otherwise."""
+
+    episodes: tuple[EpisodeResult, ...]
+
+    @classmethod
+    def of_plain(cls, episodes: object) -> Self:
+        """Return the evaluation of episodes that were read from JSON, as `to_dict` has given them.
+
+        Raises:
+            InvalidValueError: if they are no list, or one of them is none: a value is missing, unknown, or no number.
+        """
+        if not isinstance(episodes, list):
+            raise InvalidValueError(f"the episodes are a {type(episodes).__name__}, but they must be a list")
+        return cls(tuple(_episode_of(each) for each in episodes))
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the episodes that ended on a rewarded plane."""
+        return self._mean(lambda episode: episode.is_success)
+
+    @property
+    def mean_steps(self) -> float:
+        """Mean number of steps, episodes without success included."""
+        return self._mean(lambda episode: episode.n_steps)
+
+    @property
+    def score(self) -> tuple[float, float]:
+        """What evaluations are compared by: first the success rate, then the fewest steps."""
+        return self.success_rate, -self.mean_steps
+
+    def metrics(self) -> dict[str, float]:
+        """Return the figures by name; those of episodes that did not start solved stand beside those of all."""
+        unsolved = Evaluation(tuple(episode for episode in self.episodes if not episode.starts_solved))
+        return {
+            "success_rate": self.success_rate,
+            "mean_steps": self.mean_steps,
+            "mean_return": self._mean(lambda episode: episode.episode_return),
+            "mean_final_reward": self._mean(lambda episode: episode.final_reward),
+            "mean_best_reward": self._mean(lambda episode: episode.best_reward),
+            "mean_distance_mm": self._mean(lambda episode: episode.distance_mm),
+            "mean_distance_deg": self._mean(lambda episode: episode.distance_deg),
+            "mean_dice": self._mean(lambda episode: episode.mean_dice),
+            "episodes": len(self.episodes),
+            "episodes_started_solved": len(self.episodes) - len(unsolved.episodes),
+            "success_rate_not_started_solved": unsolved.success_rate,
+            "mean_steps_not_started_solved": unsolved.mean_steps,
+        }
+
+    def by_volume(self) -> dict[str, Evaluation]:
+        """Return the episodes of each volume."""
+        names = dict.fromkeys(episode.volume for episode in self.episodes)
+        return {name: Evaluation(tuple(each for each in self.episodes if each.volume == name)) for name in names}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures and every episode, ready for JSON."""
+        return {"metrics": self.metrics(), "episodes": [asdict(episode) for episode in self.episodes]}
+
+    def _mean(self, figure: Callable[[EpisodeResult], float]) -> float:
+        return statistics.fmean(map(figure, self.episodes)) if self.episodes else float("nan")
+
+
+def _episode_of(plain: object) -> EpisodeResult:
+    kinds = get_type_hints(EpisodeResult)
+    if not isinstance(plain, dict) or plain.keys() != kinds.keys():
+        raise InvalidValueError(f"an episode is {plain!r}, but it must have {', '.join(kinds)}, and nothing else")
+    for name, kind in kinds.items():
+        value = plain[name]
+        # A truth value is a number to Python; JSON writes some floats as integers.
+        is_of_kind = type(value) is kind or (kind is float and type(value) is int)
+        if not is_of_kind or (kind in (int, float) and not -LARGEST < value < LARGEST):
+            raise InvalidValueError(f"an episode's {name} is {value!r}, but it must be a finite {kind.__name__}")
+    return EpisodeResult(**plain)
+
+
+def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluation:
+    """Play episodes on each of the environment's volumes in turn.
+
+    Args:
+        agent: plays them.
+        env: an `ArmscanEnv`, with or without wrappers.
+        n_episodes: how many episodes; a multiple of the number of volumes treats them alike.
+        seed: of the first episode, the next has the next seed: the same seed gives the same episodes to every agent.
+
+    Returns:
+        The episodes.
+    """
+    names = list(env.get_wrapper_attr("volumes"))
+    count = check_int("episodes", n_episodes, at_least=1)
+    return Evaluation(tuple(play(agent, env, names[i % len(names)], seed + i) for i in range(count)))
+
+
+def play(
+    agent: Agent, env: Env, volume_name: str, seed: int, look: Callable[[], object] = lambda: None
+) -> EpisodeResult:
+    """Play an episode.
+
+    Args:
+        agent: plays it.
+        env: as in `evaluate`.
+        volume_name: of the environment's volumes.
+        seed: of the episode.
+        look: called when it begins, and after every step.
+    """
+    observation, info = env.reset(seed=seed, options={"volume": volume_name})
+    look()
+    agent.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
+    reward, rewards, ended = float(info["reward"]), [], False
+    start_s = time.perf_counter()
+    while not ended:
+        observation, received, terminated, truncated, info = env.step(agent.act(observation, reward))
+        reward = float(received)
+        rewards.append(reward)
+        ended = terminated or truncated
+        look()
+    seconds = time.perf_counter() - start_s
+    return EpisodeResult(
+        volume=volume_name,
+        seed=seed,
+        n_steps=len(rewards),
+        is_success=bool(info["is_success"]),
+        starts_solved=bool(info["starts_solved"]),
+        episode_return=sum(rewards),
+        final_reward=reward,
+        best_reward=max(rewards),
+        distance_mm=float(info["distance_mm"]),
+        distance_deg=float(info["distance_deg"]),
+        seconds_per_plane=seconds / len(rewards),
+        **_final_dice(env),
+    )
+
+
+def _final_dice(env: Env) -> dict[str, float]:
+    """Compare the current slice with that of the optimal plane; another look, which an episode's steps outweigh."""
+    scene = env.get_wrapper_attr("scene")
+    (optimal,) = env.get_wrapper_attr("rules").look([scene], [scene.optimum])
+    dice = tissue_dice(env.get_wrapper_attr("slice_xz"), optimal.slice_xz)
+    return {f"dice_{tissue}": value for tissue, value in dice.items()}

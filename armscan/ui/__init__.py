@@ -1,0 +1,1 @@
+"""MLflow UI and Optuna dashboard, started together."""

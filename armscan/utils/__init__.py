@@ -1,0 +1,1 @@
+"""Validation, files, retries, logging, threads."""

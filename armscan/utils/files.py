@@ -1,0 +1,180 @@
+"""The files of a run's folder, files that are there whole or not at all, and folders that one process holds."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fnmatch
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import platformdirs
+from filelock import FileLock, Timeout
+
+from armscan.errors import FolderInUseError, FolderTakenError
+
+# What training keeps in the folder of its run, what the run was started with, and who is at work in it.
+BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
+CONFIG_FILE, VOLUMES_FILE = "config.yaml", "volumes.json"
+# The code as it differed from its commit, and the versions of all that it was run with.
+DIFF_FILE, ENVIRONMENT_FILE = "code.diff", "environment.json"
+# The code of a run that went on with another, by how often it had been resumed.
+RESUMED_DIFF_FILE = "resumed_{0}_" + DIFF_FILE
+# What came of it; of a trial's training, the run that it is.
+EVALUATION_FILE, RUN_FILE = "evaluation.json", "run.json"
+LEARNING_CURVE_FILE, VIDEO_FILE = "learning_curve.png", "episode.gif"
+# Whether the same came of it as of the run that it repeats.
+REPRODUCTION_FILE = "reproduction.json"
+RECORDS = (RUN_FILE, REPRODUCTION_FILE)
+POLICY_FOLDER = "policy"
+# All that a run makes in its folder, beside what Hydra and the outbox leave there: before it is tracked, and after.
+STARTED_WITH = (CONFIG_FILE, VOLUMES_FILE, ENVIRONMENT_FILE, DIFF_FILE)
+RESULTS = (BEST_CHECKPOINT, LAST_CHECKPOINT, EVALUATION_FILE, LEARNING_CURVE_FILE, VIDEO_FILE)
+# The tags of a run that hold the sums of what it was started with.
+SHA256_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
+LOCK_FILE = ".lock"
+# The folder of what is to be tracked, in that of a run.
+OUTBOX_FOLDER = "tracking"
+# Of a run's outbox: how far it is delivered, who holds it, and itself, each named after the run.
+OUTBOX_SUFFIXES = (".delivered.json", ".lock", ".jsonl")
+RUN_ID = "[0-9a-f]" * 32
+UNFINISHED = "unfinished"
+# How the address of a database in a file begins.
+SQLITE_PREFIX = "sqlite:///"
+BLOCK_BYTES = 4096
+
+
+def cache_folder() -> Path:
+    """Return the folder of what a machine keeps for all runs: `$ARMSCAN_CACHE`, or else the user's cache folder."""
+    named = os.environ.get("ARMSCAN_CACHE")
+    return Path(named) if named else Path(platformdirs.user_cache_dir("armscan"))
+
+
+def sqlite_file(uri: str) -> Path:
+    """Return the file of a database, as it is understood from everywhere."""
+    return Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
+
+
+def atomic_write(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write a file beside its place and move it there: a reader sees the old one or the new one, never half of one.
+
+    Once it has returned, neither a killed process nor a power cut loses the new one.
+
+    Args:
+        path: the file's place; its folder exists.
+        write: writes the contents to the open file it is given.
+    """
+    # Where the place is a link, the file that it leads to is replaced, not the link.
+    path = path.resolve()
+    unfinished = _unfinished(path)
+    try:
+        with unfinished.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        if path.exists():
+            shutil.copymode(path, unfinished)
+        unfinished.replace(path)
+        _sync_folder(path.parent)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def check_writable(path: Path) -> None:
+    """Raise the `OSError` that `atomic_write` would meet at a place; leave nothing there."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    unfinished = _unfinished(path.resolve())
+    unfinished.touch()
+    unfinished.unlink()
+
+
+def _unfinished(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.{UNFINISHED}")
+
+
+def sha256(contents: bytes) -> str:
+    """Return the SHA-256 of a file's contents."""
+    return hashlib.sha256(contents).hexdigest()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring a folder's own entries to the disk, without which a file's new name may be lost."""
+    # Not every system can open a folder, and not every file system can sync one; the file itself is whole either way.
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def is_made_by_run(name: str) -> bool:
+    """Whether a file of this name, relative to the folder of a run, is one that runs make there."""
+    return (
+        name in (*STARTED_WITH, *RESULTS, *RECORDS)
+        or fnmatch.fnmatchcase(name, RESUMED_DIFF_FILE.format("*"))
+        or name.startswith(f"{POLICY_FOLDER}/")
+    )
+
+
+def check_free(folder: Path) -> None:
+    """Look whether a new run may make its files in a folder; those of an earlier run are in nobody's way.
+
+    Raises:
+        FolderTakenError: if there is one that no run has left there.
+    """
+    # An earlier run that was never tracked has left what it was started with: the first three, always together.
+    outboxes = (folder / OUTBOX_FOLDER).glob(RUN_ID + OUTBOX_SUFFIXES[-1])
+    if any(outboxes) or all((folder / name).is_file() for name in STARTED_WITH[:3]):
+        return
+    # Also a link that leads nowhere.
+    if taken := [name for name in (*RESULTS, *STARTED_WITH, POLICY_FOLDER) if os.path.lexists(folder / name)]:
+        raise FolderTakenError(
+            f"{folder}: holds {taken[0]}, which no run has left there, and which this run would overwrite: "
+            "name another folder with hydra.run.dir or hydra.sweep.dir"
+        )
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what a process that was killed in the middle of a write has left; for who holds the folder."""
+    for file in folder.glob(f".*.{UNFINISHED}"):
+        file.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Keep every other process from working in a run's folder; the system frees what a dead process held.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        FolderInUseError: if another process holds it.
+    """
+    try:
+        with FileLock(folder / LOCK_FILE, timeout=0):
+            yield
+    except Timeout as error:
+        raise FolderInUseError(
+            f"{folder}: another process is at work in this folder; wait for its end, or stop it"
+        ) from error
+
+
+def truncate_torn_line(path: Path) -> None:
+    """Remove the beginning of a line whose writer died before its end."""
+    with path.open("rb+") as file:
+        size = end = file.seek(0, os.SEEK_END)
+        while end > 0:
+            start = max(0, end - BLOCK_BYTES)
+            file.seek(start)
+            newline = file.read(end - start).rfind(b"\n")
+            end = start + newline + 1 if newline >= 0 else start
+            if newline >= 0:
+                break
+        if end < size:
+            file.truncate(end)

@@ -1,0 +1,108 @@
+"""Checks of arguments that constructors share: each returns the value or raises `InvalidValueError`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from armscan.errors import InvalidValueError, listed
+
+T = TypeVar("T")
+# Seeds of every random generator in use fit.
+LARGEST_SEED = 2**31 - 1
+
+
+def check_int(name: str, value: Any, *, at_least: int, at_most: int | None = None) -> int:
+    """Return `value` as an int if it is a whole number within the given bounds."""
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not is_whole or value < at_least or (at_most is not None and value > at_most):
+        above = "" if at_most is None else f" and at most {at_most}"
+        raise InvalidValueError(f"{name} is {value!r}, but it must be a whole number of at least {at_least}{above}")
+    return int(value)
+
+
+def check_seed(name: str, value: Any) -> int:
+    """Return `value` if it can seed every random generator in use."""
+    return check_int(name, value, at_least=0, at_most=LARGEST_SEED)
+
+
+def check_float(
+    name: str,
+    value: Any,
+    *,
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+) -> float:
+    """Return `value` as a float if it is finite and inside the given bounds."""
+    bounds = [
+        f"{word} {bound:g}"
+        for word, bound in (("above", above), ("at least", at_least), ("at most", at_most))
+        if math.isfinite(bound)
+    ]
+    if not _is_finite(value) or value <= above or value < at_least or value > at_most:
+        raise InvalidValueError(f"{name} is {value!r}, but it must be a finite number {' and '.join(bounds)}".rstrip())
+    return float(value)
+
+
+def check_bool(name: str, value: Any) -> bool:
+    """Return `value` if it is a truth value."""
+    if not isinstance(value, bool):
+        raise InvalidValueError(f"{name} is {value!r}, but it must be true or false")
+    return value
+
+
+def check_choice(name: str, value: T, allowed: Sequence[T]) -> T:
+    """Return `value` if it is one of `allowed`."""
+    # An array is never a choice, and cannot be compared with one.
+    if isinstance(value, np.ndarray) or value not in allowed:
+        raise InvalidValueError(f"{name} is {value!r}, but it must be {listed(allowed)}")
+    return value
+
+
+def check_numbers(name: str, value: Any, length: int, meaning: str) -> tuple[float, ...]:
+    """Return `value` as a tuple of `length` finite floats; `meaning` says of what: '(rz, rx) in degrees'."""
+    if type(value) is tuple and [type(number) for number in value] == [float] * length and math.isfinite(sum(value)):
+        # What every step of an environment gives; the checks below cost more than the rest of its plane.
+        return value
+    is_sequence = isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
+    if not is_sequence or len(value) != length or not all(map(_is_finite, value)):
+        raise InvalidValueError(f"{name} is {value!r}, but it must be {length} finite numbers, {meaning}")
+    return tuple(float(number) for number in value)
+
+
+def check_ints(name: str, value: Any, length: int | None, meaning: str, **bounds: int) -> tuple[int, ...]:
+    """Return `value` as a tuple of `length` whole numbers, of any number of them where it is None.
+
+    Args:
+        name: of the argument.
+        value: a sequence; text and bytes are none.
+        length: how many.
+        meaning: says of what: '(across, depth)'.
+        **bounds: of each, as in `check_int`.
+    """
+    is_sequence = isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray | memoryview)
+    if not is_sequence or (length is not None and len(value) != length):
+        wanted = "a list of" if length is None else str(length)
+        raise InvalidValueError(f"{name} is {value!r}, but it must be {wanted} whole numbers{meaning and ' '}{meaning}")
+    return tuple(check_int(f"each of {name}", number, **bounds) for number in value)
+
+
+def check_path(name: str, value: Any) -> Path:
+    """Return `value` as a path if it is a text or a path."""
+    if not isinstance(value, str | Path) or "\0" in str(value):
+        raise InvalidValueError(f"{name} is {value!r}, but it must be the path of a file or folder")
+    return Path(value)
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether `value` is a number, not a truth value, that a float can hold."""
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:
+        return False

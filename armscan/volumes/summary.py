@@ -1,0 +1,85 @@
+"""What was found in a file, and what became of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+from armscan.volumes.labelmap import BACKGROUND, Found, LabelMap, Source, count_values
+from armscan.volumes.orientation import Crop, orientation_of
+from armscan.volumes.volume import LABEL_NAMES, LabelVolume
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredFile:
+    """What a volume was read from.
+
+    Args:
+        shape: voxels along the file's own axes.
+        spacing: likewise, in mm.
+        orientation: what the file's axes run towards, such as 'LPS'.
+        found: every value or segment, what it was mapped to, and its voxels in the file.
+        missing: what the label map names and the file does not hold.
+        crop_mm: what was kept, None for all.
+    """
+
+    shape: tuple[int, ...]
+    spacing: tuple[float, ...]
+    orientation: str
+    found: tuple[Found, ...]
+    missing: tuple[Source, ...]
+    crop_mm: Crop | None
+
+    @property
+    def ignored(self) -> tuple[Source, ...]:
+        """What the file holds that became background, the value 0 aside."""
+        return tuple(each.source for each in self.found if each.label == BACKGROUND and each.source != 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeReport:
+    """What a volume was read from, and what it is: after orientation, order of axes, crop and resampling.
+
+    Args:
+        name: the volume's.
+        stored: the file.
+        shape: (nx, ny, nz) in voxels.
+        spacing: (sx, sy, sz) in mm.
+        orientation: what its axes run towards, such as 'LPS'.
+        n_voxels: by tissue.
+    """
+
+    name: str
+    stored: StoredFile
+    shape: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    orientation: str
+    n_voxels: dict[str, int]
+
+    @classmethod
+    def of(cls, volume: LabelVolume, stored: StoredFile) -> Self:
+        """Describe a volume."""
+        counts = count_values(volume.labels)
+        return cls(
+            name=volume.name,
+            stored=stored,
+            shape=volume.shape,
+            spacing=volume.spacing,
+            orientation=orientation_of(volume.direction),
+            n_voxels={tissue: counts.get(label, 0) for label, tissue in LABEL_NAMES.items() if label != BACKGROUND},
+        )
+
+    @property
+    def tissue_mm3(self) -> dict[str, float]:
+        """The tissues' volumes in cubic millimetres."""
+        return {tissue: count * math.prod(self.spacing) for tissue, count in self.n_voxels.items()}
+
+
+def missing_sources(labels: LabelMap | None, found: tuple[Found, ...]) -> tuple[Source, ...]:
+    """Return what the label map names and the file lacks: values of a plain file, names of a segmentation."""
+    if labels is None:
+        return ()
+    there = {each.source for each in found if each.n_voxels}
+    by_name = any(isinstance(each.source, str) for each in found)
+    return tuple(source for source in labels.by_source if isinstance(source, str) == by_name and source not in there)

@@ -1,0 +1,1 @@
+"""What agents reach, beside baselines and published curves."""

@@ -1,0 +1,81 @@
+"""How far from the labelled plane a slice can be without its reward saying so: what limits how near an agent comes.
+
+    python -m benchmarks.learning.distance FOLDER
+
+Around the labelled planes of 12 phantoms that no reward was fitted to, 1,000 planes each: the slice's centre moved
+within +-10 mm along the labelled normal, both angles turned within +-20 degrees, uniformly. Of those that a reward
+takes for the wanted plane, that is, that score above -success_threshold: their share, and the median of their
+distances. `its own plane` is no reward for unseen wrists, but the best that its features could do: fitted to the
+labelled plane of the very phantom that is judged.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import numpy as np
+
+from armscan.anatomy import AgreementReward, LandmarkReward, Reward, TissueClusters
+from armscan.training.splits import mixed_data
+from armscan.volumes import LabelVolume, ManipulatorAction
+from armscan.volumes.plane import plane_distance
+
+N_PLANES, OFFSET_MM, ANGLE_DEG = 1000, 10.0, 20.0
+
+
+def near_planes(volume: LabelVolume, rng: np.random.Generator) -> list[ManipulatorAction]:
+    """Draw planes around the labelled one, turned about the centre of its slice."""
+    labelled = volume.optimal_action
+    centre = np.array([volume.centre_mm[0], 0.0, volume.centre_mm[2]])
+    centre_in_volume = labelled.matrix @ centre + labelled.offset_mm
+    planes = []
+    for offset_mm, *turn_deg in rng.uniform(-1.0, 1.0, (N_PLANES, 3)) * (OFFSET_MM, ANGLE_DEG, ANGLE_DEG):
+        rotation = ManipulatorAction(tuple(np.add(labelled.rotation, turn_deg)), (0.0, 0.0))
+        x_mm, y_mm, _ = centre_in_volume + offset_mm * labelled.normal - rotation.matrix @ centre
+        planes.append(ManipulatorAction(rotation.rotation, (x_mm, y_mm)))
+    return planes
+
+
+def distances_of_accepted(
+    volumes: list[LabelVolume], rewards: dict[str, tuple[Callable[[LabelVolume], Reward], float]]
+) -> dict[str, list[tuple[float, float] | None]]:
+    """Return for each reward the distance (mm, degrees) of every plane that it takes for the wanted one, else None."""
+    distances = {name: [] for name in rewards}
+    rng = np.random.default_rng(0)
+    for volume in volumes:
+        of_volume = {name: reward_for(volume) for name, (reward_for, _) in rewards.items()}
+        for plane in near_planes(volume, rng):
+            landmarks = TissueClusters.from_slice(volume.slice(plane), pixel_mm=volume.pixel_mm).landmarks
+            distance = plane_distance(plane, volume.optimal_action, (volume.centre_mm[0], volume.centre_mm[2]))
+            for name, (_, success_threshold) in rewards.items():
+                is_accepted = of_volume[name].score(landmarks, volume.pixel_mm) > -success_threshold
+                distances[name].append(distance if is_accepted else None)
+    return distances
+
+
+def main(folder: str) -> None:
+    """Print the table."""
+    split = mixed_data(folder, n_training=64, n_validation=1, n_test=12)
+    fitted = AgreementReward().fitted_to(split.training.values())
+    tight = AgreementReward(slack=0.0, slack_mm=0.0).fitted_to(split.training.values())
+    rewards = {
+        "every plane drawn": (lambda _: LandmarkReward(), np.inf),
+        "published, success threshold 0.05": (lambda _: LandmarkReward(), 0.05),
+        "published, success threshold 0.01": (lambda _: LandmarkReward(), 0.01),
+        "agreement, success threshold 0.01": (lambda _: fitted, 0.01),
+        "agreement without slack, success threshold 1e-9": (lambda _: tight, 1e-9),
+        "agreement, its own plane, success threshold 1e-9": (
+            lambda volume: AgreementReward().fitted_to([volume]),
+            1e-9,
+        ),
+    }
+    print("| | accepted, % | median, mm | median, degrees |\n| --- | --- | --- | --- |")
+    for name, distances in distances_of_accepted(list(split.test.values()), rewards).items():
+        accepted = [distance for distance in distances if distance is not None]
+        median_mm, median_deg = np.median(accepted, axis=0)
+        print(f"| {name} | {100 * len(accepted) / len(distances):.0f} | {median_mm:.1f} | {median_deg:.1f} |")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,218 @@
+"""The published experiments again, drawn over their published learning curves.
+
+    python -m benchmarks.learning.published [small|full] [folder=RUNS] [data=VOLUMES] [NAME ...]
+
+`small` (where nothing is said) stops each training after a few minutes; `full` takes as many environment steps as the
+preset says, hours for those of two degrees of freedom. NAMEs of presets, such as `published_sac_y_8`, run only these.
+With a folder of volumes, its first 1, 2 or 8 are trained on, otherwise as many phantoms. A run that has finished in the
+folder of runs is not repeated.
+
+The published runs (2024, on real wrists, 80 cores and a V100) logged the mean length of the episodes that ended in each
+collection, while exploring. The same is drawn of ours: `train/length`, for each epoch. An episode there could be one
+step too long. "Reached" is the first step at which the mean of five successive points is at or below a length; their
+clock starts with their first point.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+
+from benchmarks.learning.runs import finished_run
+
+HERE = Path(__file__).parent
+PICTURE = HERE.parent / "docs" / "images" / "published.png"
+LENGTHS = (10, 5, 2)
+TICKS = (1, 2, 5, 10, 20, 50, 100)
+N_SMOOTHED = 5
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published experiment.
+
+    Args:
+        title: of its panel.
+        reference: name of the published curve.
+        n_volumes: that were trained on.
+        small_env_steps: of the small run.
+        ours: the preset of ours that is drawn beside it.
+    """
+
+    title: str
+    reference: str
+    n_volumes: int
+    small_env_steps: int
+    ours: str
+
+
+SAC = "run-sac-characteristic-array"
+EXPERIMENTS = {
+    "published_sac_y_1": Published("SAC, y, 1 volume", f"{SAC}-rew-details-y_42_20240628-183630", 1, 15_000, "best_y"),
+    "published_sac_y_2": Published("SAC, y, 2 volumes", f"{SAC}-rew-details-y_42_20240630-191219", 2, 15_000, "best_y"),
+    "published_sac_y_8": Published("SAC, y, 8 volumes", f"{SAC}-rew-details-y_42_20240722-162357", 8, 15_000, "best_y"),
+    "published_sac_zy_2": Published(
+        "SAC, zy, 2 volumes", f"{SAC}-rew-details-zy_42_20240714-111101", 2, 24_000, "best_zy"
+    ),
+    "published_sac_zy_8": Published(
+        "SAC, zy, 8 volumes", f"{SAC}-rew-details-zy_42_20240724-070219", 8, 24_000, "best_zy"
+    ),
+    "published_sac_y_memory": Published(
+        "SAC, y, actions and rewards alone", f"{SAC}-4-rew-details-y_42_20240801-205846", 8, 15_000, "best_y"
+    ),
+    "published_sac_zy_memory": Published(
+        "SAC, zy, actions and rewards alone",
+        f"{SAC}-4-rew-details-zy_20240803-141214",
+        8,
+        24_000,
+        "best_zy_published_observation",
+    ),
+    "published_ppo_channels": Published(
+        "PPO, images", "run-ppo_42_4_stack-lin_sweep_v1_20240611-161932", 1, 16_000, "best_y"
+    ),
+}
+RANDOM = "run-random-actions_42_20240814-155108"
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Mean lengths of episodes.
+
+    Args:
+        steps: environment steps. Shape (n,).
+        lengths: mean steps of the episodes that have ended. Shape (n,).
+        seconds: since the training began. Shape (n,).
+    """
+
+    steps: np.ndarray
+    lengths: np.ndarray
+    seconds: np.ndarray
+
+    def smoothed(self) -> np.ndarray:
+        """Means of each point and those before it, five together. Shape (n,)."""
+        return np.array([self.lengths[max(0, i + 1 - N_SMOOTHED) : i + 1].mean() for i in range(len(self.lengths))])
+
+    def reached(self, length: float) -> tuple[int, float] | None:
+        """Environment steps and seconds until the smoothed length is at most `length`; None where it never is."""
+        below = np.flatnonzero(self.smoothed()[N_SMOOTHED - 1 :] <= length)
+        if not len(below):
+            return None
+        first = below[0] + N_SMOOTHED - 1
+        return int(self.steps[first]), float(self.seconds[first])
+
+
+def published_curve(reference: str) -> Curve:
+    """Read a published curve."""
+    with (HERE / "reference" / f"{reference}-tag-train_lens_stat_mean.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    wall_s = np.array([float(row["Wall time"]) for row in rows])
+    return Curve(
+        np.array([int(row["Step"]) for row in rows]),
+        np.array([float(row["Value"]) for row in rows]),
+        wall_s - wall_s[0],
+    )
+
+
+def our_curve(name: str, overrides: list[str], folder: Path) -> Curve:
+    """Run a preset and return its curve."""
+    curve = finished_run(name, overrides, folder).curve
+    seconds = dict(curve["wall_s"])
+    steps, lengths = np.array(curve["train/length"]).T
+    return Curve(steps.astype(int), lengths, np.array([seconds[int(step)] for step in steps]))
+
+
+def curves(name: str, *, is_full: bool, volumes: str | None, folder: Path) -> dict[str, Curve]:
+    """Return the published curve, the same settings here, and ours, by what they are called."""
+    experiment = EXPERIMENTS[name]
+    data = (
+        [f"data.n_training={experiment.n_volumes}"]
+        if volumes is None
+        else ["data=mixed", f"data.path={volumes}", f"data.n_volumes={experiment.n_volumes}", "data.n_training=0"]
+    )
+    steps = [] if is_full else [f"training.env_steps={experiment.small_env_steps}"]
+    size = "full" if is_full else "small"
+    same = our_curve(f"{name}-{size}", [f"experiment={name}", *data, *steps], folder)
+    ours = our_curve(experiment.ours, [f"experiment={experiment.ours}"], folder)
+    return {
+        "published": published_curve(experiment.reference),
+        "the same settings": same,
+        experiment.ours: ours,
+    }
+
+
+def draw(found: dict[str, dict[str, Curve]], path: Path) -> None:
+    """Draw a panel for each experiment."""
+    n_columns = min(4, len(found))
+    n_rows = -(-len(found) // n_columns)
+    figure = Figure(figsize=(4.2 * n_columns, 3.3 * n_rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
+    at_random = float(np.mean(published_curve(RANDOM).lengths))
+    for panel, (name, of_name) in zip(panels, found.items(), strict=False):
+        for (label, curve), colour in zip(of_name.items(), ("tab:grey", "tab:orange", "tab:blue"), strict=True):
+            panel.plot(curve.steps, curve.lengths, color=colour, alpha=0.25, linewidth=0.8)
+            panel.plot(curve.steps, curve.smoothed(), color=colour, label=label)
+        panel.axhline(at_random, color="black", linestyle=":", linewidth=0.8, label="published, random planes")
+        panel.set(title=EXPERIMENTS[name].title, xscale="log", yscale="log", xlabel="environment steps")
+        panel.set_ylabel("mean steps an episode")
+        panel.set_yticks(TICKS, [str(tick) for tick in TICKS])
+        panel.yaxis.set_minor_formatter(NullFormatter())
+        panel.grid(alpha=0.3, which="both")
+        panel.legend(fontsize=7)
+    for panel in panels[len(found) :]:
+        panel.remove()
+    figure.savefig(path, dpi=110)
+
+
+def table(found: dict[str, dict[str, Curve]]) -> str:
+    """Return the steps and the time to reach each length, as a Markdown table."""
+    lines = [
+        "| experiment | curve | " + " | ".join(f"length {length}" for length in LENGTHS) + " |",
+        "| --- | --- |" + " --- |" * len(LENGTHS),
+    ]
+    for name, of_name in found.items():
+        for label, curve in of_name.items():
+            cells = [_reached(curve.reached(length)) for length in LENGTHS]
+            lines.append(f"| {EXPERIMENTS[name].title} | {label} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _reached(when: tuple[int, float] | None) -> str:
+    if when is None:
+        return "never"
+    steps, seconds = when
+    time = (
+        f"{seconds:.0f} s"
+        if seconds < 120
+        else f"{seconds / 60:.0f} min"
+        if seconds < 7200
+        else f"{seconds / 3600:.1f} h"
+    )
+    return f"{steps:,} steps, {time}"
+
+
+def main(words: list[str]) -> None:
+    """Run, draw and print what the words ask for."""
+    given = dict(word.split("=", 1) for word in words if "=" in word)
+    names = [word for word in words if word in EXPERIMENTS] or list(EXPERIMENTS)
+    unknown = [word for word in words if "=" not in word and word not in ("small", "full", *EXPERIMENTS)]
+    if unknown or given.keys() - {"folder", "data"}:
+        sys.exit(f"{' '.join(unknown) or given}: see the text at the head of {__file__}")
+    folder = Path(given.get("folder", "benchmark-runs"))
+    folder.mkdir(parents=True, exist_ok=True)
+    found = {name: curves(name, is_full="full" in words, volumes=given.get("data"), folder=folder) for name in names}
+    picture = PICTURE if len(names) == len(EXPERIMENTS) else folder / "published.png"
+    draw(found, picture)
+    print(table(found))
+    print(f"picture: {picture}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,79 @@
+"""Runs of `armscan.run` that benchmarks are made of, and what they left.
+
+A run that has finished is not repeated: its folder is read again. Remove the folder to have it anew.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from mlflow import MlflowClient
+
+from armscan.tracking import open_store
+
+CURVE = ("train/length", "train/length_max", "train/return", "train/return_min", "wall_s")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Args:
+        folder: what it left.
+        store: address of the tracking store that it is in.
+    """
+
+    folder: Path
+    store: str
+
+    @cached_property
+    def evaluations(self) -> dict[str, dict]:
+        """Figures and episodes of the final evaluations, by the name of their volumes."""
+        return json.loads((self.folder / "evaluation.json").read_text())
+
+    @cached_property
+    def curve(self) -> dict[str, list[tuple[int, float]]]:
+        """(environment step, value) of each of `CURVE`, empty for agents that do not learn."""
+        client = MlflowClient(self.store)
+        run_id = (self.folder / "run_id").read_text()
+        return {
+            name: sorted((metric.step, metric.value) for metric in client.get_metric_history(run_id, name))
+            for name in CURVE
+        }
+
+    @property
+    def training_s(self) -> float:
+        """Seconds of learning and validating."""
+        return max((value for _, value in self.curve["wall_s"]), default=0.0)
+
+    @property
+    def n_env_steps(self) -> int:
+        """Environment steps of the training."""
+        return max((step for step, _ in self.curve["wall_s"]), default=0)
+
+
+def finished_run(name: str, overrides: Sequence[str], folder: Path) -> Run:
+    """Run `armscan.run` with the overrides, unless a run of that name has finished in the folder already."""
+    run_folder = folder / name
+    store = f"sqlite:///{folder.absolute()}/mlruns.db"
+    if not (run_folder / "run_id").exists():
+        command = [
+            *(sys.executable, "-m", "armscan.run", *overrides),
+            *(f"hydra.run.dir={run_folder.absolute()}", f"tracking.uri={store}", f"tracking.experiment={name}"),
+            f"tracking.artifacts={folder.absolute()}/mlartifacts",
+        ]
+        print(f"{name}: python -m armscan.run {' '.join(overrides)}", flush=True)
+        with (folder / f"{name}.log").open("w") as log:
+            subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=True)
+        client, experiment_id = open_store(
+            store, experiment=name, artifacts=f"{folder.absolute()}/mlartifacts", wait_s=60.0
+        )
+        (newest,) = client.search_runs([experiment_id], order_by=["attributes.start_time DESC"], max_results=1)
+        (run_folder / "run_id").write_text(newest.info.run_id)
+    return Run(run_folder, store)

@@ -1,0 +1,1 @@
+"""Speed and memory of the environment, the agents and tracking."""

@@ -1,0 +1,63 @@
+"""How many pictures of an episode are drawn a second, and how long a step with its picture takes beside one without.
+
+    python -m benchmarks.speed.rendering [FOLDER]
+
+The median over many frames, each of another plane: it says what a frame takes on a machine that does other things, too.
+"""
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ[_variable] = "1"
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from armscan.envs import ArmscanEnv
+from armscan.volumes import read_dataset
+
+DEFAULT_FOLDER = Path(__file__).parents[2] / "tests" / "data" / "volumes"
+N_FRAMES = 200
+
+
+def median_seconds(env: ArmscanEnv, after_step: Callable[[], object]) -> tuple[float, float]:
+    """Return the median time of a step and of what follows it."""
+    steps_s, after_s = [], []
+    for _ in range(N_FRAMES):
+        if not env.episode.is_running:
+            env.reset()
+        action = env.action_space.sample()
+        start_s = time.perf_counter()
+        env.step(action)
+        middle_s = time.perf_counter()
+        after_step()
+        steps_s.append(middle_s - start_s)
+        after_s.append(time.perf_counter() - middle_s)
+    return float(np.median(steps_s)), float(np.median(after_s))
+
+
+def main() -> None:
+    """Print the table."""
+    env = ArmscanEnv(
+        read_dataset(sys.argv[1] if len(sys.argv) > 1 else DEFAULT_FOLDER), projection="zy", render_mode="rgb_array"
+    )
+    env.action_space.seed(0)
+    for name in env.volumes:
+        # Fonts, and the two sides of each volume, are prepared once.
+        env.reset(seed=0, options={"volume": name})
+        env.render()
+    step_s, render_s = median_seconds(env, env.render)
+    print("| | ms | a second |\n| --- | --- | --- |")
+    for name, seconds in (("step", step_s), ("render", render_s), ("step and render", step_s + render_s)):
+        print(f"| {name} | {1e3 * seconds:.2f} | {1 / seconds:.0f} |")
+    print(f"\nrgb_array: {1 / render_s:.0f} frames/s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""How long a fresh process takes to `import armscan`, and from there to its first steps.
+
+    python -m benchmarks.speed.startup
+
+Each figure is the best of several fresh processes, after one that has compiled everything and made the phantoms.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+N_PROCESSES = 5
+IMPORT = "import time; start = time.perf_counter(); import armscan; print(time.perf_counter() - start)"
+STEP = """
+import time; start = time.perf_counter()
+import armscan, gymnasium
+env = gymnasium.make("armscan/Armscan-v0", projection="zy"{arguments})
+env.reset(seed=0)
+env.step(env.action_space.sample())
+print(time.perf_counter() - start)
+"""
+PROGRAMS = {
+    "`import armscan`": IMPORT,
+    "from there to the first step, on the 4 default phantoms": STEP.format(arguments=""),
+    "the same with slice_channels, stack and memory": STEP.format(
+        arguments=', observation="slice_channels", stack=4, memory=2'
+    ),
+    "to the first step of 64 environments side by side": STEP.format(arguments="")
+    .replace(".make(", ".make_vec(")
+    .replace('zy"', 'zy", num_envs=64'),
+}
+
+
+def seconds(program: str) -> float:
+    """What a fresh process says that it took."""
+    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return float(answer.stdout.split()[-1])
+
+
+def main() -> None:
+    """Print the table."""
+    print("| | seconds |\n| --- | --- |")
+    for name, program in PROGRAMS.items():
+        seconds(program)
+        print(f"| {name} | {min(seconds(program) for _ in range(N_PROCESSES)):.2f} |")
+
+
+if __name__ == "__main__":
+    main()

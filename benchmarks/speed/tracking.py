@@ -1,0 +1,195 @@
+"""What tracking costs a training.
+
+    python -m benchmarks.speed.tracking [--rounds 3] [--env-steps 20000] [--every 1000]
+
+The default run, never stopped early, trains with the same seed, and so takes the same steps, tracked nowhere, in
+SQLite, on an MLflow server, and on one that goes away after the run has begun; in turn, in one process. Tracking has
+its share of the time in two ways: training waits for calls of its own (`calls`), and threads beside it (delivery,
+system metrics) compute while it cannot, at worst for all of the time that they compute (`threads`). Their sum over the
+training's wall time is what tracking costs at most. The longest call is what training has waited at once.
+"""
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ[_variable] = "1"
+
+import argparse
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import psutil
+
+from armscan.config.defaults import to_plain
+from armscan.config.error_messages import silence_library_warnings
+from armscan.experiment.runner import train_agent
+from armscan.experiment.setup import RunSetup
+from armscan.sweeps.tasks.attempt import composed
+from armscan.tracking import TrackedRun, open_store
+from armscan.training import EpochReport
+from tests.support.mlflow_server import MlflowServer, mlflow_server
+
+THREADS = ("uploader", "pending", "system metrics")
+LOOK_S = 0.05
+
+
+class Cost(NamedTuple):
+    """What a training took.
+
+    Args:
+        wall_s: all of it.
+        calls_s: in calls to tracking.
+        longest_s: in one of them.
+        threads_s: computed by tracking's threads, while the training goes on.
+    """
+
+    wall_s: float
+    calls_s: float
+    longest_s: float
+    threads_s: float
+
+    @property
+    def share(self) -> float:
+        """Of the training's time, at most."""
+        return (self.calls_s + self.threads_s) / self.wall_s
+
+
+class Timed:
+    """A training callback that knows how long another one takes."""
+
+    def __init__(self, callback: TrackedRun) -> None:
+        self._callback, self.calls_s = callback, []
+
+    def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
+        """Times it."""
+        self._timed(lambda: self._callback.on_start(total_env_steps, earlier))
+
+    def on_epoch(self, report: EpochReport) -> None:
+        """Times it."""
+        self._timed(lambda: self._callback.on_epoch(report))
+
+    def on_end(self) -> None:
+        """Times it."""
+        self._timed(self._callback.on_end)
+
+    def _timed(self, call: Callable[[], None]) -> None:
+        start_s = time.perf_counter()
+        call()
+        self.calls_s.append(time.perf_counter() - start_s)
+
+
+class ThreadClock(threading.Thread):
+    """Looks at how long tracking's threads have computed; one that has ended cannot be asked any more."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self._over, self._seen = threading.Event(), {}
+
+    def run(self) -> None:
+        """Look again and again."""
+        process = psutil.Process()
+        while not self._over.wait(LOOK_S):
+            ours = {each.native_id for each in threading.enumerate() if each.name in THREADS}
+            self._seen |= {each.id: each.user_time + each.system_time for each in process.threads() if each.id in ours}
+
+    def computed_s(self) -> float:
+        """End it; return what they have computed."""
+        self._over.set()
+        self.join()
+        return sum(self._seen.values())
+
+
+def trained(config: Any, tracking: dict[str, Any] | None, before: Callable[[], None] = lambda: None) -> Cost:
+    """Return what one training took; `before` is called when the run has begun."""
+    setup = RunSetup.build(config)
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        callbacks, clock = [], ThreadClock()
+        if tracking is not None:
+            store, experiment_id = open_store(**tracking)
+            tracked = TrackedRun.start(
+                store, experiment_id, name="measured", config=to_plain(config), tags={}, folder=Path(folder)
+            )
+            stack.callback(tracked.end, "FINISHED", wait_s=2.0)
+            callbacks = [Timed(tracked)]
+        before()
+        clock.start()
+        start_s = time.perf_counter()
+        train_agent(setup, Path(folder), callbacks, run_id="measured")
+        wall_s, threads_s = time.perf_counter() - start_s, clock.computed_s()
+        calls_s = callbacks[0].calls_s if callbacks else [0.0]
+        return Cost(wall_s, sum(calls_s), max(calls_s), threads_s)
+
+
+@contextmanager
+def ways(folder: Path) -> Iterator[dict[str, Callable[[Any], Cost]]]:
+    """The ways of tracking that are compared, by what they are called."""
+
+    def section(uri: str) -> dict[str, Any]:
+        return {
+            "uri": uri,
+            "experiment": "measured",
+            "artifacts": str(folder / "mlartifacts"),
+            "wait_s": 60.0,
+            "system_metrics_s": 10.0,
+        }
+
+    def away(config: Any, server: MlflowServer) -> Cost:
+        server.start()
+        try:
+            return trained(config, section(server.uri), server.stop)
+        finally:
+            server.stop()
+
+    with mlflow_server(folder / "server", f"sqlite:///{folder}/server.db") as server:
+        leaving = MlflowServer(folder / "leaving", f"sqlite:///{folder}/leaving.db")
+        yield {
+            "nowhere": lambda config: trained(config, None),
+            "SQLite": lambda config: trained(config, section(f"sqlite:///{folder}/runs.db")),
+            "server": lambda config: trained(config, section(server.uri)),
+            "server gone": lambda config: away(config, leaving),
+        }
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    for option, default in (("--rounds", 3), ("--env-steps", 20_000), ("--every", 1000)):
+        parser.add_argument(option, type=int, default=default)
+    given = parser.parse_args()
+    silence_library_warnings()
+    config, _ = composed(
+        [
+            f"training.env_steps={given.env_steps}",
+            f"training.eval_every_env_steps={given.every}",
+            "training.solved=null",
+        ]
+    )
+    with tempfile.TemporaryDirectory() as folder, ways(Path(folder)) as compared:
+        costs: dict[str, list[Cost]] = {name: [] for name in compared}
+        for number in range(given.rounds):
+            for name, measure in compared.items():
+                costs[name].append(measure(config))
+                print(f"round {number}, {name}: {costs[name][-1]}", flush=True)
+    print(f"\n{'tracked':<12} wall (s)  to nowhere's  calls (s)  threads (s)  at most   longest call (ms)")
+    base = statistics.median(cost.wall_s for cost in costs["nowhere"])
+    for name, of_name in costs.items():
+        wall, calls, threads, share = (
+            statistics.median(getattr(cost, field) for cost in of_name)
+            for field in ("wall_s", "calls_s", "threads_s", "share")
+        )
+        longest_ms = 1000 * max(cost.longest_s for cost in of_name)
+        print(
+            f"{name:<12} {wall:8.1f} {wall / base:13.3f} {calls:10.4f} {threads:12.2f} {share:8.2%} {longest_ms:19.2f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""How many updates a second an agent makes, by how its networks are computed.
+
+    python -m benchmarks.speed.updates [PART-OF-A-NAME ...]
+
+SAC on phantoms, with the network and batch size of its preset; a replay buffer of random steps, then rounds of updates,
+the ways of computing in turn. The figures to quote are the ratios to 32 bits without compilation, each the median over
+the rounds. Takes the devices that there are; on a GPU times are taken after it has finished what was asked of it.
+"""
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ[_variable] = "1"
+
+import statistics
+import sys
+import time
+from functools import partial
+
+import torch
+from tianshou.utils.torch_utils import policy_within_training_step
+
+from armscan.agents import MLP, SAC, AgentSetup, Compute, Multimodal, Network
+from armscan.config.error_messages import silence_library_warnings
+from armscan.envs import EnvFactory, SliceChannelsObservation
+from armscan.volumes import load_phantoms
+
+N_ROUNDS, N_RANDOM_STEPS, ROUND_S = 5, 1_000, 3.0
+CASES: dict[str, tuple[EnvFactory, Network]] = {
+    "cluster, 64-64": (EnvFactory(projection="full"), MLP((64, 64))),
+    "slice_channels 48 x 36": (
+        EnvFactory(projection="full", observation=SliceChannelsObservation(shape=(48, 36))),
+        Multimodal(),
+    ),
+    "slice_channels 84 x 84, stack 4": (
+        EnvFactory(projection="full", observation=SliceChannelsObservation(shape=(84, 84)), stack=4),
+        Multimodal(),
+    ),
+}
+
+
+def ways() -> dict[str, Compute]:
+    """Return the ways of computing that this machine has, by what they are called."""
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    return {
+        f"{device}, {precision}{', compiled' if is_compiled else ''}": Compute(device, precision, is_compiled)
+        for device in devices
+        for precision in ("float32", "bfloat16")
+        for is_compiled in (False, True)
+    }
+
+
+def updater(maker: EnvFactory, network: Network, compute: Compute):
+    """Return what measures updates a second, with a replay buffer that is filled."""
+    volumes = load_phantoms(range(2))
+    setup = AgentSetup(
+        make_envs=partial(maker.many, volumes=volumes, autoreset_mode="Disabled"),
+        observation_space=maker.one(volumes).observation_space,
+        action_names=("rz", "rx", "tx", "ty"),
+        total_env_steps=10 * N_RANDOM_STEPS,
+        seed=0,
+        compute=compute,
+    )
+    learner = SAC(network=network, learning_starts=N_RANDOM_STEPS).agent(setup)
+    learner.warm_up()
+    algorithm, replay = learner._algorithm, learner._replay
+
+    def measure(seconds: float = ROUND_S) -> float:
+        n_updates, start_s = 0, time.perf_counter()
+        with policy_within_training_step(algorithm.policy):
+            while n_updates < 3 or time.perf_counter() - start_s < seconds:
+                algorithm.update(buffer=replay, sample_size=256)
+                n_updates += 1
+        if compute.torch_device == "cuda":
+            torch.cuda.synchronize()
+        return n_updates / (time.perf_counter() - start_s)
+
+    return measure
+
+
+def main(words: list[str]) -> None:
+    """Measure every case and print its table."""
+    silence_library_warnings()
+    torch.set_num_threads(1)
+    chosen = {name: case for name, case in CASES.items() if not words or any(word in name for word in words)}
+    print("| observation, network | computed | updates/s, median | best | beside the first |")
+    print("| --- | --- | --- | --- | --- |")
+    for name, (maker, network) in chosen.items():
+        measures = {way: updater(maker, network, compute) for way, compute in ways().items()}
+        for measure in measures.values():
+            # Compiles.
+            measure(0.0)
+        rounds = [{way: measure() for way, measure in measures.items()} for _ in range(N_ROUNDS)]
+        first = next(iter(measures))
+        for way in measures:
+            figures = [each[way] for each in rounds]
+            ratio = statistics.median(each[way] / each[first] for each in rounds)
+            print(
+                f"| {name} | {way} | {statistics.median(figures):.1f} | {max(figures):.1f} | {ratio:.2f} |", flush=True
+            )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,44 @@
+"""What a study costs beside its trials, and what is left of it when its workers are killed.
+
+    python -m benchmarks.sweeps compare [folder=FOLDER] [trials=60] [shortest_s=6] [longest_s=30]
+                                        the workers' time spent in trials, beside Hydra's own Optuna sweeper
+    python -m benchmarks.sweeps idle [folder=FOLDER] [trials=60] [shortest_s=1] [longest_s=5]
+                                        the same of armscan alone, with trials that are over soon
+    python -m benchmarks.sweeps beside [folder=FOLDER] [trials=4]
+                                        what a study adds to a training of a minute
+    python -m benchmarks.sweeps kill [folder=FOLDER] [trials=200] [every_s=20] [storage=journal]
+                                        200 trials, workers killed, the storage (or sqlite, postgresql) away twice
+
+But for `beside`, trials only wait (`benchmarks/sweeps/sleeping.py`), so that four workers can be had on two cores.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import yaml
+
+from benchmarks.sweeps.compare_sweepers import compare
+from benchmarks.sweeps.kill_workers import kill
+from benchmarks.sweeps.occupancy import idle
+from benchmarks.sweeps.overhead import beside
+
+MEASURES: dict[str, Callable[..., None]] = {"compare": compare, "idle": idle, "beside": beside, "kill": kill}
+
+
+def main(words: list[str]) -> None:
+    """Measure what is asked for."""
+    given = dict(word.split("=", 1) for word in words if "=" in word)
+    what = [word for word in words if "=" not in word]
+    if len(what) != 1 or what[0] not in MEASURES:
+        sys.exit(__doc__)
+    folder = Path(given.pop("folder", "") or tempfile.mkdtemp()).absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    MEASURES[what[0]](folder, **{name: yaml.safe_load(text) for name, text in given.items()})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,103 @@
+"""The same trials by armscan's studies and by Hydra's own Optuna sweeper, one after the other.
+
+Hydra's sweeper runs in an environment of its own, which is made once, in the cache folder: its versions
+(`hydra_optuna/requirements.txt`) are not those of armscan. It takes a batch of trials, one for each worker, waits for
+all of them, and takes the next. Both keep the study in a file and draw at random, and trial number N takes as long on
+both. A study of armscan does more: each trial is tracked in MLflow, and reports ten times.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import time
+import venv
+from dataclasses import dataclass
+from pathlib import Path
+
+import optuna
+from optuna.trial import TrialState
+
+from armscan.utils.files import cache_folder
+from benchmarks.sweeps.occupancy import Occupation, share_in_trials, slept
+from benchmarks.sweeps.studies import N_WORKERS, REPOSITORY
+from benchmarks.sweeps.wait import WAITED_FILE, Waited
+
+HYDRA_OPTUNA = Path(__file__).parent / "hydra_optuna"
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What came of a sweep.
+
+    Args:
+        occupation: of its workers.
+        n_finished: trials whose result is in the storage.
+        command_s: seconds that the command took, the start of its workers included.
+    """
+
+    occupation: Occupation
+    n_finished: int
+    command_s: float
+
+
+def compare(folder: Path, *, trials: int = 60, shortest_s: float = 6.0, longest_s: float = 30.0) -> None:
+    """Run both, and print what came of them."""
+    python = environment()
+    start_s = time.monotonic()
+    state = slept(folder, trials, shortest_s, longest_s)
+    ours = Sweep(Occupation.of_study(state), len(state.finished), time.monotonic() - start_s)
+    sweeps = ours, _by_hydra(python, folder, trials, shortest_s, longest_s)
+    occupations = [sweep.occupation for sweep in sweeps]
+    rows = {
+        "trials finished": [f"{sweep.n_finished}" for sweep in sweeps],
+        "trials lost": [f"{trials - sweep.n_finished}" for sweep in sweeps],
+        "what all trials wait, one after another, s": [f"{each.waited_s:.1f}" for each in occupations],
+        "first trial's begin to last trial's end, s": [f"{each.wall_s:.1f}" for each in occupations],
+        "the command from start to end, s": [f"{sweep.command_s:.1f}" for sweep in sweeps],
+        "of the workers' time spent in what trials do": [f"{each.share_of_wall:.1%}" for each in occupations],
+        "the same, each worker until its own last trial": [f"{each.share_until_last:.1%}" for each in occupations],
+        "likewise, from a trial's claim to its tell": [f"{share_in_trials(state):.1%}", ""],
+    }
+    print("| | armscan | Hydra's Optuna sweeper |\n| --- | --- | --- |")
+    for name, cells in rows.items():
+        print(f"| {name} | {' | '.join(cells)} |")
+
+
+def environment() -> Path:
+    """Return the interpreter of the environment of Hydra's sweeper, which is made where there is none."""
+    requirements = HYDRA_OPTUNA / "requirements.txt"
+    version = hashlib.sha256(requirements.read_bytes()).hexdigest()[:12]
+    folder = cache_folder() / f"hydra_optuna-{version}"
+    python, is_whole = folder / "bin" / "python", folder / "installed"
+    if not is_whole.exists():
+        print(f"installing {requirements} in {folder}", flush=True)
+        venv.create(folder, clear=True, with_pip=True)
+        subprocess.run([python, "-m", "pip", "install", "--quiet", "--requirement", requirements], check=True)
+        is_whole.touch()
+    return python
+
+
+def _by_hydra(python: Path, folder: Path, trials: int, shortest_s: float, longest_s: float) -> Sweep:
+    database, sweep = folder / "hydra_optuna.db", folder / "hydra_optuna"
+    words = (
+        *("-m", f"workers={N_WORKERS}", f"shortest_s={shortest_s}", f"longest_s={longest_s}"),
+        *(f"hydra.sweep.dir={sweep}", f"hydra.sweeper.storage=sqlite:///{database}"),
+        f"hydra.sweeper.n_trials={trials}",
+    )
+    variables = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+    start_s = time.monotonic()
+    with (folder / "hydra_optuna.log").open("w") as log:
+        command = [python, HYDRA_OPTUNA / "app.py", *words]
+        subprocess.run(command, cwd=folder, env=variables, stdout=log, stderr=log, check=True)
+    command_s = time.monotonic() - start_s
+    of_worker: dict[str, list[Waited]] = {}
+    for file in sweep.glob(f"*/{WAITED_FILE}"):
+        left = json.loads(file.read_text())
+        of_worker.setdefault(left["worker"], []).append(Waited(*left["waited"]))
+    assert len(of_worker) <= N_WORKERS, "a worker was replaced, so that nobody knows until when it counts"
+    study = optuna.load_study(study_name="sleeping", storage=f"sqlite:///{database}")
+    n_finished = len(study.get_trials(states=[TrialState.COMPLETE]))
+    return Sweep(Occupation(of_worker), n_finished, command_s)

@@ -1,0 +1,103 @@
+"""How much of the time of a sweep's workers is spent in what its trials do.
+
+The trials only wait, and what of the workers' time they do not wait is the sweeper's: choosing what to try, starting a
+trial, writing down what came of it, and above all workers with nothing to do although there are trials left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from optuna.trial import FrozenTrial
+
+from armscan.sweeps.scheduling.state import METRICS, StudyState
+from benchmarks.sweeps.studies import N_WORKERS, SLEEPING, by_worker, finish
+from benchmarks.sweeps.wait import Waited
+
+
+@dataclass(frozen=True)
+class Occupation:
+    """What the workers of a sweep did from the first trial's begin to the last trial's end.
+
+    Args:
+        of_worker: what each has waited.
+    """
+
+    of_worker: Mapping[str, Sequence[Waited]]
+
+    @classmethod
+    def of_study(cls, state: StudyState) -> Self:
+        """Return that of a study of `benchmarks.sweeps.sleeping`."""
+        return cls({worker: list(map(_waited, trials)) for worker, trials in by_worker(state).items()})
+
+    @property
+    def waited_s(self) -> float:
+        """What all trials had to wait, one after another."""
+        return sum(each.length_s for one in self.of_worker.values() for each in one)
+
+    @property
+    def begin_s(self) -> float:
+        """When the first trial began to wait."""
+        return min(each.begin_s for one in self.of_worker.values() for each in one)
+
+    @property
+    def ends_s(self) -> list[float]:
+        """When each worker's last trial had waited."""
+        return [max(each.end_s for each in one) for one in self.of_worker.values()]
+
+    @property
+    def wall_s(self) -> float:
+        """From the first trial's begin to the last one's end."""
+        return max(self.ends_s) - self.begin_s
+
+    @property
+    def share_of_wall(self) -> float:
+        """Of that time of all workers, what the trials had to wait; the end, where some find no more trial, counts."""
+        return self.waited_s / (N_WORKERS * self.wall_s)
+
+    @property
+    def share_until_last(self) -> float:
+        """The same, but each worker counts only until the end of its own last trial: then nothing was left to do."""
+        return self.waited_s / sum(end_s - self.begin_s for end_s in self.ends_s)
+
+
+def share_in_trials(state: StudyState) -> float:
+    """Return what share of the workers' time a study's trials are at hand, by the storage: from claim to tell.
+
+    Each worker counts from the first trial's begin to the end of its own last one.
+    """
+    workers = by_worker(state).values()
+    begin = min(trials[0].datetime_start for trials in workers)
+    inside_s = sum((each.datetime_complete - each.datetime_start).total_seconds() for one in workers for each in one)
+    return inside_s / sum((trials[-1].datetime_complete - begin).total_seconds() for trials in workers)
+
+
+def slept(folder: Path, trials: int, shortest_s: float, longest_s: float) -> StudyState:
+    """Run a study of `benchmarks.sweeps.sleeping` in a folder, and return how it stands then."""
+    lengths = (f"+study.task.shortest_s={shortest_s}", f"+study.task.longest_s={longest_s}")
+    return finish(folder, *SLEEPING, *lengths, f"study.n_trials={trials}")
+
+
+def idle(folder: Path, *, trials: int = 60, shortest_s: float = 1.0, longest_s: float = 5.0) -> None:
+    """Measure how much of the workers' time is spent in trials, and what each trial takes beside what it does."""
+    state = slept(folder, trials, shortest_s, longest_s)
+    occupation = Occupation.of_study(state)
+    beside_s = sorted(
+        (trial.datetime_complete - trial.datetime_start).total_seconds() - _waited(trial).length_s
+        for trial in state.finished
+    )
+    print(f"{len(state.finished)} trials by {len(occupation.of_worker)} workers in {occupation.wall_s:.1f} s")
+    print(
+        f"of the workers' time {share_in_trials(state):.1%} in trials, {occupation.share_until_last:.1%} in what they "
+        f"do; {occupation.share_of_wall:.1%} where the end counts for all workers"
+    )
+    print(
+        f"beside what it does a trial takes {beside_s[len(beside_s) // 2]:.2f} s (median), {beside_s[-1]:.2f} s (most)"
+    )
+
+
+def _waited(trial: FrozenTrial) -> Waited:
+    return Waited(*(trial.user_attrs[METRICS][name] for name in Waited._fields))

@@ -1,0 +1,132 @@
+"""What a study adds to a trial beside its training.
+
+A trial is at hand from its claim to its tell, by the storage. Its worker then still closes the trial's tracked run and
+claims the next one. All of that is the study's, but for what a single run of `armscan.run` does as well, which is what
+the task does between its begin and its end: environments and agent are built, the training is tracked, checkpoints are
+written, the learning curve is drawn. Within that the study's are the calls to the attempt (`OF_STUDY`): the composing
+of the configuration, which a single run does only once; the reports, with the pruner's answer; what is noted when a
+seed is done; the picture for the dashboard.
+"""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from typing import Any, Self
+
+from optuna.trial import FrozenTrial
+
+from armscan.sweeps.scheduling.state import METRICS
+from armscan.sweeps.tasks.attempt import Attempt
+from armscan.sweeps.tasks.training import TrainingTask
+from benchmarks.sweeps.studies import by_worker, finish
+
+OF_STUDY = ("config", "opened", "report", "keep_seed", "show_picture")
+N_WORKERS = 2
+# A minute of training for each trial, whatever its learning rate.
+TRAINING = (
+    *(
+        "study.task._target_=benchmarks.sweeps.overhead.TimedTraining",
+        f"study.workers={N_WORKERS}",
+        "training.env_steps=20000",
+    ),
+    *("agent.utd_ratio=0.4", "agent.batch_size=128", "+study.sampler.n_startup_trials=1"),
+)
+
+
+class TimedTraining(TrainingTask):
+    """The task of training an agent, which says what of its time was the study's."""
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """Those of a training, and the seconds of the whole task and of the study's part in it."""
+        return (*super().metrics, "task_s", *(f"{name}_s" for name in OF_STUDY))
+
+    def run(self, attempt: Attempt) -> dict[str, float]:
+        """See `Task.run`."""
+        spent_s = dict.fromkeys(OF_STUDY, 0.0)
+        for name in OF_STUDY:
+            setattr(attempt, name, _timed(getattr(attempt, name), name, spent_s))
+        start_s = time.perf_counter()
+        figures = super().run(attempt)
+        task_s = time.perf_counter() - start_s
+        return figures | {"task_s": task_s} | {f"{name}_s": seconds for name, seconds in spent_s.items()}
+
+
+def _timed(method: Callable[..., Any], name: str, spent_s: dict[str, float]) -> Callable[..., Any]:
+    @wraps(method)
+    def timed(*arguments: Any, **named: Any) -> Any:
+        start_s = time.perf_counter()
+        try:
+            return method(*arguments, **named)
+        finally:
+            spent_s[name] += time.perf_counter() - start_s
+
+    return timed
+
+
+@dataclass(frozen=True)
+class Shares:
+    """What the seconds of a trial went to, from its claim to its tell; all four together are all of them.
+
+    Args:
+        training_s: learning, validating, tracking, checkpoints.
+        single_s: what else a single run does.
+        around_s: the study's, before and after the task.
+        within_s: the study's, within the task.
+    """
+
+    training_s: float
+    single_s: float
+    around_s: float
+    within_s: float
+
+    @classmethod
+    def of(cls, trial: FrozenTrial) -> Self:
+        """Return those of a finished trial."""
+        figures = trial.user_attrs[METRICS]
+        within_s = sum(figures[f"{name}_s"] for name in OF_STUDY)
+        # The reports are made while the agent is trained.
+        training_s = figures["training_s"] - figures["report_s"]
+        at_hand_s = (trial.datetime_complete - trial.datetime_start).total_seconds()
+        task_s = figures["task_s"]
+        return cls(training_s, task_s - training_s - within_s, at_hand_s - task_s, within_s)
+
+    @property
+    def at_hand_s(self) -> float:
+        """From claim to tell."""
+        return self.training_s + self.single_s + self.around_s + self.within_s
+
+
+def beside(folder: Path, *, trials: int = 4) -> None:
+    """Train, and print what the study took of each trial; of more than five some would be pruned."""
+    workers = by_worker(finish(folder, *TRAINING, f"study.n_trials={trials}")).values()
+    shares = [Shares.of(trial) for of_worker in workers for trial in of_worker]
+    between_s = [
+        (after.datetime_start - before.datetime_complete).total_seconds()
+        for of_worker in workers
+        for before, after in itertools.pairwise(of_worker)
+    ]
+    # A worker's last trial is followed by none: the median stands for what would have been.
+    gap_s = statistics.median(between_s)
+    study_s = [each.around_s + each.within_s + gap_s for each in shares]
+    rows = {
+        "a trial, from claim to tell": [each.at_hand_s for each in shares],
+        "its training: learning, validating, tracking, checkpoints": [each.training_s for each in shares],
+        "what else a single run does: building, its tracked run, the curve": [each.single_s for each in shares],
+        "the study's, before and after the task": [each.around_s for each in shares],
+        "the study's, within the task": [each.within_s for each in shares],
+        "the study's, between a tell and the worker's next claim": between_s,
+        "the study's, all of it": study_s,
+        "the same, in % of the trial": [
+            100 * own_s / each.at_hand_s for own_s, each in zip(study_s, shares, strict=True)
+        ],
+    }
+    print(f"{len(shares)} trials by {len(workers)} workers\n\n| s | median | most |\n| --- | --- | --- |")
+    for name, seconds in rows.items():
+        print(f"| {name} | {statistics.median(seconds):.2f} | {max(seconds):.2f} |")

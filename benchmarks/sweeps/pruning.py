@@ -1,0 +1,84 @@
+"""What pruning is worth: the study `sac_y` with its pruner, and without one.
+
+    python -m benchmarks.sweeps.pruning [folder=FOLDER] [seeds=0,1,2] [trials=40]
+
+Both studies of a seed draw the same points at random, so that a trial of one is the same training as that of the other
+as far as it goes, and what differs is the pruning. A folder that has studies already is gone on with.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import optuna
+from optuna.trial import FrozenTrial, TrialState
+
+from armscan.sweeps.scheduling.state import StudyState, env_steps_of
+from armscan.sweeps.storage.storage import open_storage
+
+STUDIES = {"plain": ["study/pruner=none"], "pruned": []}
+
+
+def trials_of(folder: Path, seed: int, name: str, n_trials: int) -> list[FrozenTrial]:
+    """Run a study, and return its trials in the order in which they ended."""
+    words = ["-m", "sweep=sac_y", f"study.name={name}", f"study.seed={seed}", f"study.n_trials={n_trials}"]
+    words += ["study.final_eval.top_k=0", "study/sampler=random", *STUDIES[name]]
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / f"{name}.log").open("a") as log:
+        subprocess.run(
+            [sys.executable, "-m", "armscan.run", *words],
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+            stdout=log,
+            stderr=log,
+            check=True,
+        )
+    storage = open_storage(str(folder / "optuna.journal"))
+    study = optuna.load_study(study_name=name, storage=storage.optuna)
+    return sorted(StudyState.of(study.trials).finished, key=lambda trial: str(trial.datetime_complete))
+
+
+def env_steps_until(trials: list[FrozenTrial], value: float) -> int | None:
+    """Return the environment steps of the trials that had ended when one was as good as this; None where none was."""
+    n_env_steps = 0
+    for trial in trials:
+        n_env_steps += env_steps_of(trial)
+        if trial.state == TrialState.COMPLETE and trial.values[0] <= value:
+            return n_env_steps
+    return None
+
+
+def compare(folder: Path, seed: int, n_trials: int) -> None:
+    """Print how both studies of a seed went."""
+    plain, pruned = (trials_of(folder, seed, name, n_trials) for name in STUDIES)
+    best = {
+        name: min(trial.values[0] for trial in each if trial.state == TrialState.COMPLETE)
+        for name, each in (("plain", plain), ("pruned", pruned))
+    }
+    total, total_pruned = (sum(map(env_steps_of, each)) for each in (plain, pruned))
+    n_pruned = sum(trial.state == TrialState.PRUNED for trial in pruned)
+    reached = env_steps_until(pruned, best["plain"])
+    when = "never" if reached is None else f"after {reached:,} ({reached / total:.0%})"
+    alone = env_steps_until(plain, best["plain"])
+    print(f"seed {seed}: plain {total:,} environment steps, best {best['plain']:.3f} after {alone:,}")
+    print(
+        f"        pruned {total_pruned:,} ({total_pruned / total:.0%}), {n_pruned} of {len(pruned)} trials pruned, "
+        f"best {best['pruned']:.3f}, as good as the plain one's best {when}",
+        flush=True,
+    )
+
+
+def main(words: list[str]) -> None:
+    """Run what is asked for."""
+    given = dict(word.split("=", 1) for word in words)
+    folder = Path(given.get("folder") or tempfile.mkdtemp())
+    for seed in map(int, given.get("seeds", "0,1,2").split(",")):
+        compare(folder / f"seed_{seed}", seed, int(given.get("trials", "40")))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

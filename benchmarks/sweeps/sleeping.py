@@ -1,0 +1,42 @@
+"""A trial that only takes its time: what is left of a study without training is the platform."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from armscan.experiment.build import check_keys
+from armscan.sweeps.tasks.attempt import Attempt
+from benchmarks.sweeps.wait import N_PARTS, Waited, wait
+
+STEPS_A_PART = 100
+
+
+class Sleeping:
+    """The task of waiting, with ten reports; see `wait`."""
+
+    metrics = ("mean_steps", *Waited._fields)
+    final_metric = "test/mean_steps"
+
+    def __init__(self, shortest_s: float = 1.0, longest_s: float = 5.0) -> None:
+        self._shortest_s, self._longest_s = shortest_s, longest_s
+
+    def check(self, config: DictConfig) -> None:
+        """See `Task.check`."""
+        check_keys(config)
+
+    def run(self, attempt: Attempt) -> dict[str, float]:
+        """Wait; the value is what `agent.lr` is."""
+        (seed,) = attempt.seeds
+        config, _ = attempt.config(seed)
+        value = float(config.agent.lr)
+
+        def report(part: int) -> None:
+            at = {"n_env_steps": part * STEPS_A_PART, "grid": STEPS_A_PART, "total": N_PARTS * STEPS_A_PART}
+            attempt.report({"mean_steps": value, "mean_return": -value}, seed=seed, **at)
+
+        waited = wait(attempt.trial.number, self._shortest_s, self._longest_s, report)
+        return {"mean_steps": value, **waited._asdict()}
+
+    def evaluate(self, attempt: Attempt) -> dict[str, float]:
+        """See `Task.evaluate`."""
+        return {"test/mean_steps": self.run(attempt)["mean_steps"]}

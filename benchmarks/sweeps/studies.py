@@ -1,0 +1,62 @@
+"""Studies that benchmarks are made of: started in a folder, and what they have left there."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import optuna
+from optuna.trial import FrozenTrial
+
+from armscan.sweeps.scheduling.state import LEASE, StudyState
+from armscan.sweeps.storage.storage import open_storage
+
+N_WORKERS = 4
+NAME, JOURNAL = "benchmark", "optuna.journal"
+REPOSITORY = Path(__file__).parents[2]
+SLEEPING = (
+    *("study.task._target_=benchmarks.sweeps.sleeping.Sleeping", "study/sampler=random", "study/pruner=none"),
+    *(f"study.workers={N_WORKERS}", "+study.space={agent.lr:{low:1.0e-4,high:1.0e-2,log:true}}"),
+)
+# The cores are not what is measured: a trial that waits needs none.
+PROGRAM = """
+import os, sys
+os.sched_getaffinity = lambda _: range(64)
+from armscan.run import main
+sys.exit(main())
+"""
+
+
+def started(folder: Path, *words: str) -> subprocess.Popen[bytes]:
+    """Start a study in a folder, without the judging of its best trials."""
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+    words = ("-m", "sweep=sac_y", f"study.name={NAME}", "study.final_eval.top_k=0", *words)
+    with (folder / "printed").open("ab") as printed:
+        return subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, *words], cwd=folder, env=environment, stdout=printed, stderr=printed
+        )
+
+
+def finish(folder: Path, *words: str) -> StudyState:
+    """Run a study in a folder to its end, and return how it stands then."""
+    if started(folder, *words).wait() != 0:
+        sys.exit((folder / "printed").read_text())
+    return state_in(folder)
+
+
+def state_in(folder: Path, uri: str = JOURNAL) -> StudyState:
+    """Return how the study of a folder stands."""
+    storage = open_storage(uri if "://" in uri else str(folder / uri))
+    if NAME not in optuna.get_all_study_names(storage.optuna):
+        return StudyState.of([])
+    return StudyState.of(optuna.load_study(study_name=NAME, storage=storage.optuna).trials)
+
+
+def by_worker(state: StudyState) -> dict[str, list[FrozenTrial]]:
+    """Return the finished trials that each worker has run, in their order."""
+    workers: dict[str, list[FrozenTrial]] = {}
+    for trial in sorted(state.finished, key=lambda trial: trial.datetime_start):
+        workers.setdefault(trial.user_attrs[LEASE]["worker"], []).append(trial)
+    return workers

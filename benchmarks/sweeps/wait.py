@@ -1,0 +1,44 @@
+"""The waiting that trials do instead of a training; it needs nothing but Python, so that any platform can run it."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+WAITED_FILE = "waited.json"
+N_PARTS = 10
+
+
+class Waited(NamedTuple):
+    """What a trial did.
+
+    Args:
+        length_s: that it had to wait.
+        begin_s: when it began, by the clock that all processes share.
+        end_s: when it ended.
+    """
+
+    length_s: float
+    begin_s: float
+    end_s: float
+
+
+def wait(
+    number: int, shortest_s: float, longest_s: float, on_part: Callable[[int], None] = lambda part: None
+) -> Waited:
+    """Wait as long as the trial of this number takes, whichever platform runs it.
+
+    Args:
+        number: of the trial.
+        shortest_s: any trial waits.
+        longest_s: likewise; lengths are spread evenly between the two.
+        on_part: called after each of the `N_PARTS` parts with its number, from 1; its time is part of the waiting.
+    """
+    length_s = random.Random(number).uniform(shortest_s, longest_s)
+    begin_s = time.time()
+    for part in range(1, N_PARTS + 1):
+        time.sleep(max(0.0, begin_s + length_s * part / N_PARTS - time.time()))
+        on_part(part)
+    return Waited(length_s, begin_s, time.time())

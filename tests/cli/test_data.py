@@ -1,0 +1,53 @@
+"""The command that tells what is in a folder of volumes."""
+
+import subprocess
+import sys
+
+from armscan.cli.main import main
+
+
+def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, capsys):
+    write_labelmap("a.nrrd")
+    write_labelmap("b.nrrd")
+    write_labelmap("c.nrrd")
+    (tmp_path / "manifest.yaml").write_text(
+        "labels: {bones: [1], tendons: [2], artery: [3], nerve: [4]}\n"
+        "splits: {train: [S1, b.nrrd]}\n"
+        "volumes:\n"
+        "  a.nrrd: {subject: S1, crop_mm: {y: [0, 4]}, rotation: [0, 0], translation: [0, 0]}\n"
+        "  b.nrrd: {}\n"
+        "  c.nrrd: {exclude: '[bold] motion'}\n"
+    )
+    assert main(["data", "inspect", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    for part in (
+        "a.nrrd: subject S1, for train, a labelled plane",
+        "30 x 11 x 12 voxels of 0.3 x 0.4 x 0.5 mm, axes towards LPS; read from 30 x 20 x 12",
+        "cropped to y from 0 to 4 mm",
+        "b.nrrd: subject b.nrrd, for train, no labelled plane",
+        "not there",
+        "c.nrrd: excluded ([bold] motion)",
+        "bones",
+        "1 (231)",
+    ):
+        assert part in printed
+
+
+def test_data_command_needs_no_manifest(write_labelmap, tmp_path, capsys):
+    write_labelmap("a.nrrd")
+    assert main(["data", "inspect", str(tmp_path)]) == 0
+    assert "a.nrrd: subject a.nrrd, no labelled plane" in capsys.readouterr().out
+
+
+def test_data_command_answers_a_mistake_in_one_line(tmp_path, capsys):
+    assert main(["data", "inspect", str(tmp_path / "nowhere")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert len(error.splitlines()) == 1
+
+
+def test_volumes_load_nothing_heavy_until_a_file_is_read():
+    heavy = {"SimpleITK", "slicerio", "pydantic", "torch", "hydra", "mlflow"}
+    program = f"import sys, armscan.volumes; print({heavy!r} & sys.modules.keys())"
+    printed = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
+    assert printed.strip() == "set()"

@@ -1,0 +1,148 @@
+"""The command that films an agent, as a person types it, on real tracked runs."""
+
+import json
+import re
+from functools import partial
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from mlflow import MlflowClient
+from PIL import Image, ImageChops
+
+from armscan.training import load_checkpoint, save_checkpoint
+from tests.cli.test_evaluate import FEW, GUESSER, ON_FILES, tracked
+
+EPISODE = re.compile(r"^(.+): (\S+), seed (\d+): (no )?success after (\d+) steps?, ([\d.]+) mm", re.MULTILINE)
+GUESSER_OF_ANYTHING = ["--agent=sac", "~agent.network", "agent._target_=tests.cli.test_evaluate.GuesserOfAnything"]
+PICTURES_A_FRAME, PICTURES_OF_THE_LAST = 6, 24
+
+
+@pytest.fixture
+def answer(armscan):
+    """Runs `armscan evaluate --video` in this process; returns its exit code and what it printed."""
+    return partial(armscan, "evaluate", "--video")
+
+
+def gif_frames(file):
+    with Image.open(file) as video:
+        frames = []
+        for number in range(video.n_frames):
+            video.seek(number)
+            frames.append((video.info["duration"], video.convert("RGB")))
+    return frames
+
+
+def mp4_frames(file):
+    reader = imageio_ffmpeg.read_frames(str(file))
+    facts = next(reader)
+    width, height = facts["size"]
+    return facts, [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]
+
+
+def difference(one, other):
+    """Mean of what two pictures differ by, from 0 to 255."""
+    return np.asarray(ImageChops.difference(one, other)).mean()
+
+
+def test_film_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(answer, armscan, tmp_path):
+    run_id = tracked(tmp_path, "projection=zy")
+    code, printed, errors = answer(run_id[:8], "--episodes=2", "--seed=4", "--max-steps=3")
+    assert (code, errors) == (0, "")
+    told = EPISODE.findall(printed)
+    assert [(label, volume, seed) for label, volume, seed, *_ in told] == [
+        ("test volumes", "phantom-2000000", "4"),
+        ("test volumes", "phantom-2000000", "5"),
+    ]
+    words = [run_id, "--episodes=2", "--seed=4", "--max-steps=3", "--out=a.json"]
+    assert armscan("evaluate", *words)[0] == 0
+    episodes = json.loads((tmp_path / "a.json").read_text())["episodes"]["test volumes"]
+    n_steps = [each["n_steps"] for each in episodes]
+    assert [int(steps) for *_, steps, _ in told] == n_steps
+    assert [float(mm) for *_, mm in told] == [round(each["distance_mm"], 1) for each in episodes]
+    name = f"films/tiny-own-volumes-{run_id[:8]}-seed4"
+    assert printed.endswith(f"look at   {name}.gif\nlook at   {name}.mp4\n")
+    frames = gif_frames(tmp_path / f"{name}.gif")
+    durations = [ms for steps in n_steps for ms in [*steps * [600], 2400]]
+    assert [ms for ms, _ in frames] == durations
+    facts, pictures = mp4_frames(tmp_path / f"{name}.mp4")
+    assert (facts["codec"], facts["pix_fmt"].partition("(")[0], facts["size"]) == ("h264", "yuv420p", (860, 512))
+    assert len(pictures) == sum(ms // 100 for ms in durations)
+    # Each picture of the one is in the other, where it belongs; those of other steps differ by more.
+    at = 0
+    for ms, frame in frames:
+        same = Image.fromarray(pictures[at + ms // 200])
+        others = [other for _, other in frames if other is not frame]
+        assert difference(frame, same) < min(difference(other, same) for other in others)
+        at += ms // 100
+
+
+def test_film_goes_over_every_split_of_a_folder_and_says_what_is_known(answer, tmp_path, wrists):
+    run_id = tracked(tmp_path, "projection=zy", agent=GUESSER, **ON_FILES)
+    code, printed, errors = answer(run_id, "--data=wrists", "--episodes=1", "--out=elsewhere/films")
+    assert (code, errors) == (0, "")
+    assert "note: the agent was trained on these volumes: " in printed
+    assert [label for label, *_ in EPISODE.findall(printed)] == ["train split", "validation split", "test split"]
+    assert {file.suffix for file in (tmp_path / "elsewhere" / "films").iterdir()} == {".gif", ".mp4"}
+
+
+def test_baseline_is_filmed_without_a_store(answer, tmp_path):
+    words = [*GUESSER_OF_ANYTHING, "--data=phantom", "--phantoms=2", "--max-steps=2"]
+    code, printed, errors = answer(*words)
+    assert (code, errors) == (0, "")
+    assert [volume for _, volume, *_ in EPISODE.findall(printed)] == [
+        *("phantom-3000000", "phantom-3000001", "phantom-3000000")
+    ]
+    assert {file.name for file in (tmp_path / "films").iterdir()} == {"sac-phantom-seed0.gif", "sac-phantom-seed0.mp4"}
+    assert not (tmp_path / "mlruns.db").exists()
+
+
+def test_video_answers_mistakes_in_one_line(answer, tmp_path):
+    run_id = tracked(tmp_path)
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    experiment_id = client.get_run(run_id).info.experiment_id
+    evaluation = client.create_run(experiment_id, tags={"evaluation.of": run_id}).info.run_id
+    (tmp_path / "file").write_text("mine")
+    run = run_id
+    for words, line in (
+        ([], "give one RUN, or --agent NAME"),
+        (["ffffffff"], "the run is 'ffffffff', but no run of sqlite:///"),
+        ([evaluation], f"run is '{evaluation}', but that is an evaluation, of {run_id}"),
+        ([run, "--episodes=0"], "Invalid value for '--episodes': 0 is not in the range x>=1."),
+        ([run, "--data=/nowhere"], "--data is '/nowhere', but there is no such folder: it must be "),
+        ([run, "--tracking=sqlite:///no.db"], "tracking.uri is 'sqlite:///no.db', but there is no "),
+        ([run, "--tracking-experiment=x"], "--tracking-experiment is for --agent without --video"),
+        (
+            ["--agent=sac", "tracking.experiment=x"],
+            "tracking.experiment is for armscan run, and not read here: give --tracking-experiment NAME",
+        ),
+        (["--agent=sac", *FEW], "sac has to be trained first: give the RUN that has trained one"),
+        ([run, "--out=file"], "--out is 'file', but no video can be written there: "),
+        ([run, "--out=/proc/films"], "--out is '/proc/films', but no video can be written there: "),
+        ([run, "--success-threshold=7"], "Invalid value for '--success-threshold': 7.0 is not in the range 0<x<=1."),
+    ):
+        code, _, errors = answer(*words)
+        assert code == 2, words
+        assert errors.startswith(f"error: {line}"), (words, errors)
+        assert len(errors.splitlines()) == 1, errors
+    assert not (tmp_path / "films").exists()
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_checkpoints_that_are_gone_or_damaged_or_anothers_are_refused(answer, tmp_path):
+    run_id = tracked(tmp_path, kept=("config.yaml", "volumes.json"))
+    assert answer(run_id)[2].startswith(f"error: run {run_id} has kept no checkpoint, so that there is nothing")
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    weights, facts = load_checkpoint(tmp_path / "best.pt")
+    whole = (tmp_path / "best.pt").read_bytes()
+    for change, line in (
+        (lambda file: file.write_bytes(whole[: len(whole) // 2]), "best.pt: is damaged"),
+        (lambda file: file.write_bytes(whole.replace(b"0", b"1")), "best.pt: is damaged"),
+        (lambda file: save_checkpoint(file, weights, facts | {"run_id": "5f"}), "best.pt: is a checkpoint of run '5f'"),
+    ):
+        change(tmp_path / "best.pt")
+        client.log_artifact(run_id, str(tmp_path / "best.pt"))
+        code, _, errors = answer(run_id)
+        assert code == 2
+        assert errors.startswith(f"error: run {run_id}: {line}")
+    assert not (tmp_path / "films").exists()

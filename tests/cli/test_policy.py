@@ -1,0 +1,277 @@
+"""The command that exports and registers policies, as a person types it, on real tracked runs."""
+
+import json
+import logging
+import shutil
+from functools import partial
+
+import mlflow.pyfunc
+import numpy as np
+import pytest
+from mlflow import MlflowClient
+
+from armscan.policies.build import SUM_TAG
+from armscan.policies.model import model_sha256
+from armscan.runs.model_card import MAX_CHARS
+from armscan.tracking import EVALUATED_TAG
+from armscan.training import load_checkpoint, save_checkpoint
+from armscan.utils.files import BEST_CHECKPOINT
+from tests.cli.test_evaluate import GUESSER, IMAGES, tracked
+from tests.test_run import runs_in
+from tests.training.test_train import evaluation_of
+
+EXPORT, REGISTER = ("export", "--out=new"), ("register", "--name=n")
+
+
+@pytest.fixture
+def answer(armscan, tmp_path, monkeypatch):
+    """Runs `armscan policy`; returns its exit code and what it printed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlruns.db")
+    return partial(armscan, "policy")
+
+
+def store_of(folder):
+    return MlflowClient(f"sqlite:///{folder}/mlruns.db")
+
+
+@pytest.mark.parametrize(
+    "words", [["projection=zy", "agent.deterministic_eval=false", "compute.precision=bfloat16"], ["obs=slice", *IMAGES]]
+)
+def test_policy_of_an_earlier_run_is_exported_from_its_checkpoint(answer, tmp_path, words):
+    run_id = tracked(tmp_path, *words)
+    assert answer("export", run_id[:8], "--out=models/mine") == (
+        0,
+        "exported   models/mine\n"
+        "load it    mlflow.pyfunc.load_model('models/mine').predict(observations)\n"
+        "serve it   mlflow models serve -m models/mine --env-manager local\n",
+        "",
+    )
+    model = mlflow.pyfunc.load_model("models/mine")
+    answers = model.predict(model.input_example)
+    assert answers.shape == (2, 2 if "projection=zy" in words else 1)
+    assert np.abs(answers).max() <= 1
+    said = model.metadata.metadata
+    # As the network itself answers, with all of its bits.
+    assert (said["run"], said["differs_from_agent"]) == (run_id, None)
+    assert (tmp_path / "models" / "mine" / "policy.onnx").stat().st_size > 1000
+    # A model of ours is replaced.
+    assert answer("export", run_id, "--out=models/mine")[0] == 0
+    assert [path.name for path in (tmp_path / "models").iterdir()] == ["mine"]
+    # What else lies in its folder is not.
+    (tmp_path / "models" / "mine" / "notes.txt").write_text("precious")
+    assert answer("export", run_id, "--out=models/mine") == (
+        2,
+        "",
+        "error: --out is 'models/mine', but 'notes.txt' is in it, and would be lost: name another",
+    )
+    assert (tmp_path / "models" / "mine" / "notes.txt").read_text() == "precious"
+
+
+def test_policy_is_registered_with_the_figures_of_its_run(answer, armscan, tmp_path):
+    run_id = tracked(tmp_path)
+    code, printed, errors = answer("register", run_id, "--name=wrist plane")
+    assert (code, errors) == (0, "")
+    assert printed.splitlines() == [
+        "registered models:/wrist plane/1",
+        f"its store  export MLFLOW_TRACKING_URI=sqlite:///{tmp_path}/mlruns.db",
+        "load it    mlflow.pyfunc.load_model('models:/wrist plane/1').predict(observations)",
+        "serve it   mlflow models serve -m 'models:/wrist plane/1' --env-manager local",
+    ]
+    client = store_of(tmp_path)
+    first = client.get_model_version("wrist plane", "1")
+    assert first.run_id == run_id
+    assert f"`armscan evaluate {run_id}" in first.description
+    assert first.tags == {}
+    assert client.get_run(run_id).data.tags["policy"] == "kept"
+    models = [mlflow.pyfunc.load_model(uri) for uri in ("models:/wrist plane/1", f"runs:/{run_id}/policy")]
+    np.testing.assert_array_equal(*(model.predict(model.input_example) for model in models))
+
+    contents = {"test volumes": evaluation_of(2, 4).to_dict()}
+    (tmp_path / "evaluation.json").write_text(json.dumps(contents))
+    client.log_artifact(run_id, str(tmp_path / "evaluation.json"))
+    made_at = client.get_run(run_id).info.end_time
+    assert answer("register", run_id, "--name=wrist plane")[0] == 0
+    second = client.get_model_version("wrist plane", "2")
+    assert "### at the end of the run\n\n| metrics, with 95 % intervals | test volumes |" in second.description
+    assert "| mean steps | 3.00 (2.00–4.00) |" in second.description
+    assert second.tags["test_volumes/mean_steps"] == "3"
+    assert second.source == first.source
+    assert client.get_run(run_id).info.end_time == made_at
+
+    assert armscan("evaluate", run_id, "--episodes=2", "--success-threshold=0.2")[0] == 0
+    (child,) = [run for run in runs_in(tmp_path)[1] if run.info.run_id != run_id]
+    assert answer("register", run_id, "--name=wrist plane")[0] == 0
+    third = client.get_model_version("wrist plane", "3")
+    assert f"### by evaluation {child.info.run_id}, on own volumes, success_threshold=0.2\n" in third.description
+    assert "### at the end of the run" in third.description
+    assert len(third.description) <= MAX_CHARS
+    assert {"test_volumes/success_rate", "training_volumes/success_rate"} <= third.tags.keys()
+
+
+def test_bad_words_are_answered_in_one_line_and_change_nothing(answer, tmp_path):
+    run_id = tracked(tmp_path)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.txt").write_text("precious")
+    (tmp_path / "file").write_text("precious")
+    run, out, name = run_id, "--out=new", "--name=n"
+    before = sorted(path.name for path in tmp_path.iterdir())
+    words_and_lines = [
+        (["delete", run], "No such command 'delete'."),
+        (["export"], "Missing argument 'RUN'."),
+        (["export", run, run, out], f"Got unexpected extra argument ({run})"),
+        (["export", run], "Missing option '--out'."),
+        (["register", run], "Missing option '--name'."),
+        (["export", run, out, name], "No such option '--name'."),
+        (["export", run, "--out="], "Invalid value for '--out': a path is required."),
+        (["export", run, out, "--tracking="], "Invalid value for '--tracking': an address is required."),
+        (["export", "nobody", out], "the run is 'nobody', but it must be an id"),
+        (["export", "0" * 32, out], f"the run is '{'0' * 32}', but no run of"),
+        (["export", run, out, "--tracking=sqlite:///none.db"], "tracking.uri is 'sqlite:///none.db', but there is no"),
+        (["export", run, "--out=other"], "--out is 'other', but something else is there, and would be lost"),
+        (["export", run, "--out=file"], "--out is 'file', but something else is there, and would be lost"),
+        (["export", run, "--out=file/in/it"], "file/in/it: the model cannot be written (Not a directory)"),
+        *(
+            (["register", run, f"--name={bad}"], f"--name is '{bad}', but it must be a text")
+            for bad in ("a/b", "a:b", "..", " ", "")
+        ),
+        (["register", run, f"--name={'a' * 257}"], "--name is 'aaa"),
+        (["register", "0" * 32, name], f"the run is '{'0' * 32}', but no run of"),
+    ]
+    for words, line in words_and_lines:
+        code, _, errors = answer(*words)
+        assert (code, len(errors.splitlines())) == (2, 1), (words, errors)
+        assert errors.startswith(f"error: {line}"), (words, errors)
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+    assert store_of(tmp_path).search_registered_models() == []
+    assert "policy" not in {file.path for file in store_of(tmp_path).list_artifacts(run_id)}
+
+
+def test_run_without_a_policy_is_refused(answer, tmp_path):
+    baseline = tracked(tmp_path, agent=GUESSER)
+    evaluation = tracked(tmp_path)
+    store_of(tmp_path).set_tag(evaluation, EVALUATED_TAG, baseline)
+    unfinished = tracked(tmp_path, kept=("config.yaml", "volumes.json"))
+    lines = {
+        baseline: f"run is '{baseline}', but its agent does not learn and has no policy",
+        evaluation: f"run is '{evaluation}', but that is an evaluation, of {baseline}",
+        unfinished: f"run {unfinished} has kept no checkpoint",
+    }
+    for words in EXPORT, REGISTER:
+        for run_id, line in lines.items():
+            assert answer(*words, run_id)[2].startswith(f"error: {line}")
+    assert not (tmp_path / "new").exists()
+    assert store_of(tmp_path).search_registered_models() == []
+
+
+def test_damaged_checkpoint_is_told_and_changes_nothing(answer, tmp_path):
+    run_id = tracked(tmp_path)
+    file, client = tmp_path / BEST_CHECKPOINT, store_of(tmp_path)
+    weights, facts = load_checkpoint(file)
+    whole = file.read_bytes()
+    damages = {
+        "best.pt: is damaged: its contents are not those that were written": whole[: len(whole) // 2],
+        "best.pt: is empty": b"",
+        "best.pt: is no checkpoint of armscan": b"nonsense",
+    }
+    for line, contents in damages.items():
+        file.write_bytes(contents)
+        client.log_artifact(run_id, str(file))
+        assert answer(*EXPORT, run_id)[2].startswith(f"error: run {run_id}: {line}")
+    save_checkpoint(file, {"other": next(iter(weights.values()))}, facts)
+    client.log_artifact(run_id, str(file))
+    assert answer(*REGISTER, run_id)[2].startswith(f"error: run {run_id}: the checkpoint is another agent's")
+    assert not (tmp_path / "new").exists()
+    assert client.search_registered_models() == []
+    assert "policy" not in {file.path for file in client.list_artifacts(run_id)}
+
+
+def registered(answer, folder, *words):
+    """A run whose policy is registered: its id, and the folder of the model among its artifacts."""
+    run_id = tracked(folder, *words)
+    assert answer("register", run_id, "--name=n")[0] == 0
+    return run_id, folder / "artifacts" / run_id / "artifacts" / "policy"
+
+
+def versions_in(folder):
+    return [version.run_id for version in store_of(folder).search_model_versions("name='n'")]
+
+
+def test_policy_of_another_run_is_not_registered_in_the_place_of_the_kept_one(answer, tmp_path):
+    run_id, model = registered(answer, tmp_path)
+    _, another = registered(answer, tmp_path, "projection=zy")
+    before, whole = versions_in(tmp_path), tmp_path / "whole"
+    shutil.copytree(model, whole)
+    line = f"error: run {run_id}: its policy/ is not the one that it has kept: changed, or another run's; remove it "
+
+    def is_refused():
+        code, _, errors = answer("register", run_id, "--name=n")
+        return code == 2 and errors.startswith(line) and len(errors.splitlines()) == 1
+
+    for name in ("artifacts/policy.pt2", "policy.onnx", "MLmodel"):
+        shutil.copy(another / name, model / name)
+        assert is_refused(), name
+        shutil.copy(whole / name, model / name)
+    (model / "artifacts" / "policy.pt2").unlink()
+    assert is_refused()
+    shutil.copytree(another, model, dirs_exist_ok=True)
+    assert is_refused()
+    store_of(tmp_path).set_tag(run_id, SUM_TAG, model_sha256(model))
+    assert is_refused()
+    assert versions_in(tmp_path) == before
+
+    # As earlier versions have left it: nothing says that it is the one that was kept.
+    store_of(tmp_path).delete_tag(run_id, SUM_TAG)
+    assert answer("register", run_id, "--name=n")[0] == 0
+    assert mlflow.pyfunc.load_model("models:/n/3").metadata.metadata["run"] == run_id
+    assert store_of(tmp_path).get_run(run_id).data.tags[SUM_TAG] == model_sha256(model)
+
+
+def test_model_that_does_not_answer_is_not_registered_and_only_one_line_told(answer, tmp_path, caplog):
+    run_id, model = registered(answer, tmp_path)
+    program = model / "artifacts" / "policy.pt2"
+    program.write_bytes(program.read_bytes()[:1000])
+    store_of(tmp_path).set_tag(run_id, SUM_TAG, model_sha256(model))
+    torchs = logging.getLogger("torch.export")
+    torchs.addHandler(caplog.handler)
+    try:
+        code, _, errors = answer("register", run_id, "--name=n")
+    finally:
+        torchs.removeHandler(caplog.handler)
+    assert code == 2
+    assert errors.startswith(f"error: run {run_id}: its policy/ is damaged, it does not answer its own example: ")
+    assert len(errors.splitlines()) == 1
+    assert [record for record in caplog.records if record.name == "torch.export"] == []
+    assert len(versions_in(tmp_path)) == 1
+
+
+def test_policy_is_not_registered_with_a_damaged_evaluation(answer, tmp_path):
+    run_id, model = registered(answer, tmp_path)
+    for damaged in ('{"a": 1}', "{}"):
+        (model.parent / "evaluation.json").write_text(damaged)
+        line = f"error: run {run_id}: its evaluation.json is damaged; put it back, or remove it"
+        assert answer("register", run_id, "--name=n") == (2, "", line)
+    assert len(versions_in(tmp_path)) == 1
+
+
+@pytest.mark.parametrize(
+    ("part", "beginning"),
+    [
+        ("", "the artifacts of runs lie in "),
+        # Which is met when the model is there already.
+        ("{run_id}/artifacts", "tracking.uri is 'sqlite:///"),
+    ],
+    ids=["all", "the run's"],
+)
+def test_policy_is_not_registered_where_artifacts_are_read_only(answer, tmp_path, made_read_only, part, beginning):
+    run_id = tracked(tmp_path)
+    with made_read_only(tmp_path / "artifacts" / part.format(run_id=run_id)):
+        code, printed, errors = answer("register", run_id, "--name=n")
+    assert (code, printed) == (2, "")
+    assert errors.startswith(f"error: {beginning}{tmp_path}/")
+    assert errors.endswith(": Read-only file system")
+    assert len(errors.splitlines()) == 1
+    client = store_of(tmp_path)
+    assert client.search_registered_models() == []
+    assert not {"policy", SUM_TAG} & client.get_run(run_id).data.tags.keys()
+    assert "policy" not in {file.path for file in client.list_artifacts(run_id)}

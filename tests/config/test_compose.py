@@ -1,0 +1,67 @@
+"""Every choice of every configuration group can be composed, and makes an environment."""
+
+import numpy as np
+import pytest
+from hydra.utils import instantiate
+
+from armscan.config.compose import compose
+from armscan.config.sources import config_folder
+from armscan.experiment.build import build_experiment
+
+
+def choices(group):
+    return sorted(path.stem for path in (config_folder() / group).glob("*.yaml"))
+
+
+def one_env(volume, *overrides):
+    config = compose(overrides)
+    return instantiate(config.env, _convert_="object").fitted_to({volume.name: volume}).one([volume])
+
+
+@pytest.mark.parametrize("reward", choices("reward"))
+@pytest.mark.parametrize("obs", choices("obs"))
+def test_conf_composes_every_observation_and_reward(phantom, obs, reward):
+    # A phantom's labelled plane shows four bones and three tendons.
+    env = one_env(phantom, f"obs={obs}", f"reward={reward}", "env.success_threshold=0.5")
+    observed, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observed)
+
+
+WHOLE = [f"agent={agent}" for agent in choices("agent")] + [f"experiment={name}" for name in choices("experiment")]
+
+
+@pytest.mark.parametrize("override", WHOLE)
+def test_conf_composes_every_agent_and_experiment(override):
+    # The phantoms are few, so that this is quick; what an experiment says of them is said before.
+    # A reward that is fitted to one wrist alone would not take the labelled plane of another.
+    few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1", "env.success_threshold=0.5"]
+    experiment = build_experiment(compose([override, *few]))
+    env = experiment.maker.one(experiment.split.test)
+    observation, info = env.reset(seed=0)
+    experiment.agent.begin(seed=0, bounds=env.get_wrapper_attr("scene").bounds)
+    action = experiment.agent.act(observation, info["reward"])
+    assert action.shape == env.action_space.shape
+    assert np.abs(action).max() <= 1.0
+
+
+@pytest.mark.parametrize("clustering", ["pixels", "metric"])
+@pytest.mark.parametrize("wrappers", [["stack=3"], ["memory=2"], ["stack=2", "memory=3", "stack_memory=true"]], ids=str)
+def test_conf_composes_wrappers_and_clusterings(phantom, wrappers, clustering):
+    env = one_env(phantom, *wrappers, f"env.clustering={clustering}", "projection=[rz,ty]")
+    assert env.observation_space.contains(env.reset(seed=0)[0])
+
+
+def test_conf_takes_any_combination_of_observations(phantom):
+    env = one_env(phantom, "env.observation=[slice,cluster,slice_channels]", "stack=2", "stack_exclude=[slice]")
+    assert list(env.observation_space) == ["action", "channels", "clusters", "reward", "slice"]
+    assert env.observation_space["slice"].shape == (360, 80)
+    assert env.observation_space["channels"].shape == (2, 3, 360, 80)
+
+
+def test_conf_fits_the_reward_to_the_volumes_that_are_trained_on(dataset):
+    first, second = list(dataset.values())[:2]
+    maker = instantiate(compose(["reward=agreement", "env.success_threshold=0.5"]).env, _convert_="object")
+    rewards = [maker.fitted_to({volume.name: volume}).one([first]).unwrapped.rules.reward for volume in (first, second)]
+    landmarks = np.array([[4, 3000, 180, 40], [3, 1000, 180, 45], [1, 100, 190, 50]], dtype=float)
+    scores = [reward.score(landmarks, first.pixel_mm) for reward in rewards]
+    assert scores[0] != scores[1]

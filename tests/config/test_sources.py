@@ -1,0 +1,77 @@
+"""One's own configurations in the working folder, before armscan's own."""
+
+from pathlib import Path
+
+import pytest
+from hydra.errors import MissingConfigException
+
+from armscan.config.compose import compose
+from armscan.config.defaults import default_tracking
+from armscan.config.sources import own_folders, sweeps_folder, working_folder
+
+REPOSITORY = Path(__file__).parents[2]
+MINE = "# @package _global_\n# One of my own.\ndefaults:\n  - /study/base\n  - _self_\nstudy:\n  name: mine\n"
+
+
+@pytest.fixture
+def working(tmp_path, monkeypatch):
+    """Writes files into an empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PWD", str(tmp_path))
+
+    def write(**files):
+        for name, text in files.items():
+            path = tmp_path / f"{name.replace('__', '/')}.yaml"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        return tmp_path
+
+    return write
+
+
+def test_directory_is_called_as_its_user_calls_it_where_that_is_where_it_is(tmp_path, monkeypatch):
+    called = tmp_path / "home"
+    called.symlink_to(tmp_path)
+    monkeypatch.chdir(called)
+    monkeypatch.setenv("PWD", str(called))
+    assert working_folder() == called
+    monkeypatch.setenv("PWD", "/")
+    assert working_folder() == tmp_path
+
+
+def test_study_of_the_working_folder_is_found_by_its_name(working, capsys):
+    working(sweeps__mine=MINE)
+    assert compose(["sweep=mine", "study.n_trials=3"]).study.name == "mine"
+    assert compose(["sweep=sac_y"]).study.name == "sac_y"
+    with pytest.raises(MissingConfigException) as raised:
+        compose(["sweep=foo"])
+    assert {"mine", "sac_y"} < set(raised.value.options)
+    assert capsys.readouterr().err == ""
+
+
+def test_groups_of_the_working_folder_are_found_beside_those_of_armscan(working):
+    working(conf__agent__mine="defaults: [sac, _self_]\nlr: 0.5\n", conf__mine__a="value: 1\n", conf__sweep__other=MINE)
+    config = compose(["agent=mine", "+mine=a"])
+    assert (config.agent.lr, config.agent._target_, config.mine.value) == (0.5, "armscan.agents.SAC", 1)
+    assert compose(["sweep=other"]).study.name == "mine"
+
+
+def test_own_file_replaces_that_of_the_same_name_and_one_line_says_so(working, capsys):
+    folder = working(sweeps__sac_y=MINE, conf__tracking__mlflow="uri: sqlite:///mine.db\n")
+    assert compose(["sweep=sac_y"]).study.name == "mine"
+    assert default_tracking() == {"uri": "sqlite:///mine.db"}
+    compose()
+    said = "using ./conf/tracking/mlflow.yaml, ./sweeps/sac_y.yaml instead of armscan's own\n"
+    assert capsys.readouterr().err == said
+    # A copy is not worth a word.
+    (folder / "conf" / "tracking" / "mlflow.yaml").unlink()
+    (folder / "sweeps" / "sac_y.yaml").write_bytes((sweeps_folder() / "sac_y.yaml").read_bytes())
+    assert compose(["sweep=sac_y"]).study.name == "sac_y"
+    assert capsys.readouterr().err == ""
+
+
+def test_nothing_is_found_twice_in_the_checkout(monkeypatch, capsys):
+    monkeypatch.chdir(REPOSITORY)
+    assert own_folders() == {}
+    assert compose(["sweep=sac_y"]).study.name == "sac_y"
+    assert capsys.readouterr().err == ""

@@ -1,0 +1,83 @@
+"""What a configuration describes, built."""
+
+from dataclasses import replace
+
+import pytest
+
+from armscan.config.compose import compose
+from armscan.envs import SliceObservation
+from armscan.errors import InvalidValueError
+from armscan.experiment.build import build_experiment
+from armscan.experiment.setup import RunSetup
+from armscan.training import Split
+
+
+def split_of_sizes(volume):
+    """A split whose test volume is narrower than the others."""
+    return Split(
+        {"a": replace(volume, name="a")},
+        {"b": replace(volume, name="b")},
+        {"c": replace(volume, name="c", labels=volume.labels[:-24])},
+    )
+
+
+class AsLargeAsTheSlice(SliceObservation):
+    """One's own, without a crop that could be the same everywhere."""
+
+    def __init__(self):
+        super().__init__()
+
+
+def config_of_sizes(phantom, monkeypatch, *overrides):
+    """The configuration with volumes of which that of the test is narrower."""
+    monkeypatch.setattr("armscan.training.phantom_data", lambda **_: split_of_sizes(phantom))
+    return compose(overrides)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["obs=slice", "obs.shape=null"],
+        ["obs=slice", "obs.shape=[40,36]"],
+        ["env.observation=slice"],
+        ["env.observation=[slice_channels,slice]"],
+    ],
+    ids=str,
+)
+def test_build_crops_images_of_all_splits_alike(phantom, overrides, monkeypatch):
+    experiment = build_experiment(config_of_sizes(phantom, monkeypatch, *overrides))
+    volumes = (experiment.split.training, experiment.split.validation, experiment.split.test)
+    frames = [experiment.maker.one(each).unwrapped.rules._observation for each in volumes]
+    assert {frame.observations[0]._frame.crop for frame in frames} == {(336, 80)}
+    spaces = [experiment.maker.one(each).observation_space for each in volumes]
+    assert spaces[0] == spaces[1] == spaces[2]
+
+
+def test_stage_refuses_volumes_that_an_observation_is_of_another_shape_on(phantom, monkeypatch):
+    own = "env.observation={_target_: tests.experiment.test_build.AsLargeAsTheSlice}"
+    config = config_of_sizes(phantom, monkeypatch, own)
+    with pytest.raises(InvalidValueError, match=r"part 'slice' has the shape \(360, 80\), but .* \(336, 80\)"):
+        RunSetup.build(config)
+
+
+class Unfinished:
+    """An algorithm of one's own, and its agent, which learns but gives no policy."""
+
+    def agent(self, setup):
+        return self
+
+    def begin(self, *, seed, bounds):
+        pass
+
+    def act(self, observation, reward):
+        return [0.0]
+
+    def learn(self, n_env_steps):
+        return {}
+
+
+def test_build_refuses_an_agent_that_learns_but_lacks_what_training_needs(phantom, monkeypatch):
+    config = config_of_sizes(phantom, monkeypatch)
+    config.agent = {"_target_": "tests.experiment.test_build.Unfinished"}
+    with pytest.raises(InvalidValueError, match=r"agent is Unfinished, which learns, .* has no .*policy.* or weights"):
+        build_experiment(config)

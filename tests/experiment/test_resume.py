@@ -1,0 +1,363 @@
+"""Runs that are killed, at any moment, and go on: real processes, ended by the system's own kill -9."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from mlflow import MlflowClient
+
+import armscan
+from armscan.errors import FolderInUseError
+from armscan.experiment.job import GRID_TAG
+from armscan.tracking import open_store
+from armscan.training import load_checkpoint
+from armscan.utils.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, atomic_write, folder_lock
+from tests.support.waiting import HANG_S, wait_until
+from tests.test_run import SMALL, TIMES, armscan_run, job_process_ids, runs_in
+
+LONGER = [*SMALL, "training.env_steps=1000", "training.solved=null"]
+PPO = [*(each for each in LONGER if not each.startswith("agent.learning_starts")), "agent=ppo", "agent.num_envs=4"]
+PPO += ["agent.env_steps_per_collection=100"]
+IMAGES = [*(each for each in LONGER if not each.startswith("network")), "obs=slice_channels", "obs.shape=[36,36]"]
+IMAGES += ["network=multimodal", "network.filters=[2,2,2]", "network.vector_sizes=[8]", "network.head_sizes=[8]"]
+TWO = ("00001_labels.nii.gz", "00002_labels.nii.gz")
+COMMAND = ["-m", "armscan.run"]
+# The same, but every checkpoint stays unfinished for a while.
+SLOWLY_WRITTEN = """
+import sys, time, torch
+save = torch.save
+def save_slowly(contents, file):
+    save(contents, file)
+    file.flush()
+    time.sleep(0.4)
+torch.save = save_slowly
+from armscan.run import main
+sys.exit(main())
+"""
+SLOWLY = ["-c", SLOWLY_WRITTEN]
+
+
+def killed(moment, *arguments, cwd, program=COMMAND):
+    """Starts the command and kills it as soon as `moment` has come, given what it has printed."""
+    with (cwd / "printed").open("w") as printed:
+        process = subprocess.Popen(
+            [sys.executable, *program, *arguments], cwd=cwd, stdout=printed, stderr=subprocess.STDOUT
+        )
+    printed = cwd / "printed"
+    wait_until(lambda: moment(printed.read_text()), process=process, log=printed.read_text, poll_s=0.01)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+
+
+def after_epochs(n):
+    return lambda printed: printed.count("/1000 steps") >= n
+
+
+def unfinished(folder):
+    return list(folder.glob("outputs/*/*/.*.unfinished"))
+
+
+def finish(run_id, cwd):
+    ended = armscan_run(f"resume={run_id}", cwd=cwd)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr == ""
+    return ended.stdout
+
+
+def named_tensors(tree, name=""):
+    if isinstance(tree, torch.Tensor):
+        return {name: tree}
+    parts = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list | tuple) else []
+    return {key: tensor for part, tree in parts for key, tensor in named_tensors(tree, f"{name}/{part}").items()}
+
+
+def figures(client, run):
+    """The history of every figure but the times, which no two runs share."""
+    names = [name for name in run.data.metrics if not name.startswith(TIMES)]
+    return {name: [(p.step, p.value) for p in client.get_metric_history(run.info.run_id, name)] for name in names}
+
+
+def assert_ended_alike(cwd):
+    """Checks that the two runs of a store have the same figures, none twice, and the same weights bit for bit."""
+    client, runs = runs_in(cwd)
+    assert [run.info.status for run in runs] == ["FINISHED"] * 2
+    first, second = (figures(client, run) for run in runs)
+    assert first == second
+    assert len(first["validation/mean_return"]) >= 4
+    for run in runs:
+        for name in run.data.metrics:
+            steps = [point.step for point in client.get_metric_history(run.info.run_id, name)]
+            assert len(steps) == len(set(steps)), name
+        wall_s = [point.value for point in client.get_metric_history(run.info.run_id, "wall_s")]
+        assert wall_s == sorted(wall_s)
+    folders = [Path(run.data.tags["folder"]) for run in runs]
+    for file in ("best.pt", "last.pt"):
+        one, other = (named_tensors(load_checkpoint(folder / file)[0]) for folder in folders)
+        assert one.keys() == other.keys()
+        assert all(torch.equal(one[name], other[name]) for name in one), file
+    artifacts = [{file.path for file in client.list_artifacts(run.info.run_id)} for run in runs]
+    assert artifacts[0] == artifacts[1]
+    assert not unfinished(cwd)
+
+
+@pytest.mark.full
+def test_run_killed_while_it_writes_a_checkpoint_goes_on_and_ends_as_if_it_had_not_been(tmp_path):
+    killed(lambda printed: after_epochs(1)(printed) and unfinished(tmp_path), *LONGER, cwd=tmp_path, program=SLOWLY)
+    assert unfinished(tmp_path)
+    (run,) = runs_in(tmp_path)[1]
+    assert run.info.status == "RUNNING"
+    printed = finish(run.info.run_id[:10], tmp_path)
+    assert "of them taken" in printed
+    assert printed.count("/1000 steps") < 5
+    assert len(list(tmp_path.glob("outputs/*/*"))) == 1
+    assert armscan_run(*LONGER, cwd=tmp_path).returncode == 0
+    assert_ended_alike(tmp_path)
+    again = armscan_run(f"resume={run.info.run_id}", cwd=tmp_path)
+    assert (again.returncode, again.stdout) == (2, "")
+    assert again.stderr == f"error: run {run.info.run_id} has finished: there is nothing to resume\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arguments", [LONGER, PPO, IMAGES], ids=["sac", "ppo", "images"])
+def test_run_killed_again_and_again_ends_as_if_it_had_not_been(tmp_path, arguments):
+    drawn = random.Random(7)
+
+    def soon_after(begun):
+        """A moment up to half a second after something was printed."""
+        due_s = []
+
+        def moment(printed):
+            if begun(printed) and not due_s:
+                due_s.append(time.monotonic() + drawn.uniform(0.0, 0.5))
+            return due_s and time.monotonic() > due_s[0]
+
+        return moment
+
+    # First before there is a checkpoint, then twice after epochs, and once while a checkpoint is written.
+    killed(lambda printed: "training for" in printed, *arguments, cwd=tmp_path)
+    (run,) = runs_in(tmp_path)[1]
+    word = f"resume={run.info.run_id}"
+    for _ in range(2):
+        killed(soon_after(after_epochs(1)), word, cwd=tmp_path)
+    killed(lambda _: unfinished(tmp_path), word, cwd=tmp_path, program=SLOWLY)
+    finish(run.info.run_id, tmp_path)
+    assert runs_in(tmp_path)[1][0].data.tags["resumed"] == "4"
+    assert armscan_run(*arguments, cwd=tmp_path).returncode == 0
+    assert_ended_alike(tmp_path)
+
+
+@pytest.mark.slow
+def test_interrupted_run_says_how_to_go_on_and_only_one_process_may(tmp_path):
+    with (tmp_path / "printed").open("w") as printed:
+        process = subprocess.Popen(
+            [sys.executable, *COMMAND, *LONGER, "training.env_steps=5000"],
+            cwd=tmp_path,
+            stdout=printed,
+            stderr=subprocess.STDOUT,
+        )
+    wait_until(lambda: (tmp_path / "printed").read_text().count("/5000 steps") >= 2, process=process)
+    (run,) = runs_in(tmp_path)[1]
+    # Still at work, and not done before the other has started.
+    process.send_signal(signal.SIGSTOP)
+    beside = armscan_run(f"resume={run.info.run_id}", cwd=tmp_path)
+    assert beside.returncode == 2
+    assert "another process is at work in this folder" in beside.stderr
+    assert len(beside.stderr.splitlines()) == 1
+    process.send_signal(signal.SIGCONT)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(HANG_S) == 130
+    assert f"resume with: python -m armscan.run resume={run.info.run_id}\n" in (tmp_path / "printed").read_text()
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    ended = armscan_run(f"resume={run.info.run_id}", f"tracking.uri=sqlite:///{tmp_path}/mlruns.db", cwd=elsewhere)
+    assert ended.returncode == 0, ended.stderr
+    assert not list(elsewhere.iterdir())
+    (run,) = runs_in(tmp_path)[1]
+    assert run.info.status == "FINISHED"
+    assert "failure" not in run.data.tags
+
+
+@pytest.mark.slow
+def test_killed_job_of_a_multirun_is_resumed_by_its_own_id(tmp_path):
+    command = [
+        sys.executable,
+        *COMMAND,
+        "-m",
+        "seed=0,1",
+        "hydra.launcher.n_jobs=2",
+        *LONGER,
+        "training.env_steps=2000",
+    ]
+    with (tmp_path / "printed").open("w") as printed:
+        process = subprocess.Popen(command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT)
+    wait_until(lambda: (tmp_path / "printed").read_text().count("[0 seed=0] ") >= 4, process=process)
+    os.kill(job_process_ids(process.pid)[0], signal.SIGKILL)
+    assert process.wait(HANG_S) == 1
+    output = (tmp_path / "printed").read_text()
+    client, runs = runs_in(tmp_path)
+    (child,) = [run for run in runs if run.info.status == "FAILED" and "folder" in run.data.tags]
+    assert f"resume job {child.data.tags['job']} with: python -m armscan.run resume={child.info.run_id}" in output
+    parent_id = child.data.tags["mlflow.parentRunId"]
+    finish(child.info.run_id, tmp_path)
+    child = client.get_run(child.info.run_id)
+    assert (child.info.status, child.data.tags["mlflow.parentRunId"]) == ("FINISHED", parent_id)
+
+
+@pytest.fixture
+def cut_off(tmp_path, database):
+    """A run that was cut off before anything was learned; returns its client, id and folder."""
+    client, experiment_id = open_store(
+        database, experiment="armscan", artifacts=str(tmp_path / "mlartifacts"), wait_s=60.0
+    )
+    folder = tmp_path / "outputs" / "run"
+    folder.mkdir(parents=True)
+    (folder / CONFIG_FILE).write_text("seed: 3\n")
+    tags = {
+        "folder": str(folder),
+        "host": "elsewhere",
+        "working_folder": str(tmp_path),
+        "armscan.version": armscan.__version__,
+        "config.sha256": "f3",
+    }
+    return client, client.create_run(experiment_id, name="cut off", tags=tags).info.run_id, folder
+
+
+def refused(answer, *words):
+    code, printed = answer(*words)
+    assert code == 2
+    assert len(printed.splitlines()) == 1
+    return printed
+
+
+@pytest.mark.parametrize("beside", ["seed=1", "-m", "--multirun", "--cfg=job", "tracking.experiment=x", "resume=b"])
+def test_resume_takes_nothing_beside_it(answer, tmp_path, beside):
+    printed = refused(answer, "resume=a", beside)
+    assert beside in printed or "'b'" in printed
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("uri", ["", "tracking.uri=sqlite:///other.db", "tracking.uri="])
+def test_resume_names_a_store_that_is_not_there_and_makes_none(answer, tmp_path, uri):
+    assert refused(answer, "resume=a", *([uri] if uri else [])).startswith("error: tracking.uri is ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_resume_names_a_run_that_is_not_there(answer, cut_off):
+    assert "but no run of " in refused(answer, f"resume={'0' * 31}")
+    assert "must be an id as MLflow shows it" in refused(answer, "resume=")
+    assert "must be an id as MLflow shows it" in refused(answer, "resume='; DROP TABLE runs")
+
+
+def test_resume_refuses_a_configuration_that_was_changed(answer, cut_off):
+    _, run_id, folder = cut_off
+    assert f"{CONFIG_FILE}: is not the configuration that run {run_id} was started" in refused(
+        answer, f"resume={run_id}"
+    )
+    (folder / CONFIG_FILE).unlink()
+    assert f"{CONFIG_FILE}: the run's configuration cannot be read" in refused(answer, f"resume={run_id}")
+
+
+def test_resume_refuses_a_run_whose_folder_is_gone(answer, cut_off):
+    client, run_id, folder = cut_off
+    client.set_tag(run_id, "folder", str(folder / "gone"))
+    printed = refused(answer, f"resume={run_id}")
+    assert f"its folder {folder / 'gone'} is not there; it last ran on the host elsewhere" in printed
+
+
+def test_resume_refuses_a_run_that_is_going_on(answer, cut_off):
+    _, run_id, folder = cut_off
+    with folder_lock(folder):
+        assert f"{folder}: another process is at work in this folder" in refused(answer, f"resume={run_id}")
+
+
+def test_resume_refuses_a_run_of_a_newer_version(answer, cut_off):
+    client, run_id, _ = cut_off
+    client.set_tag(run_id, "armscan.version", "99.1.0")
+    assert f"was made by armscan 99.1.0, but this is {armscan.__version__}" in refused(answer, f"resume={run_id}")
+
+
+def test_resume_names_the_jobs_of_a_grid_that_was_made_before_grids_could_be_resumed(answer, cut_off):
+    client, run_id, _ = cut_off
+    experiment_id = client.get_run(run_id).info.experiment_id
+    parent_id = client.create_run(experiment_id, name="multirun", tags={}).info.run_id
+    client.set_tag(run_id, "mlflow.parentRunId", parent_id)
+    assert refused(answer, f"resume={parent_id}") == (
+        f"error: run {parent_id} is the parent of a multirun, whose jobs are resumed one by one: {run_id}"
+    )
+
+
+def test_resume_refuses_a_grid_that_has_finished(answer, cut_off):
+    client, run_id, _ = cut_off
+    client.set_tag(run_id, GRID_TAG, "[]")
+    client.set_terminated(run_id, "FINISHED")
+    assert f"all jobs of the grid {run_id} have finished" in refused(answer, f"resume={run_id}")
+
+
+def test_resume_refuses_a_run_of_something_else(answer, cut_off):
+    client, run_id, _ = cut_off
+    client.delete_tag(run_id, "folder")
+    assert "it was not started by armscan run" in refused(answer, f"resume={run_id}")
+
+
+def test_resume_refuses_a_checkpoint_that_is_damaged_or_gone_and_leaves_the_run_as_it_is(answer, tmp_path):
+    assert answer(*SMALL)[0] == 0
+    client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path}/mlruns.db")
+    (run,) = runs_in(tmp_path)[1]
+    client.set_terminated(run.info.run_id, "KILLED")
+    last = Path(run.data.tags["folder"]) / LAST_CHECKPOINT
+    contents = last.read_bytes()
+    last.write_bytes(contents[:-1])
+    assert f"{last}: is damaged" in refused(answer, f"resume={run.info.run_id}")
+    last.unlink()
+    assert f"{last}: there is no such checkpoint any more, but run" in refused(answer, f"resume={run.info.run_id}")
+    assert client.get_run(run.info.run_id).info.status == "KILLED"
+    # A run that was killed when all but the closing was done; its figures stand already.
+    last.write_bytes(contents)
+    assert answer(f"resume={run.info.run_id}")[0] == 0
+    assert client.get_run(run.info.run_id).info.status == "FINISHED"
+    assert len(client.get_metric_history(run.info.run_id, "test_volumes/mean_steps")) == 1
+
+
+def test_resume_refuses_other_volumes_where_there_is_no_checkpoint(answer, tmp_path, data_folder):
+    shutil.copytree(data_folder, tmp_path / "wrists")
+    few = [word for word in SMALL if not word.startswith(("agent.", "network", "data."))]
+    assert answer("agent=random", "data=nifti", "data.path=wrists", f"data.test=[{TWO[0]}]", *few)[0] == 0
+    client, (run,) = runs_in(tmp_path)
+    client.set_terminated(run.info.run_id, "KILLED")
+    word, record = f"resume={run.info.run_id}", Path(run.data.tags["folder"]) / VOLUMES_FILE
+    kept = record.read_bytes()
+    record.write_bytes(kept.replace(b"00001_labels", b"00009_labels"))
+    assert f"{record}: is not the record of its volumes that run" in refused(answer, word)
+    record.write_bytes(kept)
+    # Two wrists, each with its plane, exchange their names, and with them the splits.
+    manifest = tmp_path / "wrists" / "optimal_actions.json"
+    entries = json.loads(manifest.read_text())
+    for name, other in (TWO, TWO[::-1]):
+        shutil.copy(data_folder / name, tmp_path / "wrists" / other)
+    manifest.write_text(json.dumps(entries | {TWO[0]: entries[TWO[1]], TWO[1]: entries[TWO[0]]}))
+    line = f"volumes are not those that run {run.info.run_id} was started with: "
+    assert line in refused(answer, word)
+    assert client.get_run(run.info.run_id).info.status == "KILLED"
+
+
+def test_folder_is_free_again_when_its_process_was_killed(tmp_path):
+    program = (
+        "import sys, time; from pathlib import Path; from armscan.utils.files import folder_lock\n"
+        "with folder_lock(Path(sys.argv[1])): print('held', flush=True); time.sleep(900)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    with pytest.raises(FolderInUseError, match="another process"), folder_lock(tmp_path):
+        pass
+    process.kill()
+    process.wait()
+    with folder_lock(tmp_path):
+        atomic_write(tmp_path / "a", lambda file: file.write(b"x"))

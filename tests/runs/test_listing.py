@@ -1,0 +1,202 @@
+"""Runs listed and shown: filters, order, what is folded, what they take of the disk."""
+
+import csv
+import io
+import json
+import re
+import sqlite3
+import time
+
+import pytest
+
+from armscan.runs.tables import format_bytes, format_duration
+
+DAY_S = 86400.0
+
+
+@pytest.fixture
+def aged(tmp_path):
+    """Has a run have been started days ago, and have taken seconds."""
+
+    def change(run_id, *, days=0.0, took_s=60.0):
+        start_ms = round((time.time() - days * DAY_S) * 1000)
+        with sqlite3.connect(tmp_path / "mlruns.db") as database:
+            values = (start_ms, start_ms + round(took_s * 1000), run_id)
+            database.execute("update runs set start_time = ?, end_time = ? where run_uuid = ?", values)
+        return run_id
+
+    return change
+
+
+@pytest.fixture
+def listed(answer):
+    """Returns the names of the runs that a list has, in its order."""
+
+    def names(*words):
+        code, printed, errors = answer("list", "--format=json", *words)
+        assert (code, errors) == (0, "")
+        return [row["name"] for row in json.loads(printed)]
+
+    return names
+
+
+def judged(success_rate, mean_steps):
+    return {"test_volumes/success_rate": success_rate, "test_volumes/mean_steps": mean_steps}
+
+
+@pytest.fixture
+def three(make_run, aged):
+    """Runs of other agents, ages and figures; the last was never judged."""
+    tags = [{"choice.agent": agent, "choice.obs": obs} for agent, obs in (("sac", "slice"), ("ppo", "cluster"))]
+    return [
+        aged(make_run("a", tags=tags[0], figures=judged(0.5, 9.0)), days=1, took_s=30),
+        aged(make_run("b", tags=tags[1], figures=judged(0.9, 12.0)), days=10, took_s=20),
+        aged(make_run("c", tags=tags[1], status="FAILED"), days=40, took_s=90),
+    ]
+
+
+SELECTED = [
+    ([], "abc"),
+    (["--status=failed"], "c"),
+    (["--status=failed,finished"], "abc"),
+    (["--status=running"], ""),
+    (["--agent=ppo"], "bc"),
+    (["--agent=ppo,sac", "--obs=slice"], "a"),
+    (["--projection=zy"], "abc"),
+    (["--projection=[rz,ty]"], ""),
+    (["--since=7d"], "a"),
+    (["--before=1w"], "bc"),
+    (["--since=11d", "--before=12h"], "ab"),
+    (["--since=2000-01-01"], "abc"),
+    (["--before=2000-01-01T12:00"], ""),
+    (["--where=metrics.`test_volumes/success_rate` > 0.6"], "b"),
+    (["--where=tags.`choice.obs` = 'cluster'", "--before=20d"], "c"),
+    (["--sort=started"], "cba"),
+    (["--sort=duration"], "bac"),
+    (["--sort=-duration"], "cab"),
+    (["--sort=success"], "abc"),
+    (["--sort=-success"], "bac"),
+    (["--sort=-steps"], "bac"),
+    (["--sort=-success", "--limit=2"], "ba"),
+    (["--experiment=armscan"], "abc"),
+    (["--experiment=unused"], ""),
+]
+
+
+def test_list_has_what_is_asked_for_in_its_order(three, listed):
+    found = [(words, "".join(listed(*words))) for words, _ in SELECTED]
+    assert found == SELECTED
+
+
+@pytest.fixture
+def family(store, make_run, aged):
+    """A multirun of two jobs, of which one was evaluated; and a run beside it."""
+    client, experiment_id = store
+    parent_id = client.create_run(experiment_id, name="multirun", tags={}).info.run_id
+    client.set_terminated(parent_id)
+    aged(parent_id, days=3)
+    jobs = [aged(make_run(f"job{number}", parent_id=parent_id), days=2 - number) for number in range(2)]
+    tags = {"mlflow.parentRunId": jobs[0], "evaluation.of": jobs[0]}
+    evaluation = client.create_run(experiment_id, name="evaluation", tags=tags).info.run_id
+    client.set_terminated(evaluation)
+    aged(make_run("alone"), days=5)
+    return parent_id, *jobs
+
+
+def test_children_are_folded_into_their_parent_and_unfolded_where_that_is_asked_for(family, listed, answer):
+    parent_id, *_ = family
+    assert listed() == ["multirun", "alone"]
+    assert listed("--children") == ["multirun", "job0", "evaluation", "job1", "alone"]
+    assert listed(f"--parent={parent_id[:8]}") == ["job1", "job0"]
+    # Of a parent that is not meant, the children stand by themselves.
+    assert listed("--where=attributes.run_name LIKE 'job%'") == ["job1", "job0"]
+    rows = json.loads(answer("list", "--format=json")[1])
+    assert [row["below"] for row in rows] == [3, 0]
+    unfolded = json.loads(answer("list", "--format=json", "--children")[1])
+    assert rows[0]["size_bytes"] == sum(row["size_bytes"] for row in unfolded[:-1])
+    assert [row["parent"] for row in unfolded[1:4]] == [parent_id, family[1], parent_id]
+
+
+def test_sizes_are_those_of_the_folder_and_of_the_artifacts(make_run, answer, tmp_path, listed):
+    make_run("small")
+    make_run("large")
+    with (tmp_path / "outputs" / "large" / "last.pt").open("ab") as file:
+        file.write(bytes(500_000))
+    (tmp_path / "outputs" / "small" / "mine.bin").write_bytes(bytes(2_000_000))
+    assert listed("--sort=-size") == ["large", "small"]
+    large, small = json.loads(answer("list", "--sort=-size", "--format=json")[1])
+    assert (
+        small["artifact_bytes"]
+        == large["artifact_bytes"]
+        == sum(file.stat().st_size for file in tmp_path.glob(f"mlartifacts/{small['run_id']}/artifacts/*"))
+    )
+    assert 503_000 < large["folder_bytes"] < 510_000
+    # What is not the run's is not counted: prune would leave it.
+    assert small["folder_bytes"] < 10_000
+
+
+def test_table_fits_eighty_columns_and_csv_has_whole_ids(three, answer):
+    code, table, _ = answer("list")
+    assert code == 0
+    assert max(map(len, table.splitlines())) <= 80
+    assert all(run_id[:8] in table for run_id in three)
+    assert "90%" in table
+    rows = list(csv.DictReader(io.StringIO(answer("list", "--format=csv")[1])))
+    assert [row["run_id"] for row in rows] == three
+    assert (rows[0]["success_rate"], rows[2]["success_rate"]) == ("0.5", "")
+
+
+def test_long_names_stay_whole_and_odd_ones_are_no_markup(make_run, answer):
+    make_run("sac-[bold]-cluster_slice_channels-rz+rx+tx+ty-stack4-memory2-phantom-seed0")
+    table = answer("list")[1]
+    assert max(map(len, table.splitlines())) <= 80
+    name = "".join(line[9:].split(" ")[0] for line in table.splitlines()[1:])
+    assert name == "sac-[bold]-cluster_slice_channels-rz+rx+tx+ty-stack4-memory2-phantom-seed0"
+
+
+def test_show_tells_everything_of_a_run(make_run, store, answer, tmp_path):
+    tags = {"overrides": "agent=sac seed=3", "git.commit": 40 * "a", "something.new": "[red]x"}
+    figures = {"validation/success_rate": 0.75, **judged(0.5, 9.25), "volume/a/success_rate": 0.1}
+    run_id = make_run(tags=tags, figures=figures, status="FAILED")
+    client, experiment_id = store
+    child = client.create_run(experiment_id, name="evaluation: x", tags={"mlflow.parentRunId": run_id}).info.run_id
+    code, printed, errors = answer("show", run_id[:8])
+    assert (code, errors) == (0, "")
+    for told in (
+        *(run_id, "failed after", "no reason", "agent=sac seed=3", 40 * "a", "something.new", "[red]x", child[:8]),
+        *("last validation", "test volumes", "75.0%", "9.25", "best.pt", "1 kB", ".hydra/config.yaml", "evaluation: x"),
+        str(tmp_path / "outputs" / "tiny"),
+        f"resume    python -m armscan.run resume={run_id}\n",
+        f"evaluate  armscan evaluate {run_id}\n",
+        f"record    armscan evaluate {run_id} --video\n",
+    ):
+        assert told in printed
+    assert "volume/a" not in printed
+    client.set_tag(run_id, "command", "python -m armscan.run agent=sac")
+    assert re.search("^command +python -m armscan.run agent=sac", answer("show", run_id)[1], re.MULTILINE)
+
+
+def test_show_of_a_parent_offers_nothing_that_it_cannot_do(family, answer):
+    printed = answer("show", family[0])[1]
+    assert "folder: no folder was noted for it" in printed
+    assert "job0" in printed
+    assert "evaluate " not in printed
+    assert "resume " not in printed
+
+
+def test_sizes_and_times_are_readable():
+    assert [format_bytes(n) for n in (0, 999, 1000, 12_345, 999_400, 999_600, 1.5e9, 2e15)] == [
+        *("0 B", "999 B", "1 kB", "12.3 kB", "999 kB", "1 MB", "1.5 GB", "2e+03 TB")
+    ]
+    assert [format_duration(s) for s in (None, 5, 65, 3605, 100_000)] == ["-", "0:05", "1:05", "1:00:05", "1d 3h"]
+
+
+def test_run_that_goes_on_again_has_no_duration(answer, make_run, store, aged, listed):
+    going_on, ended = aged(make_run("going_on"), took_s=90), aged(make_run("ended"), took_s=30)
+    # As a resumed one says it, whose end MLflow keeps.
+    store[0].update_run(going_on, status="RUNNING")
+    assert store[0].get_run(going_on).info.end_time is not None
+    rows = {row["run_id"]: row["duration_s"] for row in json.loads(answer("list", "--format=json")[1])}
+    assert rows == {going_on: None, ended: 30.0}
+    assert listed("--sort=-duration") == ["ended", "going_on"]
+    assert "running after" not in answer("show", going_on)[1]

@@ -1,0 +1,93 @@
+"""What is told of a registered policy: the latest figures there are, or that a file with figures is damaged."""
+
+import json
+
+import pytest
+
+from armscan.errors import TrackingError
+from armscan.evaluation import EvaluationReport
+from armscan.runs.model_card import Card
+from armscan.tracking import EVALUATED_TAG, TrackedRun, load_run, open_store
+from tests.training.test_train import evaluation_of
+
+OWN = {"test volumes": evaluation_of(2, 4).to_dict()}
+FACTS = {"data": "own volumes", "changes": {"success_threshold": 0.2}}
+BY_COMMAND = EvaluationReport({"test volumes": evaluation_of(6)}, has_total=False, facts=FACTS).to_dict()
+
+
+@pytest.fixture
+def keep(tmp_path, database):
+    """Tracks a run with a file, of a run that it evaluates or of none; returns its id."""
+    store, experiment_id = open_store(database, experiment="test", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
+
+    def kept(name, text, of=None):
+        (tmp_path / name).write_text(text)
+        tags = {EVALUATED_TAG: of} if of else {}
+        with TrackedRun.start(store, experiment_id, name="n", config={}, tags=tags, folder=tmp_path) as run:
+            run.log_files(tmp_path / name)
+        return run.run_id
+
+    return kept
+
+
+def card_of(run_id, tmp_path):
+    folder = tmp_path / "fetched"
+    folder.mkdir(exist_ok=True)
+    return Card.of(load_run(f"sqlite:///{tmp_path}/mlruns.db", run_id), folder)
+
+
+def test_card_has_the_latest_evaluation_that_has_kept_its_figures(keep, tmp_path):
+    run_id = keep("evaluation.json", json.dumps(OWN))
+    earlier, latest = (keep("figures.json", json.dumps(BY_COMMAND | {"data": data}), run_id) for data in ("a", "b"))
+    # As `out=figures.txt` left it in earlier versions.
+    keep("figures.txt", json.dumps(BY_COMMAND), run_id)
+    card = card_of(run_id, tmp_path)
+    assert f"### by evaluation {latest}, on b, success_threshold=0.2\n" in card.text
+    assert earlier not in card.text
+    assert "| mean steps | 3.00 (2.00–4.00) |" in card.text
+    assert card.tags["test_volumes/mean_steps"] == "6"
+
+
+@pytest.mark.parametrize(
+    "contents",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"a": 1}',
+        '{"a": {}}',
+        '{"a": {"episodes": []}}',
+        '{"a": {"episodes": {}}}',
+        '{"a": {"episodes": [1]}}',
+        *(
+            json.dumps({"a": {"episodes": [OWN["test volumes"]["episodes"][0] | changed]}})
+            for changed in (
+                {"n_steps": "many"},
+                {"n_steps": True},
+                {"is_success": 1},
+                {"volume": 3},
+                {"distance_mm": float("nan")},
+                {"distance_mm": float("inf")},
+                {"n_steps": 10**400},
+                {"new": 1},
+            )
+        ),
+    ],
+)
+def test_damaged_evaluation_of_a_run_is_one_line(keep, tmp_path, contents):
+    run_id = keep("evaluation.json", contents)
+    with pytest.raises(TrackingError, match=rf"^run {run_id}: its evaluation\.json is damaged; put it back, or remove"):
+        card_of(run_id, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "contents",
+    [{}, [], BY_COMMAND | {"changes": []}, BY_COMMAND | {"data": 1}, BY_COMMAND | {"episodes": {"test volumes": []}}],
+)
+def test_damaged_evaluation_by_the_command_is_one_line(keep, tmp_path, contents):
+    run_id = keep("evaluation.json", json.dumps(OWN))
+    latest = keep("figures.json", json.dumps(contents), run_id)
+    with pytest.raises(
+        TrackingError, match=rf"^run {latest}: its figures\.json is damaged; put it back, or remove it$"
+    ):
+        card_of(run_id, tmp_path)

@@ -1,0 +1,125 @@
+"""What seeds say together: against rliable, and what holds whatever the scores are."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from rliable.library import get_interval_estimates
+from rliable.metrics import aggregate_iqm
+from rliable.metrics import probability_of_improvement as theirs
+
+from armscan.errors import InvalidValueError
+from armscan.stats.aggregation import (
+    band_over_seeds,
+    interquartile_mean,
+    mean_for,
+    over_seeds,
+    probability_of_improvement,
+)
+
+
+def scores(n_seeds, n_volumes):
+    # Few values, so that there are ties.
+    return arrays(float, (n_seeds, n_volumes), elements=st.sampled_from([-2.0, 0.0, 0.5, 1.0, 3.0]))
+
+
+@st.composite
+def two_groups(draw):
+    n_volumes = draw(st.integers(1, 4))
+    return tuple(draw(scores(draw(st.integers(2, 5)), n_volumes)) for _ in range(2))
+
+
+@given(two_groups())
+@settings(max_examples=40)
+def test_probability_of_improvement_is_that_of_rliable(groups):
+    ours, others = groups
+    estimate = probability_of_improvement(ours, others)
+    assert estimate.value == pytest.approx(theirs(ours, others))
+    assert 0.0 <= estimate.low <= estimate.high <= 1.0
+    opposite = probability_of_improvement(others, ours)
+    assert opposite.value == pytest.approx(1.0 - estimate.value)
+    assert probability_of_improvement(ours + 9.0, others) == (1.0, 1.0, 1.0)
+    assert probability_of_improvement(ours, others) == estimate
+
+
+@pytest.mark.parametrize(("n_volumes", "is_stratified"), [(1, False), (1, True), (6, True)])
+def test_intervals_of_improvement_are_those_of_rliable(n_volumes, is_stratified):
+    rng = np.random.default_rng(0)
+    ours, others = rng.normal(0.7, size=(8, n_volumes)), rng.normal(size=(6, n_volumes))
+    estimate = probability_of_improvement(ours, others, is_stratified=is_stratified)
+    _, ends = get_interval_estimates({"it": (ours, others)}, lambda *both: np.array([theirs(*both)]), reps=1500)
+    # But for what is left to chance.
+    assert estimate[1:] == pytest.approx(ends["it"][:, 0], abs=0.05)
+
+
+def test_interval_of_improvement_holds_the_truth_only_if_seeds_are_drawn_with_all_their_volumes():
+    rng = np.random.default_rng(0)
+    n_whole = n_stratified = 0
+    for _ in range(60):
+        # Each training is good or bad on all of eight volumes; both groups are the same.
+        ours, others = (rng.normal(size=(10, 1)) + 0.3 * rng.normal(size=(10, 8)) for _ in range(2))
+        whole, stratified = (probability_of_improvement(ours, others, is_stratified=each) for each in (False, True))
+        n_whole += whole.low <= 0.5 <= whole.high
+        n_stratified += stratified.low <= 0.5 <= stratified.high
+    assert n_whole >= 50
+    assert n_stratified <= 45
+
+
+@pytest.mark.parametrize(("n_volumes", "is_stratified"), [(1, False), (1, True), (8, True)])
+def test_intervals_over_seeds_are_those_of_rliable(n_volumes, is_stratified):
+    values = np.random.default_rng(0).gamma(2.0, 2.0, (5, n_volumes))
+    estimate = over_seeds(values, interquartile_mean, is_stratified=is_stratified)
+    _, ends = get_interval_estimates({"it": values}, lambda each: np.array([aggregate_iqm(each)]), reps=10_000)
+    assert estimate[1:] == pytest.approx(ends["it"][:, 0], rel=0.05)
+
+
+def test_interval_over_seeds_holds_the_truth_only_if_they_are_drawn_with_all_their_volumes():
+    rng = np.random.default_rng(0)
+    n_whole = n_stratified = 0
+    for _ in range(40):
+        # Each training is good or bad on all of eight volumes; the mean of all trainings is 0.
+        values = rng.normal(size=(8, 1)) + 0.3 * rng.normal(size=(8, 8))
+        whole, stratified = (over_seeds(values, np.mean, is_stratified=each) for each in (False, True))
+        n_whole += whole.low <= 0 <= whole.high
+        n_stratified += stratified.low <= 0 <= stratified.high
+    assert n_whole >= 32
+    assert n_stratified <= 26
+
+
+@given(arrays(float, st.tuples(st.integers(2, 7), st.integers(1, 5)), elements=st.floats(-10, 10, width=32)))
+@settings(max_examples=40)
+def test_band_lies_within_the_seeds_and_is_the_same_each_time(values):
+    band = band_over_seeds(values, mean_for("mean_steps"))
+    assert np.allclose(band.values, [aggregate_iqm(values[:, [place]]) for place in range(values.shape[1])])
+    slack = 1e-9
+    assert (values.min(axis=0) - slack <= band.lows).all()
+    assert (band.lows <= band.highs + slack).all()
+    assert (band.highs <= values.max(axis=0) + slack).all()
+    assert all(map(np.array_equal, band, band_over_seeds(values, mean_for("mean_steps"))))
+
+
+@pytest.mark.parametrize("n_seeds", [2, 3])
+def test_band_of_two_or_three_seeds_is_their_range(n_seeds):
+    values = np.random.default_rng(0).normal(size=(n_seeds, 4))
+    band = band_over_seeds(values, interquartile_mean)
+    assert np.allclose(band.lows, values.min(axis=0))
+    assert np.allclose(band.highs, values.max(axis=0))
+
+
+def test_band_of_success_rates_is_of_their_mean():
+    values = np.array([[0.0], [1.0], [1.0], [1.0]])
+    assert band_over_seeds(values, mean_for("validation/success_rate")).values == [0.75]
+    assert band_over_seeds(values, mean_for("validation/mean_steps")).values == [1.0]
+
+
+def test_one_seed_has_no_interval():
+    one = np.array([[1.0, 2.0]])
+    assert np.isnan(band_over_seeds(one, np.mean).lows).all()
+    assert np.isnan(over_seeds(one, np.mean)[1:]).all()
+    assert np.isnan(probability_of_improvement(one, one)[1:]).all()
+
+
+def test_scores_of_other_numbers_of_volumes_are_refused():
+    with pytest.raises(InvalidValueError, match="scores are of 2 and of 3 volumes"):
+        probability_of_improvement(np.zeros((3, 2)), np.zeros((3, 3)))

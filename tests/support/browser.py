@@ -1,0 +1,161 @@
+"""Chromium without a window, for tests and for pictures of what is shown in a browser; nothing outside is reached."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from selenium.common.exceptions import (
+    ElementClickInterceptedException,
+    JavascriptException,
+    NoSuchElementException,
+    StaleElementReferenceException,
+)
+from selenium.webdriver import Chrome, ChromeOptions
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.by import By
+from selenium.webdriver.remote.webelement import WebElement
+from selenium.webdriver.support.wait import WebDriverWait
+
+from tests.support.waiting import HANG_S
+
+PROGRAMS = ("chromium", "chromedriver")
+WORDS = (
+    *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-quic"),
+    *("--no-first-run", "--no-proxy-server", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"),
+)
+# MLflow opens its assistant's panel by itself, once.
+BEFORE_EACH_PAGE = "localStorage.setItem('mlflow.assistant.fab.autoOpenedOnFirstLoad_v1', 'true')"
+FIND = """
+    const isRead = (each, text) => (each.innerText ?? each.textContent).trim().replace(/\\s+/g, " ") === text;
+    const seen = [...document.querySelectorAll(arguments[0])].filter((each) => each.getClientRects().length > 0);
+    return seen.findLast((each) => arguments[1] === null || isRead(each, arguments[1])) ?? null;
+"""
+
+
+def programs() -> tuple[str, str] | None:
+    """Returns the paths of the browser and its driver; None where one is not installed."""
+    browser, driver = (shutil.which(name) for name in PROGRAMS)
+    return (browser, driver) if browser and driver else None
+
+
+@contextmanager
+def chromium(profile: Path, *, width: int = 1400, height: int = 900) -> Iterator[Browser]:
+    """A browser as long as it lasts.
+
+    Args:
+        profile: folder of its own.
+        width: of the page, in pixels.
+        height: likewise.
+    """
+    found = programs()
+    assert found is not None
+    options = ChromeOptions()
+    options.binary_location = found[0]
+    for word in (*WORDS, f"--user-data-dir={profile}"):
+        options.add_argument(word)
+    driver = Chrome(options=options, service=Service(executable_path=found[1]))
+    try:
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        browser = Browser(driver)
+        browser.before_each_page(BEFORE_EACH_PAGE)
+        yield browser
+    finally:
+        driver.quit()
+
+
+class Browser:
+    """A browser, in which everything is waited for.
+
+    Args:
+        driver: of Selenium.
+    """
+
+    def __init__(self, driver: Chrome) -> None:
+        self.driver = driver
+        # While a page changes.
+        passing = (
+            ElementClickInterceptedException,
+            JavascriptException,
+            NoSuchElementException,
+            StaleElementReferenceException,
+        )
+        self._wait = WebDriverWait(driver, HANG_S, poll_frequency=0.1, ignored_exceptions=passing)
+
+    def before_each_page(self, program: str) -> None:
+        """Runs JavaScript before those of a page."""
+        self.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": program})
+
+    def open(self, address: str) -> None:
+        """Goes to an address."""
+        self.driver.get(address)
+
+    @property
+    def address(self) -> str:
+        """Of the page."""
+        return self.driver.current_url
+
+    def find(self, css: str, *, text: str | None = None) -> WebElement:
+        """Returns an element on the page, of several the innermost, as soon as it is there.
+
+        Args:
+            css: what it is.
+            text: all that can be read in it, None for anything.
+        """
+        element = self._wait.until(lambda _: self._seen(css, text), f"there is no {css} {text or ''}")
+        assert isinstance(element, WebElement)
+        return element
+
+    def has(self, css: str, *, text: str) -> bool:
+        """Whether an element is on the page now; see `find`."""
+        return self._seen(css, text) is not None
+
+    def click(self, css: str, *, text: str | None = None) -> None:
+        """Clicks on an element, as soon as nothing is in its way."""
+
+        def clicked(_: Chrome) -> bool:
+            element = self.find(css, text=text)
+            self._scroll_to(element)
+            element.click()
+            return True
+
+        self._wait.until(clicked)
+
+    def type(self, css: str, text: str) -> None:
+        """Writes into an element."""
+        self.find(css).send_keys(text)
+
+    def count(self, css: str, at_least: int) -> int:
+        """Waits until there are as many elements; returns how many there are."""
+
+        def counted(driver: Chrome) -> int:
+            n = len(driver.find_elements(By.CSS_SELECTOR, css))
+            return n if n >= at_least else 0
+
+        return int(self._wait.until(counted, f"fewer than {at_least} of {css}"))
+
+    def picture(self, css: str) -> int:
+        """Waits until a picture has been read, scrolls to it, and returns its width in pixels."""
+
+        def read(driver: Chrome) -> int:
+            image = driver.find_element(By.CSS_SELECTOR, css)
+            self._scroll_to(image)
+            return int(image.get_property("naturalWidth") or 0)
+
+        return int(self._wait.until(read, f"no picture {css}"))
+
+    def keep(self, file: Path) -> None:
+        """Keeps what is seen."""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        assert self.driver.save_screenshot(str(file))
+
+    def _seen(self, css: str, text: str | None) -> WebElement | None:
+        found = self.driver.execute_script(FIND, css, text)
+        return found if isinstance(found, WebElement) else None
+
+    def _scroll_to(self, element: WebElement) -> None:
+        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", element)

@@ -1,0 +1,157 @@
+"""A PostgreSQL server of one's own, for tests and benchmarks: on a free port of this machine, gone when it is left."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import pwd
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tests.support.waiting import wait_until
+
+USER, PASSWORD = "armscan", "not-to-be-shown"
+DEBIAN, PROGRAMS = Path("/usr/lib/postgresql"), ("initdb", "postgres")
+LOOPBACK = "127.0.0.1"
+
+
+def programs() -> Path | None:
+    """Returns the folder with PostgreSQL's programs, Debian's newest before those on the path; None where none are."""
+    of_debian = sorted(DEBIAN.glob("*/bin"), key=lambda folder: float(folder.parent.name), reverse=True)
+    on_path = [Path(found).parent] if (found := shutil.which("initdb")) else []
+    return next((each for each in (*of_debian, *on_path) if all((each / name).exists() for name in PROGRAMS)), None)
+
+
+@contextmanager
+def postgres_server(host: str = LOOPBACK, **settings: str) -> Iterator[PostgresServer]:
+    """A server as long as it lasts, with these settings of PostgreSQL beside its own.
+
+    This process and those that it starts have the password from the file that PGPASSFILE names.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="armscan-postgres-"))
+    before = os.environ.get("PGPASSFILE")
+    try:
+        server = PostgresServer(folder, settings, host)
+        passwords = folder / "pgpass"
+        passwords.write_text(f"*:*:*:{USER}:{PASSWORD}\n")
+        passwords.chmod(0o600)
+        os.environ["PGPASSFILE"] = str(passwords)
+        server.start()
+        try:
+            yield server
+        finally:
+            server.stop(at_once=True)
+    finally:
+        os.environ.pop("PGPASSFILE", None)
+        if before is not None:
+            os.environ["PGPASSFILE"] = before
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+class PostgresServer:
+    """A server with one user who has a password.
+
+    Args:
+        folder: of its data, empty.
+        settings: of PostgreSQL, beside those that a server of one's own needs.
+        host: address that it listens on.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, str] | None = None, host: str = LOOPBACK) -> None:
+        found = programs()
+        assert found is not None
+        self._host = host
+        self._programs, self._data, self._log = found, folder / "data", folder / "log"
+        # It refuses to run as root.
+        self._account = _account() if os.geteuid() == 0 else None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._numbers, self._settings = itertools.count(), dict(settings or {})
+        with socket.socket() as free:
+            free.bind((host, 0))
+            self.port = free.getsockname()[1]
+        password = folder / "password"
+        password.write_text(PASSWORD)
+        if self._account is not None:
+            for path in (folder, password):
+                shutil.chown(path, self._account)
+        words = ("-D", self._data, "-U", USER, f"--pwfile={password}", "--auth=scram-sha-256", "--encoding=UTF8")
+        assert self._started("initdb", *words, "--no-sync").wait() == 0, self._log.read_text()
+        with (self._data / "pg_hba.conf").open("a") as allowed:
+            allowed.write("host all all samenet scram-sha-256\n")
+
+    def start(self) -> None:
+        """Starts it, and waits until it answers."""
+        # Without fsync: it is only the server that is killed here, and never the machine.
+        own = {"port": self.port, "listen_addresses": self._host, "unix_socket_directories": "", "fsync": "off"}
+        words = [word for key, value in (self._settings | own).items() for word in ("-c", f"{key}={value}")]
+        self._process = self._started("postgres", "-D", self._data, *words)
+        wait_until(self._answers, process=self._process, log=self._log.read_text)
+
+    def stop(self, *, at_once: bool = False) -> None:
+        """Stops it, with all connections.
+
+        Args:
+            at_once: as if the power failed, which the next start has to mend.
+        """
+        if self._process is not None:
+            self._process.send_signal(signal.SIGQUIT if at_once else signal.SIGINT)
+            self._process.wait()
+        self._process = None
+
+    def restart(self, away_s: float = 0.0, *, at_once: bool = False) -> None:
+        """Stops it, and starts it again after a while."""
+        self.stop(at_once=at_once)
+        time.sleep(away_s)
+        self.start()
+
+    def make_database(self) -> str:
+        """Makes an empty database, and returns its address."""
+        name = f"study_{next(self._numbers)}"
+        self.execute(f"CREATE DATABASE {name}")
+        return self.uri(name)
+
+    def execute(self, statement: str) -> list[tuple[Any, ...]]:
+        """Executes a statement in the database that is always there; returns its rows."""
+        import psycopg
+
+        with psycopg.connect(self.uri("postgres"), password=PASSWORD, autocommit=True) as connection:
+            cursor = connection.execute(statement)
+            return cursor.fetchall() if cursor.description else []
+
+    def uri(self, database: str) -> str:
+        """Returns the address of a database, without the password."""
+        return f"postgresql://{USER}@{self._host}:{self.port}/{database}"
+
+    def _answers(self) -> bool:
+        import psycopg
+
+        try:
+            psycopg.connect(self.uri("postgres"), password=PASSWORD, connect_timeout=5).close()
+        except psycopg.OperationalError:
+            return False
+        return True
+
+    def _started(self, program: str, *words: str | Path) -> subprocess.Popen[bytes]:
+        account: dict[str, Any] = {}
+        if self._account is not None:
+            group = pwd.getpwnam(self._account).pw_gid
+            account = {"user": self._account, "group": group, "extra_groups": []}
+        with self._log.open("ab") as log:
+            # In a session of its own: to the server, a Ctrl-C that is meant for who started it would be a stop.
+            return subprocess.Popen(
+                [self._programs / program, *words], cwd="/", stdout=log, stderr=log, start_new_session=True, **account
+            )
+
+
+def _account() -> str:
+    """Returns who a server is run as where this process is root."""
+    known = {each.pw_name for each in pwd.getpwall()}
+    return "postgres" if "postgres" in known else "nobody"

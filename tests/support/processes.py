@@ -1,0 +1,63 @@
+"""What runs on this machine, for tests of what must not be left running, and to end what they started by others."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from tests.support.waiting import wait_until
+
+
+def processes_in(folder: Path) -> list[int]:
+    """The processes whose working folder this is."""
+    listing = subprocess.run(["ps", "-eo", "pid="], capture_output=True, text=True, check=True).stdout.split()
+    found = []
+    for pid in listing:
+        try:
+            if Path(f"/proc/{pid}/cwd").readlink() == folder:
+                found.append(int(pid))
+        except OSError:
+            continue
+    return found
+
+
+def with_variable(name: str, value: str) -> list[int]:
+    """Returns the ids of the processes that were started with a variable in their environment."""
+    wanted, found = f"{name}={value}".encode(), []
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit() and int(folder.name) != os.getpid():
+            try:
+                variables = (folder / "environ").read_bytes().split(b"\0")
+            # It has ended, or is somebody else's.
+            except OSError:
+                continue
+            if wanted in variables:
+                found.append(int(folder.name))
+    return found
+
+
+def kill(pids: Iterable[int], how: signal.Signals = signal.SIGKILL) -> None:
+    """Sends a signal to those that are still there."""
+    for pid in pids:
+        try:
+            os.kill(pid, how)
+        except ProcessLookupError:
+            continue
+
+
+def end_all(found: Callable[[], list[int]]) -> None:
+    """Kills processes until none is found any more.
+
+    Args:
+        found: returns their ids.
+    """
+
+    def are_gone() -> bool:
+        pids = found()
+        kill(pids)
+        return not pids
+
+    wait_until(are_gone, log=lambda: f"processes {found()} do not end", poll_s=0.1)

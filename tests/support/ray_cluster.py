@@ -1,0 +1,91 @@
+"""A Ray cluster of one's own for tests: of two machines that nobody else reaches, gone when it is left."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import secrets
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.support.machines import Machine, two_machines, why_not
+
+PORT, OBJECT_STORE_BYTES = 6379, 80_000_000
+# A dead machine refuses connections and is given up in seconds; a busy one has time to answer.
+HEALTH = {
+    "RAY_health_check_initial_delay_ms": "1000",
+    "RAY_health_check_period_ms": "1000",
+    "RAY_health_check_timeout_ms": "60000",
+    "RAY_health_check_failure_threshold": "3",
+}
+
+
+def why_not_here() -> str | None:
+    """Returns why there can be no cluster here, None where there can."""
+    if importlib.util.find_spec("ray") is None:
+        return "Ray is not installed: pip install 'armscan[ray]'"
+    return why_not()
+
+
+@dataclass(frozen=True)
+class RayCluster:
+    """Two machines with two cores each, as far as Ray knows.
+
+    Args:
+        head: the machine that the command is to be typed on.
+        other: another one.
+        environment: of who uses the cluster.
+    """
+
+    head: Machine
+    other: Machine
+    environment: Mapping[str, str]
+
+
+@contextmanager
+def ray_cluster(environment: Mapping[str, str]) -> Iterator[RayCluster]:
+    """A cluster as long as it lasts.
+
+    Args:
+        environment: of both machines, beside that of this process.
+    """
+    # Short, because the paths of sockets are limited.
+    folder = Path(tempfile.mkdtemp(prefix="armscan-ray-"))
+    try:
+        with two_machines() as (head, other):
+            token = folder / "token"
+            token.touch(mode=0o600)
+            token.write_text(secrets.token_hex(32))
+            # Said in any case: what was used on this machine before decides otherwise.
+            access = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), "RAY_USAGE_STATS_ENABLED": "0"}
+            address = f"{head.address}:{PORT}"
+            of_nodes = access | HEALTH | environment
+            _start(head, folder, of_nodes, "--head", f"--port={PORT}", "--include-dashboard=false")
+            _start(other, folder, of_nodes, f"--address={address}")
+            yield RayCluster(head, other, access | {"RAY_ADDRESS": address})
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _start(machine: Machine, folder: Path, environment: Mapping[str, str], *words: str) -> None:
+    own = folder / machine.address
+    own.mkdir()
+    program = str(Path(sys.executable).with_name("ray"))
+    words = (f"--node-ip-address={machine.address}", f"--temp-dir={own}", "--num-cpus=2", *words)
+    with (folder / f"{machine.address}.log").open("ab") as log:
+        ended = subprocess.run(
+            machine.command(program, "start", f"--object-store-memory={OBJECT_STORE_BYTES}", *words),
+            # Another directory than that of who uses it.
+            cwd=own,
+            env=os.environ | environment,
+            stdout=log,
+            stderr=log,
+            check=False,
+        )
+    assert ended.returncode == 0, (folder / f"{machine.address}.log").read_text()

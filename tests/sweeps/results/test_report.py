@@ -1,0 +1,154 @@
+"""The report of a study: one page without a server, every number as CSV beside it."""
+
+import csv
+from functools import partial
+
+import optuna
+import pytest
+from PIL import Image
+
+from armscan.sweeps.scheduling.scheduler import Limits, TrialScheduler
+from armscan.sweeps.storage.storage import open_storage
+from tests.sweeps.conftest import fail
+
+
+@pytest.fixture
+def answer(armscan):
+    """Runs `armscan report` in a folder of its own; returns its exit code and what it printed."""
+    return partial(armscan, "report")
+
+
+def searched(folder, objectives, n_trials=6):
+    """Makes a study of trials that have finished, been pruned and failed."""
+    storage = open_storage(str(folder / "optuna.journal"))
+    directions = ["minimize"] * len(objectives)
+    study = optuna.create_study(study_name="a", storage=storage.optuna, directions=directions)
+    for name, value in (("objectives", dict.fromkeys(objectives, "minimize")), ("space", {}), ("fixed_config", {})):
+        study.set_user_attr(name, value)
+    for number in range(n_trials):
+        trial = study.ask()
+        lr = trial.suggest_float("agent.lr", 0.0, 1.0)
+        trial.set_user_attr("env_steps", 100 * number)
+        if len(objectives) == 1:
+            trial.report(lr, 100)
+        if number == 1:
+            fail(TrialScheduler(study, storage, Limits(n_trials=1)), trial, "it <b>broke</b>")
+        elif number == 2 and len(objectives) == 1:
+            study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+        else:
+            study.tell(trial, [lr] * len(objectives))
+    return storage
+
+
+def judge(storage, folder):
+    study = optuna.create_study(study_name="a-judged", storage=storage.optuna)
+    for seed in range(3):
+        study.enqueue_trial({}, user_attrs={"judged": 0, "judged_seed": seed})
+        trial = study.ask()
+        of_seed = folder / "trials" / f"seed_{seed}"
+        of_seed.mkdir(parents=True)
+        Image.new("L", (4, 4)).save(of_seed / "episode.gif")
+        trial.set_user_attr("folder", str(folder / "trials"))
+        trial.set_user_attr("figures", {"test/mean_steps": 1.5 + seed, "test/success_rate": 1.0})
+        study.tell(trial, 1.5 + seed)
+
+
+def rows(file):
+    with file.open() as opened:
+        return list(csv.DictReader(opened))
+
+
+def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
+    storage = searched(tmp_path, ["mean_steps"])
+    judge(storage, tmp_path)
+    assert answer("--study=a") == (0, "look at   reports/a/report.html\n", "")
+    folder = tmp_path / "reports" / "a"
+    page = (folder / "report.html").read_text()
+    for heading in (
+        "Result",
+        "History",
+        "Importance",
+        "Parallel",
+        "Slices",
+        "Reports while",
+        "Learning curves",
+        "Failures",
+    ):
+        assert f"<h2>{heading}" in page
+    assert "data:image/gif;base64," in page
+    assert "it &lt;b&gt;broke&lt;/b&gt;" in page
+    assert 'src="http' not in page
+    trials = rows(folder / "trials.csv")
+    assert [row["state"] for row in trials] == ["complete", "fail", "pruned", "complete", "complete", "complete"]
+    assert trials[0]["mean_steps"] == trials[0]["agent.lr"]
+    assert trials[2]["mean_steps"] == ""
+    assert len(rows(folder / "reports.csv")) == 6
+    assert rows(folder / "failures.csv")[0]["cause"] == "it <b>broke</b>"
+    assert [(row["ending"], row["cause"], row["which"]) for row in rows(folder / "endings.csv")] == [
+        ("complete", "", "0 3 4 5"),
+        ("fail", "it <b>broke</b>", "1"),
+        ("pruned", "behind the others at environment step 100", "2"),
+    ]
+    (steps, success) = rows(folder / "result.csv")
+    assert (steps["figure"], float(steps["mean"]), success["mean"]) == ("test/mean_steps", 2.5, "1.0")
+    assert float(steps["low"]) < 2.5 < float(steps["high"])
+    assert [row["key"] for row in rows(folder / "importances.csv")] == ["agent.lr"]
+
+
+@pytest.mark.parametrize(("objectives", "n_trials"), [(["mean_steps", "env_steps"], 6), (["mean_steps"], 0)])
+def test_report_of_several_objectives_or_of_nothing_yet_can_be_made(answer, tmp_path, objectives, n_trials):
+    searched(tmp_path, objectives, n_trials)
+    assert answer("--study=a", "--out=here")[0] == 0
+    page = (tmp_path / "here" / "report.html").read_text()
+    assert ("Trials that no other is better than" if n_trials else "No trial has run to its end yet") in page
+    of_each = ["History", "Importance of each key", "Parallel coordinates", "Slices of the space"]
+    assert all(f"<h2>{what}: {name}</h2>" in page for what in of_each for name in objectives) == (n_trials > 0)
+
+
+def test_report_needs_only_to_read_the_storage(answer, tmp_path):
+    searched(tmp_path, ["mean_steps"])
+    with (tmp_path / "optuna.journal").open("ab") as journal:
+        journal.write(b'{"op_code": 4, "wor')
+    for file in tmp_path.glob(".*"):
+        file.unlink()
+    assert answer("--study=a")[0] == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["optuna.journal", "reports"]
+    assert (tmp_path / "optuna.journal").read_bytes().endswith(b'"wor')
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ([], "error: neither --study nor --runs is given, but a report is of one of them: give --study NAME or --runs"),
+        (
+            ["--study=a", "--storage=nowhere"],
+            "error: --storage is 'nowhere', but nothing is there: give the one that it is",
+        ),
+        (
+            ["--study=a", "--storage=sqlite:///nowhere.db"],
+            "error: --storage is 'sqlite:///nowhere.db', but nothing is there",
+        ),
+        (["--study=a", "--storage=list.journal"], "error: --storage is '/"),
+        (["--study=b"], "error: --study is 'b', but there is only a or foreign in '/"),
+        (
+            ["--study=a", "--tracking=x"],
+            "error: --tracking is given, but it is for --runs, and this report is of --study",
+        ),
+        (["--study=../a"], "error: --study is '../a', but it must begin with a letter, a digit or _"),
+        (["--study=foreign"], "error: --study is 'foreign', but that one in '/"),
+        (["--study=a", "--out=/dev/null/a"], "error: --out is '/dev/null/a', but /dev/null is no folder"),
+        (["--study=a", "--foo=1"], "error: No such option '--foo'."),
+        (["--study=a", "foo"], "error: Got unexpected extra argument (foo)"),
+    ],
+    ids=str,
+)
+def test_report_answers_mistakes_in_one_line(answer, tmp_path, words, line):
+    storage = searched(tmp_path, ["mean_steps"], n_trials=1)
+    optuna.create_study(study_name="foreign", storage=storage.optuna)
+    (tmp_path / "list.journal").write_text('{"op_code": 9}\n[1]\n')
+    there = sorted(tmp_path.iterdir())
+    code, printed, errors = answer(*words)
+    assert (code, printed) == (2, "")
+    assert errors.startswith(line)
+    assert len(errors.splitlines()) == 1
+    assert sorted(tmp_path.iterdir()) == there

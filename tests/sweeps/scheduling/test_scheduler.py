@@ -1,0 +1,280 @@
+"""The books of a study: exactly as many trials as asked for, whoever dies in between."""
+
+import multiprocessing
+import os
+import random
+import signal
+import time
+
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from armscan.sweeps.scheduling.state import ATTEMPT, FAILURE, LEASE, RETRIED, RETRY_OF, StudyState
+from armscan.sweeps.workers import heartbeat as lease_module
+from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
+from armscan.utils.processes import process_start
+from tests.support.waiting import wait_until
+from tests.sweeps.conftest import fail
+
+
+def states(scheduler):
+    return [trial.state.name for trial in scheduler.study.get_trials(deepcopy=False)]
+
+
+def finish(scheduler, trial, value=1.0):
+    trial.report(value, 1)
+    scheduler.study.tell(trial, value)
+
+
+def test_claim_gives_as_many_trials_as_are_wanted(make_scheduler):
+    scheduler, other = make_scheduler(n_trials=3), make_scheduler(n_trials=3)
+    trials = [scheduler.claim({"worker": "a"}), other.claim({"worker": "b"}), scheduler.claim({"worker": "a"})]
+    assert [trial.number for trial in trials] == [0, 1, 2]
+    assert other.claim({"worker": "b"}) is None
+    assert other.end(other.state()) is None
+    for trial in trials:
+        finish(scheduler, trial)
+    assert other.end(other.state()) == "3 trials have finished"
+
+
+def test_trial_that_is_handed_back_is_the_next_to_be_run_with_the_same_values(make_scheduler):
+    scheduler, other = make_scheduler(), make_scheduler()
+    trial = scheduler.claim({"worker": "a"})
+    value = trial.suggest_float("x", 0, 1)
+    scheduler.requeue(trial, {})
+    assert states(scheduler) == ["WAITING"]
+    again = other.claim({"worker": "b"})
+    assert (again.number, again.suggest_float("x", 0, 1)) == (trial.number, value)
+
+
+def test_failed_trial_is_replaced_until_too_many_have_failed(make_scheduler):
+    scheduler = make_scheduler(n_trials=2, max_failures=1)
+    finish(scheduler, scheduler.claim({}))
+    fail(scheduler, scheduler.claim({}), "no luck")
+    assert scheduler.end(scheduler.state()) is None
+    fail(scheduler, scheduler.claim({}), "none again")
+    reason = "2 trials have failed, and at most 1 may: trial 2: none again"
+    assert scheduler.end(scheduler.state()) == scheduler.broken(scheduler.state()) == reason
+    assert scheduler.claim({}) is None
+
+
+def test_study_whose_first_trials_all_fail_at_once_ends(make_scheduler):
+    scheduler = make_scheduler(n_trials=100, max_failures=50)
+    for _ in range(3):
+        assert scheduler.broken(scheduler.state()) is None
+        fail(scheduler, scheduler.claim({}), "agent.lr is -1")
+    assert scheduler.broken(scheduler.state()).endswith("before they reported anything: trial 0: agent.lr is -1")
+
+
+def test_limits_of_time_and_environment_steps_end_a_study(make_scheduler):
+    scheduler = make_scheduler(env_steps=100)
+    scheduler.claim({"env_steps": 99})
+    assert scheduler.end(scheduler.state()) is None
+    scheduler.claim({"env_steps": 1})
+    assert scheduler.end(scheduler.state()) == "the 100 environment steps of study.max_env_steps are taken"
+    assert make_scheduler(hours=1.0).end(scheduler.state()) is None
+    time.sleep(0.1)
+    assert make_scheduler(hours=1e-5).end(scheduler.state()) == "the 1e-05 hours of study.timeout_hours are over"
+
+
+def test_trial_of_a_dead_worker_is_retried_once_with_its_values(make_scheduler):
+    scheduler, other = make_scheduler(), make_scheduler()
+    trial = scheduler.claim({"worker": "a", "host": "there"})
+    value = trial.suggest_float("x", 0, 1)
+    assert other.reclaim(lambda _: False) == []
+    assert [each.number for each in other.reclaim(lambda _: True)] == [0]
+    assert scheduler.reclaim(lambda _: True) == []
+    assert states(scheduler) == ["FAIL", "WAITING"]
+    state = scheduler.state()
+    assert (len(state.failed), len(state.retried)) == (0, 1)
+    assert state.retried[0].user_attrs[FAILURE] == "its worker died: a on there"
+    again = other.claim({"worker": "b"})
+    assert again.user_attrs[RETRY_OF] == 0
+    assert again.suggest_float("x", 0, 1) == value
+    other.reclaim(lambda _: True)
+    assert len(other.state().failed) == 1
+    assert RETRIED not in other.state().failed[0].user_attrs
+    # Whoever was taken for dead finds that it is not its own any more.
+    with pytest.raises(optuna.exceptions.UpdateFinishedTrialError):
+        trial.report(1.0, 1)
+    scheduler.requeue(trial, {})
+    scheduler.renew(trial, {})
+    assert states(scheduler) == ["FAIL", "FAIL"]
+
+
+def test_trial_whose_worker_died_while_it_took_it_is_reclaimed_at_once(make_scheduler):
+    scheduler = make_scheduler()
+    scheduler.study.ask()
+    assert [trial.number for trial in scheduler.reclaim(lambda _: False)] == [0]
+
+
+def test_death_between_a_retry_and_the_failure_makes_no_second_retry(make_scheduler, monkeypatch):
+    scheduler, other = make_scheduler(), make_scheduler()
+    scheduler.claim({"worker": "a"})
+    monkeypatch.setattr(scheduler, "_fail", lambda *_: (_ for _ in ()).throw(SystemExit))
+    with pytest.raises(SystemExit):
+        scheduler.reclaim(lambda _: True)
+    other.reclaim(lambda _: True)
+    assert states(other) == ["FAIL", "WAITING"]
+
+
+def reclaim_together(barrier, make_scheduler, n):
+    scheduler = make_scheduler()
+    barrier.wait()
+    for _ in range(n):
+        scheduler.reclaim(lambda trial: trial.number < 4)
+
+
+def test_workers_that_notice_a_death_at_once_make_one_retry(make_scheduler):
+    scheduler = make_scheduler()
+    for _ in range(4):
+        scheduler.claim({"worker": "a"})
+    context = multiprocessing.get_context("fork")
+    barrier = context.Barrier(3)
+    processes = [context.Process(target=reclaim_together, args=(barrier, make_scheduler, 3)) for _ in range(3)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert states(scheduler) == ["FAIL"] * 4 + ["WAITING"] * 4
+    assert sorted(trial.user_attrs[RETRY_OF] for trial in scheduler.state().waiting) == [0, 1, 2, 3]
+    assert {trial.user_attrs[ATTEMPT] for trial in scheduler.state().waiting} == {1}
+
+
+def work(make_scheduler, n_trials):
+    scheduler, liveness, chance = (
+        make_scheduler(n_trials=n_trials, max_retries=9),
+        LivenessCheck(),
+        random.Random(os.getpid()),
+    )
+    lease = {"host": os.uname().nodename, "pid": os.getpid(), "started": process_start(os.getpid())}
+    while scheduler.end(scheduler.state()) is None:
+        scheduler.reclaim(liveness.is_dead)
+        trial = scheduler.claim(lease)
+        if trial is None:
+            time.sleep(0.01)
+            continue
+        trial.suggest_float("x", 0, 1)
+        time.sleep(chance.uniform(0.0, 0.1))
+        finish(scheduler, trial)
+
+
+def test_workers_killed_at_any_moment_lose_no_trial_and_make_none_too_many(make_scheduler):
+    n_trials, n_killed, context = 40, 0, multiprocessing.get_context("fork")
+    scheduler, chance = make_scheduler(n_trials=n_trials), random.Random(0)
+
+    def started():
+        process = context.Process(target=work, args=(make_scheduler, n_trials))
+        process.start()
+        return process
+
+    workers = [started() for _ in range(3)]
+    while scheduler.end(scheduler.state()) is None:
+        time.sleep(chance.uniform(0.05, 0.4))
+        one = chance.randrange(3)
+        if workers[one].is_alive():
+            os.kill(workers[one].pid, signal.SIGKILL)
+            n_killed += 1
+            workers[one].join()
+            workers[one] = started()
+    for worker in workers:
+        worker.join()
+    state = scheduler.state()
+    assert n_killed > 2
+    assert len(state.finished) == n_trials
+    assert not state.failed
+    assert not state.running
+    assert len({trial.params["x"] for trial in state.finished}) == n_trials
+
+
+def test_closed_ledger_runs_only_what_waits(make_scheduler):
+    scheduler = make_scheduler(n_trials=9, is_open=False)
+    assert scheduler.claim({}) is None
+    scheduler.study.enqueue_trial({"x": 1.0})
+    trial = scheduler.claim({})
+    assert trial.suggest_float("x", 0, 2) == 1.0
+    assert scheduler.claim({}) is None
+    finish(scheduler, trial)
+    assert scheduler.end(scheduler.state()) == "1 trials have finished, 0 failed"
+
+
+def test_tally_counts_the_time_in_which_anything_ran_once(make_scheduler):
+    scheduler = make_scheduler()
+    trials = [scheduler.claim({}) for _ in range(2)]
+    time.sleep(0.2)
+    for trial in trials:
+        finish(scheduler, trial)
+    first, second = scheduler.state().finished
+    spent_s = (second.datetime_complete - first.datetime_start).total_seconds()
+    assert scheduler.state().busy_hours * 3600 == pytest.approx(spent_s, abs=0.05)
+    assert {trial.state for trial in StudyState.of(scheduler.study.trials).all} == {TrialState.COMPLETE}
+
+
+def test_witness_knows_a_process_that_is_gone_and_one_that_has_its_number(make_scheduler):
+    scheduler, liveness = make_scheduler(), LivenessCheck()
+    process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
+    process.start()
+    here = {"host": os.uname().nodename, "pid": process.pid, "started": process_start(process.pid)}
+    scheduler.claim(here)
+    assert not liveness.is_dead(scheduler.state().running[0])
+    scheduler.renew(_trial(scheduler), here | {"started": "1"})
+    assert liveness.is_dead(scheduler.state().running[0])
+    scheduler.renew(_trial(scheduler), here)
+    process.kill()
+    # Killed, and not yet waited for: nothing but an exit code is left of it.
+    wait_until(lambda: liveness.is_dead(scheduler.state().running[0]))
+    process.join()
+    assert liveness.is_dead(scheduler.state().running[0])
+
+
+def test_witness_takes_a_worker_elsewhere_for_dead_when_its_lease_is_not_renewed(make_scheduler, monkeypatch):
+    scheduler, liveness, now_s = make_scheduler(), LivenessCheck(), [100.0]
+    monkeypatch.setattr("armscan.sweeps.workers.heartbeat.time.monotonic", lambda: now_s[0])
+    lease = {"worker": "a", "host": "elsewhere", "pid": 1, "started": "1", "beat": 0}
+    scheduler.claim(lease)
+
+    def found_dead_after(*waited_s):
+        found = []
+        for each_s in waited_s:
+            now_s[0] += each_s
+            found.append(liveness.is_dead(scheduler.state().running[0]))
+        return found
+
+    for beat in range(3):
+        scheduler.renew(_trial(scheduler), lease | {"beat": beat})
+        assert not any(found_dead_after(0, 10, 10, 10))
+    assert found_dead_after(9, 10) == [False, True]
+    scheduler.renew(_trial(scheduler), lease | {"beat": 3})
+    # Nobody looked for long, because the storage was away: then it could not be renewed, either.
+    assert found_dead_after(0, 10, 500, 10, 10) == [False, False, False, False, True]
+
+
+def test_keepers_of_many_trials_take_turns_in_looking_after_them(make_scheduler, monkeypatch):
+    scheduler, now_s, looks = make_scheduler(), [100.0], []
+    monkeypatch.setattr(lease_module.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(lease_module, "MAX_CHECKERS", 2)
+    heartbeat = Heartbeat(scheduler, "a", is_told_to_leave=lambda: False, leave=lambda: None, on_death=pytest.fail)
+    heartbeat.claim()
+    alive = {"host": os.uname().nodename, "pid": os.getpid(), "started": process_start(os.getpid())}
+    for _ in range(4):
+        scheduler.claim(alive | {"worker": "b"})
+    state = scheduler.state
+    monkeypatch.setattr(scheduler, "state", lambda: looks.append(now_s[0]) or state())
+    for _ in range(9):
+        heartbeat._renew()
+        now_s[0] += lease_module.HEARTBEAT_S
+    # Five trials, of whose workers two may look in a beat: each after two beats, as two and a half cannot be.
+    assert [look_s - 100 for look_s in looks] == [0, 20, 40, 60, 80]
+    own = [trial.user_attrs[LEASE]["beat"] for trial in state().running if trial.user_attrs[LEASE]["worker"] == "a"]
+    assert own == [9]
+
+
+def _trial(scheduler):
+    return optuna.trial.Trial(scheduler.study, scheduler.state().running[0]._trial_id)
+
+
+def test_lease_of_a_trial_says_who_runs_it(make_scheduler):
+    scheduler = make_scheduler()
+    scheduler.claim({"worker": "a", "beat": 0})
+    assert scheduler.state().running[0].user_attrs[LEASE] == {"worker": "a", "beat": 0}

@@ -1,0 +1,169 @@
+"""Search spaces: what may stand in them, what a trial is given, how it is written."""
+
+import optuna
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from armscan.errors import InvalidValueError
+from armscan.sweeps.space.overrides import overrides_of, written
+from armscan.sweeps.space.space import Space
+
+DESCRIBED = {
+    "network": {"choices": ["mlp", "multimodal"]},
+    "network.hidden_sizes": {"choices": [[64, 64], [128, 128]], "when": {"network": "mlp"}},
+    "agent.lr": {"low": 1e-4, "high": 1e-2, "log": True},
+    "agent.batch_size": {"low": 64, "high": 256, "step": 64},
+    "agent.gamma": {"low": 0, "high": 0.99},
+    "training.solved": {"choices": [None, True, 3]},
+}
+
+
+def test_space_gives_a_trial_what_is_searched_beside_its_choices():
+    space, study = Space.read(DESCRIBED), optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    seen = [space.suggest(study.ask()) for _ in range(60)]
+    assert all(("network.hidden_sizes" in chosen) == (chosen["network"] == "mlp") for chosen in seen)
+    assert {chosen["agent.batch_size"] for chosen in seen} == {64, 128, 192, 256}
+    assert {chosen["network"] for chosen in seen} == {"mlp", "multimodal"}
+    assert all(1e-4 <= chosen["agent.lr"] <= 1e-2 for chosen in seen)
+    assert sum(chosen["agent.lr"] < 1e-3 for chosen in seen) > 15
+    assert any(0 < chosen["agent.gamma"] < 0.99 for chosen in seen)
+
+
+def test_space_is_written_as_the_command_line_has_it():
+    chosen = {"network": "mlp", "network.hidden_sizes": "[64,64]", "agent.lr": 1e-4, "a.b": None, "c": False}
+    texts = ["it's, odd", "a\\b", "a\\", "a\\'b", "true", "Null", "nan", "1e3"]
+    values = [OverridesParser.create().parse_override(f"a={written(text)}").value() for text in texts]
+    assert [value if isinstance(value, str) else value.text for value in values] == texts
+    words = overrides_of({**chosen, "d": "it's, odd"})
+    assert words[:5] == ["network=mlp", "network.hidden_sizes=[64,64]", "agent.lr=0.0001", "a.b=null", "c=false"]
+    read = [override.value() for override in OverridesParser.create().parse_overrides(words)]
+    assert [str(value) if hasattr(value, "text") else value for value in read] == [
+        *("mlp", [64, 64], 1e-4, None, False, "it's, odd")
+    ]
+    assert written({"a": [1, {"b": True}]}) == "{a:[1,{b:true}]}"
+
+
+def test_space_extremes_have_every_choice_and_both_ends():
+    extremes = list(Space.read(DESCRIBED).extremes())
+    assert {"network": "mlp", "network.hidden_sizes": "[128,128]"} in extremes
+    for name, values in {
+        "agent.lr": (1e-4, 1e-2),
+        "agent.batch_size": (64, 256),
+        "training.solved": (None, True, 3),
+    }.items():
+        assert [one[name] for one in extremes if name in one] == list(values)
+
+
+def test_space_completes_choices_as_a_trial_has_them():
+    completed = Space.read(DESCRIBED).completed({"network": "multimodal", "agent.lr": 1e-2})
+    assert completed == {
+        "network": "multimodal",
+        "agent.lr": 1e-2,
+        "agent.batch_size": 64,
+        "agent.gamma": 0,
+        "training.solved": None,
+    }
+
+
+@pytest.mark.parametrize(("network", "is_there"), [("mlp", True), ("multimodal", False), ("auto", False)])
+def test_space_without_what_is_fixed_keeps_what_this_allows(network, is_there):
+    space = Space.read(DESCRIBED).without({"network": network, "agent.lr": 1})
+    others = ["agent.batch_size", "agent.gamma", "training.solved"]
+    assert [each.name for each in space.parameters] == ["network.hidden_sizes"] * is_there + others
+    chosen = space.suggest(optuna.create_study().ask())
+    assert ("network.hidden_sizes" in chosen) == is_there
+
+
+def test_space_without_what_is_fixed_lacks_what_needs_what_is_gone():
+    chain = {
+        "a": {"choices": [1, 2]},
+        "b": {"choices": [1, 2], "when": {"a": 1}},
+        "c": {"choices": [1, 2], "when": {"b": 2}},
+    }
+    assert list(Space.read(chain).extremes())[-1] == {"a": 1, "b": 2, "c": 2}
+    assert Space.read(chain).without({"a": 2}).parameters == ()
+    assert [each.name for each in Space.read(chain).without({"b": 2}).parameters] == ["a", "c"]
+
+
+@pytest.mark.parametrize("when", [{"agent": "ppo", "gamma": 0.5}, {"gamma": 0.5, "agent": "ppo"}], ids=str)
+def test_space_extremes_are_only_such_as_a_trial_can_have(when):
+    space = Space.read(
+        {
+            "agent": {"choices": ["sac", "ppo"]},
+            "gamma": {"choices": [0.5, 0.9], "when": {"agent": ["sac", "ppo"]}},
+            "clip": {"choices": [1], "when": when},
+        }
+    )
+    assert list(space.extremes())[-1] == {"agent": "ppo", "gamma": 0.5, "clip": 1}
+
+
+def test_space_is_changed_key_by_key_as_the_command_line_has_it():
+    of_agent = {"lr": {"high": 0.5}, "batch_size": {"choices": [8, 16]}, "gamma": None, "tau": {"choices": [0.1]}}
+    of_network = DESCRIBED["network"] | {"hidden_sizes": {"choices": [[8, 8]]}}
+    changed = Space.read(DESCRIBED | {"agent": of_agent, "network": of_network}).to_plain()
+    assert (
+        changed
+        == Space.read(
+            {
+                "network": DESCRIBED["network"],
+                "network.hidden_sizes": DESCRIBED["network.hidden_sizes"],
+                "agent.lr": {"low": 1e-4, "high": 0.5, "log": True},
+                "agent.batch_size": {"choices": [8, 16]},
+                "training.solved": DESCRIBED["training.solved"],
+                "agent.tau": {"choices": [0.1]},
+            }
+        ).to_plain()
+    )
+
+
+@pytest.mark.parametrize(
+    ("described", "line"),
+    [
+        (None, "study.space is None, but it must have at least one key to search"),
+        ({}, "study.space is {}, but it must have at least one key"),
+        ({"a b": {"choices": [1]}}, "study.space.a b: 'a b' is no key of the configuration"),
+        ({"a": 3}, "study.space.a is 3, but it must have low and high, or choices"),
+        ({"a": {"low": 3}}, "study.space.a is {'low': 3}, but it must have low and high, or choices"),
+        ({"a": {"choices": []}}, "study.space.a.choices is [], but it must be a list of at least one value"),
+        ({"a": {"choices": [1, 1]}}, "study.space.a.choices is [1, 1], but no value may be there twice"),
+        ({"a": {"choices": [1], "low": 1}}, "'low': 1}, but it must have low and high, or choices: study.space.a.cho"),
+        ({"a": {"choices": [1], "log": 1}}, "there is no key 'log' in study.space.a, but only choices or when"),
+        ({"study.seed": {"choices": [1]}}, "study.space.study.seed: 'study.seed' says how a study is run or kept"),
+        ({"a": {"low": 1, "high": 2, "max": 1}}, "there is no key 'max' in study.space.a, but only low, high, log"),
+        ({"a": {"low": 2, "high": 1}}, "study.space.a.low is 2, but it must be below high, 1"),
+        ({"a": {"low": "x", "high": 1}}, "study.space.a.low is 'x', but it must be a finite number"),
+        ({"a": {"low": 0.0, "high": 1.0, "log": True}}, "study.space.a.low is 0, but it must be above 0 where log"),
+        ({"a": {"low": 1.0, "high": 2.0, "log": 1}}, "study.space.a.log is 1, but it must be true or false"),
+        ({"a": {"low": 1, "high": 9, "log": True, "step": 2}}, "study.space.a.step is 2, but a range with log has no"),
+        ({"a": {"low": 1, "high": 9, "step": 0}}, "study.space.a.step is 0, but it must be a whole number of at least"),
+        ({"a": {"low": 0.0, "high": 1.0, "step": 2.0}}, "study.space.a.step is 2.0, but it must be a finite number"),
+        (
+            {"b": {"choices": [1]}, "a": {"choices": [1], "when": {"b": []}}},
+            "study.space.a.when.b is [], but it",
+        ),
+        (
+            {
+                "a": {"choices": [1, 2]},
+                "b": {"choices": [1], "when": {"a": 1}},
+                "c": {"choices": [1], "when": {"b": 1, "a": 2}},
+            },
+            "study.space.c.when can never hold",
+        ),
+        (
+            {"a": {"low": 0.0, "high": 0.1, "step": 0.03}},
+            "but steps of 0.03 from 0 end at 0.09",
+        ),
+        ({"a": {"low": 1, "high": 8, "step": 5}}, "study.space.a.high is 8, but steps of 5 from 1 end at 6"),
+        ({"a": {"choices": [1], "when": 3}}, "study.space.a.when is 3, but it must say which choice of which key"),
+        ({"a": {"choices": [1], "when": {"b": 1}}}, "study.space.a.when names 'b', but it must be a key with choices"),
+        (
+            {"b": {"choices": [1, 2]}, "a": {"choices": [1], "when": {"b": 3}}},
+            "study.space.a.when.b is 3, but it must be 1 or 2",
+        ),
+    ],
+    ids=str,
+)
+def test_space_refuses_what_is_none_in_one_line(described, line):
+    with pytest.raises(InvalidValueError) as error:
+        Space.read(described)
+    assert line in str(error.value)

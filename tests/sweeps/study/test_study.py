@@ -1,0 +1,104 @@
+"""A study in its storage: the same one goes on, another is refused with what differs."""
+
+import optuna
+import pytest
+
+from armscan.errors import StudyError
+from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.finalists import enqueue_final_trials
+from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
+from armscan.sweeps.study.study import make_study
+
+FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
+
+
+def settings(**changes):
+    values = {
+        "name": "a",
+        "storage": "optuna.journal",
+        "folder": "studies/a",
+        "artifacts": "optuna.artifacts",
+        "task": {"_target_": "armscan.sweeps.tasks.training.TrainingTask"},
+        "space": Space.read({"agent.lr": {"low": 1e-4, "high": 1e-2}}),
+        "objectives": {"mean_steps": "minimize"},
+        "sampler": {"_target_": "optuna.samplers.RandomSampler"},
+        "pruner": {"_target_": "optuna.pruners.NopPruner"},
+        "n_trials": 5,
+        "prune_after_env_steps": 4000,
+        "max_failures": 1,
+        "max_retries": 1,
+        "timeout_hours": None,
+        "max_env_steps": None,
+        "workers": 1,
+        "seed": 0,
+        "seeds": (0,),
+        "final_eval": FinalEvalSettings(top_k=0, n_seeds=1),
+        "allow_config_changes": False,
+    }
+    return StudySettings(**values | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "fixed"),
+    [
+        ({"n_trials": 50, "workers": 2, "timeout_hours": 3.0}, {}),
+        ({}, {"seed": 4, "device": "cuda", "tracking": {"uri": "b"}}),
+        ({}, {"agent": {"lr": 5.0, "gamma": 0.9}}),
+    ],
+    ids=["budgets", "where and how it is computed", "what is searched"],
+)
+def test_study_goes_on_where_what_its_trials_do_is_the_same(storage_uri, changes, fixed):
+    study = make_study(open_storage(storage_uri), settings(), FIXED)
+    study.tell(study.ask(), 1.0)
+    assert len(make_study(open_storage(storage_uri), settings(**changes), FIXED | fixed).trials) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "fixed", "line"),
+    [
+        (
+            {},
+            {"agent": {"lr": 1e-3, "gamma": 0.5}},
+            "with another configuration: agent.gamma was 0.9, is 0.5",
+        ),
+        ({}, {"stack": 4}, "stack was not there, is 4; study.allow_config_changes=true accepts that"),
+        ({"seeds": (0, 1)}, {}, "study.seeds was [0], is [0, 1]"),
+        ({"objectives": {"solved": "maximize"}}, {}, "has other objectives: mean_steps was minimize, is not there"),
+        ({"space": Space.read({"agent.tau": {"low": 0.1, "high": 0.2}})}, {}, "searches another space: agent.lr was {"),
+    ],
+    ids=lambda value: "",
+)
+def test_study_that_has_changed_is_refused_with_what_differs(storage_uri, changes, fixed, line):
+    make_study(open_storage(storage_uri), settings(), FIXED)
+    with pytest.raises(StudyError) as error:
+        make_study(open_storage(storage_uri), settings(**changes), FIXED | fixed)
+    assert line in str(error.value)
+
+
+def test_study_that_has_changed_goes_on_where_that_is_accepted_from_then_on(storage_uri):
+    make_study(open_storage(storage_uri), settings(), FIXED)
+    make_study(open_storage(storage_uri), settings(allow_config_changes=True), FIXED | {"stack": 4})
+    make_study(open_storage(storage_uri), settings(), FIXED | {"stack": 4})
+    with pytest.raises(StudyError, match="stack was 4, is not there"):
+        make_study(open_storage(storage_uri), settings(), FIXED)
+
+
+def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_uri):
+    storage, lr = open_storage(storage_uri), {"low": 1e-4, "high": 1e-2}
+    before = {"env._target_": "armscan.envs.EnvMaker", "agent.random_env_steps": 2000}
+    before |= {"study.seeds": [0], "study.task": "armscan.sweeps.training.Training"}
+    study = optuna.create_study(study_name="a", storage=storage.optuna)
+    study.set_user_attr("space", Space.read({"agent.updates_per_env_step": lr}).to_plain())
+    study.set_user_attr("objectives", {"mean_steps": "minimize"})
+    study.set_user_attr("fixed_config", before)
+    trial = study.ask()
+    ratio = trial.suggest_float("agent.updates_per_env_step", **lr)
+    study.tell(trial, 1.0)
+    fixed = {"env": {"_target_": "armscan.envs.EnvFactory"}, "agent": {"learning_starts": 2000}}
+    final_eval = FinalEvalSettings(top_k=1, n_seeds=1)
+    now = settings(space=Space.read({"agent.utd_ratio": lr}), final_eval=final_eval)
+    search = make_study(storage, now, fixed)
+    final = optuna.create_study(study_name="a-judged", storage=storage.optuna)
+    enqueue_final_trials(storage, now, search, final)
+    assert final.ask().suggest_float("agent.utd_ratio", **lr) == ratio

@@ -1,0 +1,42 @@
+"""A study that trains nothing: how well clusters tell the labelled planes from the rest of the arm."""
+
+import pytest
+
+from armscan.errors import InvalidValueError
+from armscan.sweeps.tasks.attempt import composed
+from armscan.sweeps.tasks.landmarks import LandmarksTask
+
+FEW = ["data.n_training=2", "data.n_validation=1", "data.n_test=1"]
+
+
+class Trial:
+    """Of an attempt, what this task asks for."""
+
+    seeds = (0,)
+
+    def __init__(self, *overrides):
+        self._words = ["sweep=landmarks", *FEW, *overrides]
+
+    def config(self, seed):
+        return composed([*self._words, f"seed={seed}"])
+
+
+def test_landmarks_of_the_published_clusters_are_there_at_labelled_planes_and_not_elsewhere():
+    task, trial = LandmarksTask(), Trial()
+    task.check(trial.config(0)[0])
+    metrics = task.run(trial)
+    assert set(metrics) == set(task.metrics)
+    assert metrics["labelled_reward"] == metrics["worst_labelled_reward"] == 0.0
+    assert metrics["elsewhere_reward"] < -0.2
+    assert metrics["separation"] == pytest.approx(-metrics["elsewhere_reward"])
+    assert task.final_metric in task.evaluate(trial)
+
+
+def test_landmarks_that_cannot_be_told_apart_are_worth_less():
+    coarse = Trial("env.clustering.bones.eps_px=8.0", "env.clustering.tendons.eps_px=6.0")
+    assert LandmarksTask().run(coarse)["separation"] < LandmarksTask().run(Trial())["separation"]
+
+
+def test_landmarks_need_a_clustering_whose_parts_can_be_searched():
+    with pytest.raises(InvalidValueError, match=r"env\.clustering is 'pixels', but this study searches its parts"):
+        LandmarksTask().check(Trial("env.clustering=pixels").config(0)[0])

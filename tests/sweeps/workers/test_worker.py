@@ -1,0 +1,162 @@
+"""A worker and its trials, which train nothing here: what they draw, what becomes of those that fail."""
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+
+from armscan.sweeps.scheduling.scheduler import Limits, TrialScheduler
+from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.finalists import best_trials
+from armscan.sweeps.study.phase import Phase
+from armscan.sweeps.workers.heartbeat import Heartbeat
+from armscan.sweeps.workers.worker import Worker
+from armscan.tracking import open_store
+
+SPACE = {"agent.lr": {"low": 1e-4, "high": 1e-2, "log": True}, "agent.batch_size": {"choices": [64, 128, 256]}}
+TPE = {"_target_": "optuna.samplers.TPESampler", "n_startup_trials": 2, "multivariate": True}
+RANDOM = {"_target_": "optuna.samplers.RandomSampler"}
+
+
+def far_from_a_thousandth(attempt):
+    config, _ = attempt.config(attempt.seeds[0])
+    return {"mean_steps": abs(config.agent.lr - 1e-3)}
+
+
+@pytest.fixture
+def work(tmp_path, empty_database):
+    """Lets one worker run a study in a folder of its own; returns the study."""
+
+    def run_study(folder, run=far_from_a_thousandth, *, sampler=RANDOM, seed=0, **limits):
+        folder = tmp_path / folder
+        storage = open_storage(str(folder / "optuna.journal"))
+        study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
+        if not (folder / "a.db").exists():
+            shutil.copy(empty_database, folder / "a.db")
+        client, experiment_id = open_store(
+            f"sqlite:///{folder}/a.db", experiment="a", artifacts=str(folder / "b"), wait_s=60.0
+        )
+        phase = Phase(
+            name="a",
+            scheduler=TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits)),
+            space=Space.read(SPACE),
+            objectives=("mean_steps",),
+            reported=None,
+            run=run,
+            seeds_of=lambda _: (0,),
+            sampler=sampler,
+            seed=seed,
+            folder=folder,
+            artifacts=folder / "artifacts",
+            storage_uri=storage.uri,
+            client=client,
+            experiment_id=experiment_id,
+            run_id=client.create_run(experiment_id, name="study", tags={}).info.run_id,
+        )
+        heartbeat = Heartbeat(
+            phase.scheduler, "0", is_told_to_leave=lambda: False, leave=lambda: os._exit(1), on_death=lambda _: None
+        )
+        with heartbeat.running():
+            Worker(phase, ["data.n_training=1"], heartbeat).work()
+        return study
+
+    run_study.storage = lambda folder: open_storage(str(tmp_path / folder / "optuna.journal"))
+    return run_study
+
+
+@pytest.mark.parametrize("sampler", [RANDOM, TPE], ids=["random", "tpe"])
+def test_worker_alone_draws_the_same_points_again_from_the_same_seed_and_others_from_another(work, sampler):
+    points = [
+        [trial.params for trial in work(folder, sampler=sampler, seed=seed).trials]
+        for folder, seed in (("first", 0), ("again", 0), ("other", 1))
+    ]
+    assert points[0] == points[1]
+    assert len({point["agent.lr"] for point in points[0] + points[2]}) == 10
+
+
+def test_worker_goes_on_after_a_trial_that_raised_and_says_what_it_raised(work):
+    seen = []
+
+    def second_raises(attempt):
+        seen.append(attempt.trial.number)
+        if len(seen) == 2:
+            raise RuntimeError("the second one")
+        return far_from_a_thousandth(attempt)
+
+    study = work("a", second_raises, n_trials=3)
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE", "FAIL", "COMPLETE", "COMPLETE"]
+    assert "the second one" in study.trials[1].user_attrs["failure"]
+    assert Path(study.trials[1].user_attrs["folder"]).name == "0001"
+
+
+def test_worker_ends_a_study_whose_configuration_fails_at_once_and_one_with_too_many_failures(work):
+    def raises(_):
+        raise RuntimeError("always")
+
+    def every_second_raises(attempt):
+        if attempt.trial.number % 2:
+            raise RuntimeError("odd")
+        return far_from_a_thousandth(attempt)
+
+    assert [trial.state.name for trial in work("a", raises, n_trials=100).trials] == ["FAIL"] * 3
+    study = work("b", every_second_raises, n_trials=100, max_failures=4)
+    assert sorted(trial.state.name for trial in study.trials) == ["COMPLETE"] * 5 + ["FAIL"] * 5
+
+
+@pytest.mark.parametrize(
+    ("metrics", "reason"),
+    [
+        (
+            {"mean_steps": float("nan")},
+            "what the task has returned as mean_steps is nan, but it must be",
+        ),
+        ({"mean_steps": -float("inf")}, "what the task has returned as mean_steps is -inf, but it must be a finite"),
+        ({"mean_steps": None}, "what the task has returned as mean_steps is None, but it must be"),
+        (
+            {"mean_steps": 1.0, "other": "fast"},
+            "what the task has returned as other is 'fast', but it",
+        ),
+        ({"other": 1.0}, "the task has not returned mean_steps, but only other"),
+        (3.0, "the task has returned 3.0, but it must be metrics by their names"),
+    ],
+    ids=str,
+)
+def test_worker_fails_a_trial_that_returns_something_else_than_metrics(work, metrics, reason):
+    study = work("a", lambda _: metrics)
+    assert [trial.state.name for trial in study.trials] == ["FAIL"] * 3
+    assert reason in study.trials[0].user_attrs["failure"]
+    assert best_trials(study, 1) == []
+
+
+@pytest.mark.parametrize("raised", [SystemExit(0), KeyboardInterrupt()], ids=repr)
+def test_worker_outlives_a_task_that_would_end_it(work, raised):
+    def second_raises(attempt):
+        if attempt.trial.number == 1:
+            raise raised
+        return {"mean_steps": np.float32(0.5), "other": float("nan")}
+
+    study = work("a", second_raises, n_trials=2)
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE", "FAIL", "COMPLETE"]
+
+
+def test_worker_goes_on_with_a_broken_study_once_its_failures_are_forgiven(work):
+    def raises(_):
+        raise RuntimeError("a mistake that somebody mends then")
+
+    study = work("a", raises)
+    assert [trial.state.name for trial in work("a").trials] == ["FAIL"] * 3
+    scheduler = TrialScheduler(study, work.storage("a"), Limits(n_trials=5))
+    assert [scheduler.reset_failures(), scheduler.reset_failures()] == [3, 0]
+    assert [trial.state.name for trial in work("a").trials] == ["FAIL"] * 3 + ["COMPLETE"] * 5
+
+
+def test_worker_needs_of_a_report_only_what_is_pruned_by(work):
+    def reports(attempt):
+        attempt.report({"mean_steps": 1.0}, seed=0, n_env_steps=1, grid=1, total=1)
+        return {"mean_steps": 1.0}
+
+    assert {trial.state.name for trial in work("a", reports).trials} == {"COMPLETE"}

@@ -1,0 +1,135 @@
+"""What is to be tracked of a run, in a file of its folder."""
+
+import json
+import multiprocessing
+import time
+
+import pytest
+
+from armscan.errors import FolderInUseError, TrackingError
+from armscan.tracking.outbox import Address, Outbox, file_of, outbox_files, take_over
+from tests.support.waiting import HANG_S
+
+ADDRESS = Address("a" * 32, "sqlite:///runs.db")
+
+
+@pytest.fixture
+def outbox(tmp_path):
+    outbox = Outbox.begin(tmp_path, ADDRESS)
+    yield outbox
+    outbox.close()
+
+
+def kinds(entries):
+    return [next(iter(entry)) for entry in entries]
+
+
+def test_outbox_keeps_entries_in_their_order_and_what_is_delivered_of_each_channel(outbox, tmp_path):
+    outbox.add(tags={"a": "b"})
+    outbox.add(file="best.pt")
+    outbox.add(metrics=[("x", 1.0, 5, 100)])
+    figures, end = outbox.next_entries("figures", 10)
+    assert kinds(figures) == ["address", "tags", "metrics"]
+    assert figures[2]["metrics"] == [["x", 1.0, 5, 100]]
+    assert outbox.next_entries("files", 10)[0] == [{"file": "best.pt"}]
+    outbox.mark("figures", end)
+    outbox.close()
+    again = Outbox.begin(tmp_path, ADDRESS)
+    assert again.next_entries("figures", 10)[0] == []
+    assert not again.is_delivered
+    again.mark("files", again.next_entries("files", 10)[1])
+    assert again.is_delivered
+    again.add(status=("FINISHED", 7))
+    assert (again.is_delivered, again.status) == (False, "FINISHED")
+    again.close()
+
+
+def test_outbox_gives_no_more_entries_than_asked_for(outbox):
+    for step in range(5):
+        outbox.add(metrics=[("x", 1.0, 5, step)])
+    first, end = outbox.next_entries("figures", 3)
+    outbox.mark("figures", end)
+    rest, _ = outbox.next_entries("figures", 10)
+    assert (len(first), len(rest)) == (3, 3)
+
+
+def test_outbox_cuts_off_a_line_whose_writer_died(outbox, tmp_path):
+    outbox.add(tags={"a": "b"})
+    outbox.close()
+    with outbox.file.open("ab") as file:
+        file.write(b'{"metrics": [["x", 1.')
+    again = Outbox.begin(tmp_path, ADDRESS)
+    again.add(status=("FINISHED", 7))
+    assert kinds(again.entries()) == ["address", "tags", "status"]
+    again.close()
+
+
+@pytest.mark.parametrize("damage", [b"nonsense\n", b"[1]\n", b'{"\xff": 1}\n'])
+def test_outbox_names_a_damaged_line(outbox, damage):
+    with outbox.file.open("ab") as file:
+        file.write(damage)
+    with pytest.raises(TrackingError, match=f"{outbox.file}: a line of it is damaged"):
+        list(outbox.entries())
+
+
+@pytest.mark.parametrize("contents", [b"", b'{"tags": {}}\n', b'{"address": {"run": 1}}\n', b'{"address": 3}\n'])
+def test_outbox_names_a_file_that_does_not_say_what_it_is_of(tmp_path, contents):
+    file = file_of(tmp_path, "b" * 32)
+    file.parent.mkdir()
+    file.write_bytes(contents)
+    with pytest.raises(TrackingError, match="does not begin with the run that it is of"):
+        Outbox(file)
+    # Nobody holds what could not be opened.
+    file.write_bytes(json.dumps({"address": {"run_id": "b", "uri": "c"}}).encode() + b"\n")
+    Outbox(file, timeout_s=0.0).close()
+
+
+@pytest.mark.parametrize(
+    "said",
+    ["{", "[]", "5", *(f'{{"figures": {end}, "files": {end}}}' for end in ("99999999", "-5", '"x"', "7", "true"))],
+)
+def test_outbox_delivers_all_again_where_nobody_knows_what_was_delivered(outbox, tmp_path, said):
+    outbox.mark("figures", outbox.next_entries("figures", 10)[1])
+    outbox.file.with_suffix(".delivered.json").write_text(said)
+    outbox.close()
+    again = Outbox.begin(tmp_path, ADDRESS)
+    assert kinds(again.next_entries("figures", 10)[0]) == ["address"]
+    again.close()
+
+
+def hold(folder, is_held):
+    folder_lock = Outbox.begin(folder, ADDRESS)
+    is_held.set()
+    time.sleep(HANG_S)
+    folder_lock.close()
+
+
+def test_outbox_is_held_by_one_process_until_that_dies(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    is_held = context.Event()
+    process = context.Process(target=hold, args=(tmp_path, is_held))
+    process.start()
+    assert is_held.wait(HANG_S)
+    with pytest.raises(FolderInUseError, match="another process tracks this run"):
+        Outbox(file_of(tmp_path, ADDRESS.run_id), timeout_s=0.0)
+    process.kill()
+    process.join()
+    Outbox(file_of(tmp_path, ADDRESS.run_id), timeout_s=5.0).close()
+
+
+def test_outbox_is_taken_over_with_what_is_delivered_of_it(outbox, tmp_path):
+    outbox.add(tags={"a": "b"})
+    outbox.mark("figures", outbox.next_entries("figures", 1)[1])
+    outbox.close()
+    take_over(ADDRESS.run_id, tmp_path, tmp_path / "retry")
+    assert outbox_files(tmp_path) == [file_of(tmp_path / "retry", ADDRESS.run_id)]
+    again = Outbox.begin(tmp_path / "retry", ADDRESS)
+    assert kinds(again.next_entries("figures", 10)[0]) == ["tags"]
+    again.close()
+    take_over("c" * 32, tmp_path, tmp_path / "retry")
+
+
+def test_outbox_that_is_not_there_is_not_made(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        Outbox(file_of(tmp_path / "gone", ADDRESS.run_id))
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,35 @@
+"""What episodes add up to, with intervals."""
+
+import dataclasses
+
+import pytest
+
+from armscan.training import Evaluation, MetricEstimates
+from tests.training.test_train import evaluation_of
+
+
+def test_figures_agree_with_the_metrics_of_training():
+    episodes = evaluation_of(1, 3, 50).episodes
+    episodes = tuple(
+        dataclasses.replace(episode, starts_solved=index == 0, volume=str(index))
+        for index, episode in enumerate(episodes)
+    )
+    evaluation = Evaluation(episodes)
+    figures = MetricEstimates.of(evaluation)
+    metrics = figures.metrics()
+    for name, value in evaluation.metrics().items():
+        assert metrics[name] == pytest.approx(value), name
+    assert (figures.n_volumes, figures.n_episodes, figures.n_started_solved) == (3, 3, 1)
+    assert metrics["median_steps"] == 3.0
+    assert metrics["p95_steps"] == pytest.approx(45.3)
+    assert metrics["median_steps_not_started_solved"] == 26.5
+    assert metrics["mean_steps_low"] <= 18.0 <= metrics["mean_steps_high"]
+    assert metrics["mean_dice_artery"] == pytest.approx(0.7)
+    assert metrics["success_rate_wilson_low"] == pytest.approx(0.4385, abs=1e-4)
+
+
+def test_figures_of_episodes_that_all_start_solved_are_not_those_of_others():
+    episodes = tuple(dataclasses.replace(episode, starts_solved=True) for episode in evaluation_of(1, 1).episodes)
+    metrics = MetricEstimates.of(Evaluation(episodes)).metrics()
+    assert metrics["success_rate"] == 1.0
+    assert metrics["success_rate_not_started_solved"] != metrics["success_rate_not_started_solved"]

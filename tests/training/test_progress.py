@@ -1,0 +1,40 @@
+"""The progress bar of a training."""
+
+import pytest
+from rich.console import Console
+
+from armscan.training import EpisodeResult, EpochReport, Evaluation
+from armscan.training.progress import ProgressBar
+
+
+@pytest.fixture
+def narrow(monkeypatch):
+    """A terminal of 80 columns, which keeps what is printed."""
+    console = Console(width=80, force_terminal=True, record=True)
+    monkeypatch.setattr("rich._console", console)
+    return console
+
+
+def test_progress_bar_shows_all_of_its_figures_in_80_columns(narrow):
+    episode = EpisodeResult(
+        volume="a",
+        seed=0,
+        n_steps=50,
+        is_success=True,
+        starts_solved=False,
+        episode_return=-123.456,
+        final_reward=0.0,
+        best_reward=0.0,
+        **dict.fromkeys(("distance_mm", "distance_deg", "dice_bones", "dice_tendons", "dice_artery"), 0.5),
+        seconds_per_plane=0.001,
+    )
+    report = EpochReport(
+        epoch=1, n_env_steps=120_000, wall_s=60.0, metrics={}, evaluation=Evaluation((episode,)), is_best=True
+    )
+    bar = ProgressBar()
+    bar.on_start(240_000, [report])
+    bar.on_end()
+    (line,) = narrow.export_text().strip().splitlines()
+    for figure in ("120000/240000", "return -123.46", "success 100%", "length 50.00", "-:--:--"):
+        assert figure in line
+    assert "━" in line

@@ -1,0 +1,112 @@
+"""Whole episodes, and what they add up to."""
+
+import math
+
+import numpy as np
+import pytest
+
+from armscan.envs import make_armscan_env
+from armscan.errors import InvalidValueError
+from armscan.training import Evaluation, evaluate
+from tests.training.test_train import evaluation_of
+
+
+class Still:
+    """Stays in the middle."""
+
+    def begin(self, *, seed, bounds):
+        pass
+
+    def act(self, observation, reward):
+        return np.zeros(1)
+
+
+class Oracle:
+    """Knows the optimal plane."""
+
+    def __init__(self, env):
+        self._env = env.unwrapped
+
+    def begin(self, *, seed, bounds):
+        pass
+
+    def act(self, observation, reward):
+        return self._env.scene.optimum_normalised[3:]
+
+
+def test_evaluate_visits_the_volumes_in_turn(dataset):
+    env = make_armscan_env(dataset, max_steps=2)
+    evaluation = evaluate(Oracle(env), env, n_episodes=6, seed=5)
+    names = list(dataset)
+    assert [episode.volume for episode in evaluation.episodes] == [*names, *names[:2]]
+    assert [episode.seed for episode in evaluation.episodes] == [5, 6, 7, 8, 9, 10]
+    assert evaluation.success_rate == 1.0
+    assert evaluation.mean_steps == 1.0
+    assert evaluation.metrics()["mean_distance_mm"] == pytest.approx(0, abs=1e-6)
+
+
+def test_evaluate_gives_every_agent_the_same_episodes(dataset):
+    env = make_armscan_env(dataset, max_steps=3)
+    starts = [
+        [episode.starts_solved for episode in evaluate(agent, env, n_episodes=12, seed=1).episodes]
+        for agent in (Still(), Oracle(env))
+    ]
+    assert starts[0] == starts[1]
+
+
+def test_evaluate_counts_episodes_that_start_solved_apart(dataset):
+    env = make_armscan_env(dataset, max_steps=3)
+    metrics = evaluate(Still(), env, n_episodes=40, seed=0).metrics()
+    n_solved = metrics["episodes_started_solved"]
+    assert 0 < n_solved < 40
+    assert metrics["success_rate"] == n_solved / 40
+    assert metrics["success_rate_not_started_solved"] == 0.0
+    assert metrics["mean_steps_not_started_solved"] == 3.0
+    assert metrics["mean_steps"] == (n_solved + 3 * (40 - n_solved)) / 40
+
+
+def test_episode_of_the_optimal_plane_shows_its_slice(dataset):
+    env = make_armscan_env(dataset, max_steps=2)
+    for episode in evaluate(Oracle(env), env, n_episodes=4, seed=5).episodes:
+        assert episode.mean_dice == pytest.approx(1.0, abs=0.01)
+        assert episode.seconds_per_plane > 0
+
+
+class Thrice:
+    """Tries three places, the middle one the best."""
+
+    def begin(self, *, seed, bounds):
+        self._places = iter((-1.0, 0.0, 1.0))
+
+    def act(self, observation, reward):
+        return np.array([next(self._places)])
+
+
+def test_best_reward_is_that_of_the_planes_that_were_chosen(dataset):
+    env = make_armscan_env(dataset, max_steps=3, success_threshold=0.001)
+    episodes = [each for each in evaluate(Thrice(), env, n_episodes=8, seed=0).episodes if not each.is_success]
+    assert all(episode.best_reward >= episode.final_reward for episode in episodes)
+    assert any(episode.best_reward > episode.final_reward for episode in episodes)
+    assert all(type(episode.dice_bones) is float and 0.0 <= episode.mean_dice < 0.9 for episode in episodes)
+
+
+def test_episodes_are_equal_however_long_they_took(dataset):
+    env = make_armscan_env(dataset, max_steps=3)
+    assert evaluate(Still(), env, n_episodes=4, seed=0) == evaluate(Still(), env, n_episodes=4, seed=0)
+
+
+def test_evaluation_without_episodes_has_no_means():
+    assert math.isnan(Evaluation(()).mean_steps)
+
+
+def test_evaluation_is_ready_for_json():
+    import json
+
+    contents = json.loads(json.dumps(evaluation_of(1, 3).to_dict()))
+    assert contents["metrics"]["mean_steps"] == 2.0
+    assert len(contents["episodes"]) == 2
+
+
+def test_evaluate_refuses_no_episodes(dataset):
+    with pytest.raises(InvalidValueError, match="episodes is 0"):
+        evaluate(Still(), make_armscan_env(dataset), n_episodes=0, seed=0)

@@ -1,0 +1,160 @@
+"""Which volumes are trained on, which choose the checkpoint, and which judge."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+
+from armscan.errors import InvalidValueError
+from armscan.training import Split, mixed_data, nifti_data, phantom_data
+from tests.volumes.test_damaged import SETTINGS, anything, refuses
+
+
+def test_phantom_data_has_phantoms_of_other_seeds_for_each_purpose():
+    split = phantom_data(n_training=2, n_validation=1, n_test=1, first_seed=5)
+    assert list(split.training) == ["phantom-5", "phantom-6"]
+    assert list(split.validation) == ["phantom-1000000"]
+    assert list(split.test) == ["phantom-2000000"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"n_training": 0},
+        {"n_validation": 1.5},
+        {"n_validation": 10**7},
+        {"n_test": 0},
+        {"first_seed": -1},
+        {"first_seed": 10**6},
+    ],
+)
+def test_phantom_data_refuses_impossible_numbers(changes):
+    with pytest.raises(InvalidValueError, match=r"data\."):
+        phantom_data(**({"n_training": 1, "n_validation": 1, "n_test": 1} | changes))
+
+
+@pytest.fixture
+def folder(write_labelmap, tmp_path):
+    """Six volumes of four subjects."""
+    volumes = {f"{name}.nrrd": {"subject": subject} for name, subject in zip("abcdef", "SSTTUV", strict=True)}
+    for name in volumes:
+        write_labelmap(name)
+
+    def write(**manifest):
+        (tmp_path / "manifest.json").write_text(json.dumps({"volumes": volumes} | manifest))
+        return str(tmp_path)
+
+    return write
+
+
+def names(split):
+    return tuple("".join(name[0] for name in part) for part in (split.training, split.validation, split.test))
+
+
+def test_nifti_data_takes_the_splits_of_the_manifest(folder):
+    path = folder(splits={"train": ["S", "V"], "validation": ["T"], "test": ["U"]})
+    assert names(nifti_data(path)) == ("abf", "cd", "e")
+
+
+@pytest.mark.parametrize(
+    ("validation", "test", "n_subjects"),
+    [(None, None, (2, 1, 1)), (0.25, 0.5, (1, 1, 2)), (0.01, 0.26, (1, 1, 2)), (None, 0.5, (1, 1, 2))],
+)
+def test_nifti_data_draws_shares_of_the_subjects(folder, validation, test, n_subjects):
+    split = nifti_data(folder(), validation, test)
+    subjects = dict(zip("abcdef", "SSTTUV", strict=True))
+    by_part = [{subjects[volume] for volume in part} for part in names(split)]
+    assert tuple(map(len, by_part)) == n_subjects
+    assert set.union(*by_part) == set("STUV")
+    assert sorted("".join(names(split))) == list("abcdef")
+
+
+def test_nifti_data_draws_the_shares_by_its_seed(folder):
+    path = folder()
+    drawn = [names(nifti_data(path, split_seed=seed)) for seed in (0, 0, 1, 2, 3)]
+    assert drawn[0] == drawn[1]
+    assert len(set(drawn)) > 1
+
+
+@pytest.mark.parametrize(
+    ("validation", "test", "expected"),
+    [
+        ("S", ["U"], ("cdf", "ab", "e")),
+        (["a.nrrd", "b.nrrd"], ["V", "e.nrrd"], ("cd", "ab", "ef")),
+        (["V"], "f.nrrd", "data.validation and data.test both name f.nrrd|data.test and data.validation both name"),
+        ("a.nrrd", "U", "a.nrrd is for validation and b.nrrd for train, but both are of the subject S"),
+        ("a.nrrd", "b.nrrd", "a.nrrd is for validation and b.nrrd for test, but both are of the subject S"),
+        ("W", None, "data.validation names W, but .* holds a.nrrd, .* or V"),
+        ([3], None, r"data.validation is \[3\], but it must be a share, or names"),
+        (0.0, None, "data.validation is 0.0, but it must be a share above 0"),
+        (1.5, None, "data.validation is 1.5, but it must be a share above 0"),
+        (True, None, "data.validation is True, but it must be a share above 0"),
+        (None, float("nan"), "data.test is nan, but it must be a share above 0"),
+        (0.25, 0.9, "of 0 volumes for training, 0 for validation and 6 for the test, each must be at least 1"),
+        ([], None, "0 for validation"),
+        (["S", "T", "U"], ["V"], "of 0 volumes for training, 5 for validation and 1 for the test"),
+    ],
+)
+def test_nifti_data_takes_names_of_subjects_and_volumes(folder, validation, test, expected):
+    # What is given goes before what the manifest says.
+    path = folder(splits={"train": ["S", "V"], "validation": ["T"], "test": ["U"]})
+    if isinstance(expected, tuple):
+        assert names(nifti_data(path, validation, test)) == expected
+    else:
+        with pytest.raises(InvalidValueError, match=expected):
+            nifti_data(path, validation, test)
+
+
+def test_nifti_data_refuses_a_manifest_without_a_split_for_everything(folder):
+    with pytest.raises(InvalidValueError, match="of 6 volumes for training, 0 for validation and 0 for the test"):
+        nifti_data(folder(splits={"train": ["S", "T", "U", "V"]}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "training"),
+    [
+        ({}, ["a.nrrd", "b.nrrd", "c.nrrd", "d.nrrd", "e.nrrd", "f.nrrd", "phantom-0"]),
+        ({"n_volumes": 2}, ["a.nrrd", "b.nrrd", "phantom-0"]),
+        ({"n_volumes": 1, "n_training": 0}, ["a.nrrd"]),
+    ],
+)
+def test_mixed_data_trains_on_the_folder_and_judges_on_phantoms(folder, changes, training):
+    split = mixed_data(folder(), **{"n_training": 1, "n_validation": 1, "n_test": 1} | changes)
+    assert list(split.training) == training
+    assert [*split.validation, *split.test] == ["phantom-1000000", "phantom-2000000"]
+
+
+@pytest.mark.parametrize("changes", [{"n_volumes": 7}, {"n_volumes": 0}, {"n_training": -1}, {"n_training": None}])
+def test_mixed_data_refuses_impossible_numbers(folder, changes):
+    with pytest.raises(InvalidValueError, match=r"data\.n_"):
+        mixed_data(folder(), **{"n_training": 1, "n_validation": 1, "n_test": 1} | changes)
+
+
+def test_nifti_data_reads_the_shared_manifest_as_it_is(data_folder):
+    assert [len(part) for part in names(nifti_data(str(data_folder)))] == [2, 1, 1]
+
+
+@SETTINGS
+@given(anything, anything, anything)
+def test_nifti_data_answers_any_argument(folder, validation, test, split_seed):
+    refuses(lambda: nifti_data(folder(), validation, test, split_seed))
+    refuses(lambda: nifti_data(folder(), validation="U", test=test))
+    refuses(lambda: nifti_data(validation))
+
+
+@SETTINGS
+@given(anything, anything)
+def test_split_answers_any_argument(tiny_volume, training, validation):
+    refuses(lambda: Split(training, validation, {"a": tiny_volume}))
+
+
+@pytest.mark.parametrize("volumes", [None, [], {"a": np.zeros(3)}])
+def test_split_refuses_what_are_no_volumes(tiny_volume, volumes):
+    with pytest.raises(InvalidValueError, match="the validation volumes are"):
+        Split({"a": tiny_volume}, volumes, {"b": tiny_volume})
+
+
+def test_split_refuses_a_volume_in_two_parts(tiny_volume):
+    with pytest.raises(InvalidValueError, match="a is in training and in test"):
+        Split({"a": tiny_volume}, {"b": tiny_volume}, {"a": tiny_volume})

@@ -1,0 +1,407 @@
+"""MLflow's UI and Optuna's dashboard as a person opens them: started, looked at in a browser, ended in every way."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+import urllib.request
+from contextlib import closing
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from threading import Thread
+
+import optuna
+import pytest
+from mlflow import MlflowClient
+
+from armscan.cli.main import main
+from armscan.config.credentials import STORAGE_PASSWORD, TRACKING_PASSWORD
+from armscan.sweeps.storage.database import tables_in, url_of
+from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.dashboard import LOCAL_UI
+from armscan.ui import servers
+from armscan.ui.servers import HOST
+from tests.support.postgres import PASSWORD
+from tests.support.processes import processes_in
+
+SMALL = [
+    *("-m", "sweep=sac_y", "study.name=small", "study.n_trials=3", "study.workers=1", "study.final_eval.top_k=0"),
+    *("study/pruner=none", "data.n_training=1", "data.n_validation=1", "data.n_test=1", "training.env_steps=600"),
+    *("training.eval_every_env_steps=200", "training.validation_episodes=2", "env.max_steps=8", "agent.batch_size=32"),
+    *("agent.learning_starts=100", "network.vector.hidden_sizes=[16]"),
+]
+TRAINING = "sac-cluster-y-phantom-seed0"
+START_S, END_S = 150, 60
+PORT_OPTIONS = ("--mlflow-port", "--dashboard-port")
+
+
+def free_ports(n=2):
+    folder_lock = [socket.socket() for _ in range(n)]
+    for each in folder_lock:
+        each.bind((HOST, 0))
+    ports = [each.getsockname()[1] for each in folder_lock]
+    for each in folder_lock:
+        each.close()
+    return ports
+
+
+def make_study(uri):
+    study = optuna.create_study(study_name="a", storage=open_storage(uri).optuna, load_if_exists=True)
+    study.optimize(lambda trial: trial.suggest_float("x", 0, 1), n_trials=2)
+
+
+def make_experiment(uri):
+    MlflowClient(tracking_uri=uri).create_experiment("mine")
+
+
+def answer_of(address):
+    with urllib.request.urlopen(address, timeout=30) as answer:
+        return answer.read().decode()
+
+
+def studies_at(address):
+    return [each["study_name"] for each in json.loads(answer_of(f"{address}/api/studies"))["study_summaries"]]
+
+
+def experiments_at(address):
+    return {each.name for each in MlflowClient(tracking_uri=address).search_experiments()}
+
+
+def wait_for(moment, timeout_s=END_S):
+    until_s = time.monotonic() + timeout_s
+    while not moment():
+        assert time.monotonic() < until_s
+        time.sleep(0.05)
+
+
+class Look:
+    """The command as a person starts it, with ports of its own; ready when it says how it is ended."""
+
+    def __init__(self, folder, *words, **environment):
+        self.folder, self.file = folder, folder / "printed"
+        mlflow_port, dashboard_port = free_ports()
+        self.mlflow, self.dashboard = f"http://{HOST}:{mlflow_port}", f"http://{HOST}:{dashboard_port}"
+        with self.file.open("wb") as file:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "armscan", "ui", *words, f"--dashboard-port={dashboard_port}"]
+                + (
+                    []
+                    if any(word.startswith("--tracking=http") for word in words)
+                    else [f"--mlflow-port={mlflow_port}"]
+                ),
+                cwd=folder,
+                env=os.environ | environment,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                # Whatever this process was started by, a Ctrl-C reaches it.
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+            )
+        wait_for(lambda: "Ctrl-C ends" in self.printed or self.process.poll() is not None, START_S)
+
+    @property
+    def printed(self):
+        return self.file.read_text()
+
+    @property
+    def servers(self):
+        return [pid for pid in processes_in(self.folder) if pid != self.process.pid]
+
+    def end(self, number=signal.SIGINT):
+        self.process.send_signal(number)
+        return self.process.wait(END_S)
+
+
+@pytest.fixture
+def look():
+    looks = []
+
+    def start(*words, **environment):
+        looks.append(Look(*words, **environment))
+        return looks[-1]
+
+    yield start
+    for each in looks:
+        each.process.kill()
+        each.process.wait()
+        wait_for(lambda folder=each.folder: processes_in(folder) == [])
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    """A folder with a study and an experiment in the usual places."""
+    folder = tmp_path_factory.mktemp("both")
+    make_study(str(folder / "optuna.journal"))
+    make_experiment(f"sqlite:///{folder}/mlruns.db")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--study=a"], "No such option '--study'."),
+        (["storage"], "Got unexpected extra argument (storage)"),
+        (["--storage="], "Invalid value for '--storage': an address is required."),
+        (["--mlflow-port=0"], "Invalid value for '--mlflow-port': 0 is not in the range 1<=x<=65535."),
+        (["--dashboard-port=65536"], "Invalid value for '--dashboard-port': 65536 is not in the range 1<=x<=65535."),
+        (["--dashboard-port=http"], "Invalid value for '--dashboard-port': 'http' is not a valid integer"),
+        (["--mlflow-port=8080"], "--mlflow-port and --dashboard-port are both 8080, but each must have its own"),
+        (["--tracking=http://127.0.0.1:1", "--mlflow-port=5001"], "--mlflow-port is 5001, but the runs are kept by a"),
+        (["--artifacts=nowhere"], "--artifacts is 'nowhere', but there is no such folder"),
+        (["--storage=nowhere/a.journal"], "--storage is 'nowhere/a.journal', but there are no studies there"),
+        (["--storage=sqlite:///nowhere.db"], "--storage is 'sqlite:///nowhere.db', but there are no studies there"),
+        (
+            ["--storage=mysql://me@there/db"],
+            "--storage is 'mysql://me@there/db', but it must be a file, sqlite:///FILE",
+        ),
+        (["--storage=other"], "--storage is '{here}/other', but that file is no journal of Optuna"),
+        (["--tracking=sqlite:///nowhere.db"], "--tracking is 'sqlite:///nowhere.db', but there are no runs there"),
+        (
+            ["--tracking=sqlite:///other"],
+            "--tracking is 'sqlite:///other', but this store cannot be used: file is not a",
+        ),
+        (["--tracking=./mlruns"], "--tracking is './mlruns', but it must be sqlite:///FILE, postgresql://... or an"),
+        (["--tracking=http://127.0.0.1:1"], "--tracking is 'http://127.0.0.1:1', but no server answers there"),
+        (
+            ["--tracking=postgresql://me@127.0.0.1:1/db"],
+            "--tracking is 'postgresql://me@127.0.0.1:1/db', but this store cannot be used: ",
+        ),
+        (
+            ["--tracking=postgresql://me@there:port/db"],
+            "--tracking is 'postgresql://me@there:port/db', but this store cannot",
+        ),
+        ([], "there is nothing to look at, no studies in 'optuna.journal' and no runs in 'sqlite:///mlruns.db': give"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_ui_answers_mistakes_in_one_line_and_makes_nothing(tmp_path, monkeypatch, capsys, words, line):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    (tmp_path / "other").write_text("not what is looked for\n" * 100)
+    assert main(["ui", *words]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f"error: {line.format(here=tmp_path)}")
+    assert printed.err.count("\n") == 1
+    assert PASSWORD not in printed.err
+    assert printed.out == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["other"]
+
+
+@pytest.mark.parametrize("option", PORT_OPTIONS)
+def test_ui_names_a_port_that_is_taken_and_starts_nothing(both, monkeypatch, capsys, option):
+    monkeypatch.chdir(both)
+    with socket.create_server((HOST, 0)) as taken:
+        port = taken.getsockname()[1]
+        others = [f"{other}={free}" for other, free in zip(PORT_OPTIONS, free_ports(), strict=True) if other != option]
+        assert main(["ui", f"{option}={port}", *others]) == 2
+    printed = capsys.readouterr()
+    assert printed.err == f"error: {option} is {port}, but that port of {HOST} is taken: give another\n"
+    assert printed.out == ""
+    assert processes_in(both) == [os.getpid()]
+
+
+def test_ui_shows_what_is_there_until_it_is_interrupted(both, look):
+    looked = look(both)
+    assert looked.printed.splitlines()[-3:] == [
+        f"studies   {looked.dashboard}",
+        f"runs      {looked.mlflow}   under Model training, at its top left",
+        "Ctrl-C ends both",
+    ]
+    assert studies_at(looked.dashboard) == ["a"]
+    assert "mine" in experiments_at(looked.mlflow)
+    assert looked.end() == 130
+    assert looked.printed.endswith("Ctrl-C ends both\n\ninterrupted; nothing is left running\n")
+    wait_for(lambda: processes_in(both) == [])
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_ui_takes_its_servers_along_when_it_is_killed(both, look, number):
+    looked = look(both)
+    assert len(looked.servers) == 3
+    assert looked.end(number) == -number
+    wait_for(lambda: processes_in(both) == [])
+
+
+@pytest.mark.parametrize(("program", "title"), [("dashboard", "Optuna's dashboard"), ("mlflow", "MLflow")])
+def test_ui_ends_the_other_server_and_says_so_when_one_ends_by_itself(both, look, program, title):
+    looked = look(both)
+    marked = f"armscan.ui.serve\0{program}\0"
+    (server,) = [pid for pid in looked.servers if marked in Path(f"/proc/{pid}/cmdline").read_text()]
+    os.kill(server, signal.SIGKILL)
+    assert looked.process.wait(END_S) == 1
+    said = looked.printed.partition("Ctrl-C ends both\n")[2]
+    assert said.startswith(f"error: {title} has ended by itself, by SIGKILL; the end of its log:\n")
+    assert "Traceback" not in said
+    wait_for(lambda: processes_in(both) == [])
+
+
+def test_ui_shows_the_end_of_the_log_of_a_server_that_cannot_start(both, tmp_path, look):
+    shutil.copy(both / "mlruns.db", tmp_path)
+    with closing(sqlite3.connect(tmp_path / "mlruns.db")) as database, database:
+        database.execute("UPDATE alembic_version SET version_num = '451aebb31d03'")
+    looked = look(tmp_path)
+    assert looked.process.wait(END_S) == 1
+    _, error, log = looked.printed.partition(
+        "error: MLflow has ended by itself, with exit code 1; the end of its log:\n"
+    )
+    assert error
+    assert "out-of-date database schema" in log
+
+
+def test_ui_tells_of_a_server_that_does_not_answer_in_time(both, monkeypatch, capsys):
+    monkeypatch.chdir(both)
+    monkeypatch.setattr(servers, "START_S", 0.0)
+    assert main(["ui", *(f"{option}={port}" for option, port in zip(PORT_OPTIONS, free_ports(), strict=True))]) == 1
+    assert capsys.readouterr().err.startswith("error: Optuna's dashboard does not answer within 0 s of its start; the")
+    wait_for(lambda: processes_in(both) == [os.getpid()])
+
+
+@pytest.mark.parametrize(
+    ("missing", "note"),
+    [
+        ("optuna.journal", "there are no studies in 'optuna.journal' yet; --storage URI names others"),
+        ("mlruns.db", "there are no runs in 'sqlite:///mlruns.db' yet; --tracking URI names others"),
+    ],
+)
+def test_ui_shows_the_one_that_is_there_and_says_that_the_other_is_not(both, tmp_path, look, missing, note):
+    for file in {"optuna.journal", "mlruns.db"} - {missing}:
+        shutil.copy(both / file, tmp_path)
+    looked = look(tmp_path)
+    lines = looked.printed.splitlines()
+    assert lines[0] == f"note: {note}"
+    assert len(lines) == 3
+    assert lines[-1] == "Ctrl-C ends it"
+    assert looked.end() == 130
+    assert not (tmp_path / missing).exists()
+
+
+@pytest.mark.parametrize(("storage", "study_id"), [("{}/a.journal", 0), ("sqlite:///{}/a.db", 1)])
+def test_dashboard_shows_trials_that_come_later(tmp_path, look, storage, study_id):
+    def n_trials():
+        return len(json.loads(answer_of(f"{looked.dashboard}/api/studies/{study_id}"))["trials"])
+
+    uri = storage.format(tmp_path)
+    make_study(uri)
+    looked = look(tmp_path, f"--storage={uri}")
+    assert n_trials() == 2
+    make_study(uri)
+    wait_for(lambda: n_trials() == 4)
+
+
+def test_ui_leaves_runs_to_the_server_that_keeps_them(both, look):
+    class Healthy(BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    asked = []
+    with HTTPServer((HOST, 0), Healthy) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        # Told by a word; what the environment says beside it is the password.
+        looked = look(both, f"--tracking=http://{HOST}:{server.server_port}/", MLFLOW_TRACKING_PASSWORD=PASSWORD)
+        server.shutdown()
+    assert looked.printed.splitlines() == [
+        f"runs      http://{HOST}:{server.server_port}",
+        f"studies   {looked.dashboard}",
+        "Ctrl-C ends it",
+    ]
+    assert asked == ["/health"]
+    assert len(looked.servers) == 1
+
+
+def test_ui_shows_what_is_in_postgresql_and_no_password(postgres, tmp_path, look, monkeypatch, capsys):
+    storage, tracking, empty = (postgres.make_database() for _ in range(3))
+    make_study(storage)
+    make_experiment(tracking.replace("postgresql://", "postgresql+psycopg://"))
+    words = [f"--{key}={uri}" for key, uri in {"storage": storage, "tracking": tracking}.items()]
+    looked = look(tmp_path, *words, **{STORAGE_PASSWORD: PASSWORD, TRACKING_PASSWORD: PASSWORD})
+    assert "Ctrl-C ends both" in looked.printed
+    assert studies_at(looked.dashboard) == ["a"]
+    assert "mine" in experiments_at(looked.mlflow)
+    assert all(PASSWORD not in Path(f"/proc/{pid}/cmdline").read_text() for pid in processes_in(tmp_path))
+    assert looked.end() == 130
+    assert PASSWORD not in looked.printed
+    assert [path.name for path in tmp_path.iterdir()] == ["printed"]
+    monkeypatch.setenv(TRACKING_PASSWORD, PASSWORD)
+    assert main(["ui", f"--tracking={empty}"]) == 2
+    assert "there are no runs there" in capsys.readouterr().err
+    assert tables_in(url_of(empty)) == []
+
+
+def test_ui_loads_nothing_that_trains_or_tracks_before_it_has_to():
+    program = (
+        "import sys, armscan.cli.main, armscan.ui.show\n"
+        "print([m for m in ('torch', 'mlflow', 'optuna', 'sqlalchemy') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.fixture
+def small_study(tmp_path):
+    """A folder in which a person has run a study."""
+    words = [sys.executable, "-m", "armscan.run", *SMALL]
+    ended = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    return tmp_path
+
+
+def test_ui_shows_a_study_in_the_browser(small_study, look, browser):
+    pictures = Path(os.environ.get("ARMSCAN_SCREENSHOTS", small_study / "screenshots")).absolute()
+    looked = look(small_study)
+    study = optuna.load_study(study_name="small", storage=open_storage(str(small_study / "optuna.journal")).optuna)
+
+    browser.open(looked.dashboard)
+    browser.click("*", text="0. small")
+    # The points of its history.
+    browser.count(".scatterlayer .points path", at_least=3)
+    browser.keep(pictures / "study.png")
+    browser.click("a[href$='/trials']")
+    for trial in study.trials:
+        browser.find("span", text=f"Trial {trial.number}")
+    browser.click("span", text="Trial 1")
+    browser.find("h1, h2, h3, h4, h5, h6", text="Trial 1 (trial_id=1)")
+    assert browser.picture("img[alt='learning_curve.png']") > 0
+    browser.keep(pictures / "trial.png")
+    # To its run, where `armscan ui` has MLflow by default.
+    link = browser.find("a", text="its run in MLflow").get_attribute("href")
+    assert link.startswith(f"{LOCAL_UI}/#/")
+    browser.open(link.replace(LOCAL_UI, looked.mlflow))
+    browser.find("h1, h2, h3", text="small-0001")
+    assert browser.address.startswith(f"{looked.mlflow}/#/")
+    assert study.trials[1].user_attrs["mlflow_run"] in browser.address
+
+    browser.open(looked.mlflow)
+    browser.click("span", text="Model training")
+    browser.click("a", text="armscan")
+    browser.find("a", text="study small")
+    assert not browser.has("a", text="small-0001")
+    # The button that shows the children of a run.
+    browser.click("[data-component-id*='runnamecellrenderer']")
+    for trial in study.trials:
+        browser.find("a", text=f"small-000{trial.number}")
+    browser.keep(pictures / "runs.png")
+    browser.click("a", text="small-0001")
+    browser.find("h1, h2, h3", text="small-0001")
+    # Its parent and its child.
+    browser.find("a", text="study small")
+    browser.click("a", text=TRAINING)
+    browser.find("h1, h2, h3", text=TRAINING)
+    browser.click("[role=tab]", text="Model metrics")
+    browser.type("input[placeholder='Search metric charts']", "mean_steps")
+    # A line between two points.
+    browser.count("path.js-line[d*='L']", at_least=1)
+    browser.keep(pictures / "metric.png")
+    browser.click("[role=tab]", text="Artifacts")
+    browser.click("*", text="learning_curve.png")
+    assert browser.picture("img[src^='blob:']") > 0
+    browser.keep(pictures / "artifact.png")
+    assert looked.end() == 130
