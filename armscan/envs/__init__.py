@@ -9,8 +9,7 @@ from armscan.envs.scene import RandomTransform, Scene
 from armscan.envs.slice_observations import SliceChannelsObservation, SliceObservation
 from armscan.envs.spaces import MultiBoxSpace
 from armscan.envs.vector_env import ArmscanVectorEnv
-from armscan.envs.vector_wrappers import VectorBestActionMemory, VectorFrameStack
-from armscan.envs.wrappers import BestActionMemory, FrameStack
+from armscan.envs.wrappers import BestActionMemory, FrameStack, VectorBestActionMemory, VectorFrameStack
 from armscan.volumes.plane import ManipulatorAction
 
 __all__ = [

@@ -13,8 +13,14 @@ from armscan.envs.env import ArmscanEnv
 from armscan.envs.history import boxes_of, check_exclusions
 from armscan.envs.rules import Rules, Volumes, check_reward
 from armscan.envs.vector_env import ArmscanVectorEnv
-from armscan.envs.vector_wrappers import VectorBestActionMemory, VectorFrameStack
-from armscan.envs.wrappers import MOST_KEPT, BestActionMemory, Env, FrameStack
+from armscan.envs.wrappers import (
+    MOST_KEPT,
+    BestActionMemory,
+    Env,
+    FrameStack,
+    VectorBestActionMemory,
+    VectorFrameStack,
+)
 from armscan.errors import InvalidValueError, listed
 from armscan.utils.validation import check_bool, check_int
 from armscan.volumes import LabelVolume
@@ -72,13 +78,9 @@ def make_armscan_env(
         stack_memory: whether the memory is stacked with the rest; otherwise it is added after the stack.
         **kwargs: the other arguments of `ArmscanEnv`.
     """
-    order = _wrapper_order(stack, memory, stack_memory)
-    env: Env = ArmscanEnv(volumes, **kwargs)
-    for wrapper in order:
-        env = FrameStack(env, stack, exclude=stack_exclude) if wrapper == "stack" else BestActionMemory(env, memory)
-    if "stack" not in order:
-        check_exclusions(stack_exclude, boxes_of(env.observation_space, "FrameStack"))
-    return env
+    env = ArmscanEnv(volumes, **kwargs)
+    wrapped: Env = _wrapped(env, FrameStack, BestActionMemory, stack, stack_exclude, memory, stack_memory)
+    return wrapped
 
 
 def make_armscan_vector_env(
@@ -102,15 +104,33 @@ def make_armscan_vector_env(
         stack_memory: likewise.
         **kwargs: the other arguments of `ArmscanVectorEnv`.
     """
-    order = _wrapper_order(stack, memory, stack_memory)
     env: VectorEnv[Any, Any, Any] = ArmscanVectorEnv(num_envs, volumes, **kwargs)
-    for wrapper in order:
-        if wrapper == "stack":
-            env = VectorFrameStack(env, stack, exclude=stack_exclude)
-        else:
-            env = VectorBestActionMemory(env, memory)
-    if "stack" not in order:
-        check_exclusions(stack_exclude, boxes_of(env.single_observation_space, "VectorFrameStack"))
+    env = _wrapped(env, VectorFrameStack, VectorBestActionMemory, stack, stack_exclude, memory, stack_memory)
+    return env
+
+
+def _wrapped(
+    env: Any,
+    stack_frames: Callable[..., Any],
+    keep_best: Callable[..., Any],
+    stack: int,
+    stack_exclude: Sequence[str],
+    memory: int,
+    stack_memory: bool,
+) -> Any:
+    """Return an environment, or many, with the wrappers that are asked for."""
+    is_stacked = check_int("stack", stack, at_least=1, at_most=MOST_KEPT) > 1
+    has_memory = check_int("memory", memory, at_least=0, at_most=MOST_KEPT) > 0
+    check_bool("stack_memory", stack_memory)
+    if has_memory and stack_memory:
+        env = keep_best(env, memory)
+    if is_stacked:
+        env = stack_frames(env, stack, exclude=stack_exclude)
+    if has_memory and not stack_memory:
+        env = keep_best(env, memory)
+    if not is_stacked:
+        space = env.single_observation_space if isinstance(env, VectorEnv) else env.observation_space
+        check_exclusions(stack_exclude, boxes_of(space, "FrameStack"))
     return env
 
 
@@ -118,13 +138,3 @@ def _keywords(maker: Callable[..., Any]) -> list[str]:
     """Return the names of what can only be given by name."""
     parameters = inspect.signature(maker).parameters.values()
     return [parameter.name for parameter in parameters if parameter.kind is inspect.Parameter.KEYWORD_ONLY]
-
-
-def _wrapper_order(stack: int, memory: int, stack_memory: bool) -> list[str]:
-    """Return which wrappers are put around an environment, the innermost first: `stack`, `memory`."""
-    wanted = {
-        "stack": check_int("stack", stack, at_least=1, at_most=MOST_KEPT) > 1,
-        "memory": check_int("memory", memory, at_least=0, at_most=MOST_KEPT) > 0,
-    }
-    order = ("memory", "stack") if check_bool("stack_memory", stack_memory) else ("stack", "memory")
-    return [name for name in order if wanted[name]]

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from armscan.envs.spaces import MultiBoxSpace, Parts
+from armscan.envs.spaces import MultiBoxSpace, Parts, flat_space
 from armscan.errors import InvalidValueError, listed
 
 FLAT = ""
 """The name that a flat observation goes by among parts."""
 
+MEMORY = "memory"
 Mask = NDArray[np.bool_]
 
 
@@ -64,12 +65,28 @@ def check_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozense
     return frozenset(excluded)
 
 
+class Remembered(Protocol):
+    """What a wrapper remembers of the episodes of a batch of environments."""
+
+    boxes: dict[str, spaces.Box]
+    """Space of each part of what one environment observes with it."""
+
+    def refill(self, parts: Parts, infos: Mapping[str, Any], is_first: Mask) -> None:
+        """Begin anew with the first observations, shape (n_envs, ...), of the environments that `is_first` marks."""
+
+    def push(self, parts: Parts, infos: Mapping[str, Any]) -> None:
+        """Add the latest observation and `info` of every environment, shape (n_envs, ...)."""
+
+    def added_to(self, parts: Parts) -> Parts:
+        """Return the latest observations with what is remembered, in arrays that are not filled again."""
+
+
 class FrameHistory:
     """The last observations of a batch of environments, from the oldest to the latest.
 
     Args:
         boxes: space of each part of one environment.
-        size: how many are kept.
+        size: how many observations are kept.
         excluded: parts that are not stacked.
         n_envs: environments of the batch.
 
@@ -79,34 +96,26 @@ class FrameHistory:
 
     def __init__(self, boxes: Mapping[str, spaces.Box], size: int, excluded: Collection[str], n_envs: int) -> None:
         self._size = size
-        self._excluded = check_exclusions(excluded, boxes)
+        excluded = check_exclusions(excluded, boxes)
+        stacked = {name: box for name, box in boxes.items() if name not in excluded}
         # Every frame is written twice, `size` apart, so that the last ones always lie in one piece.
-        self._frames = {
-            name: np.empty((2 * size, n_envs, *box.shape), dtype=box.dtype)
-            for name, box in boxes.items()
-            if name not in self._excluded
-        }
+        self._frames = {name: np.empty((2 * size, n_envs, *box.shape), box.dtype) for name, box in stacked.items()}
         self._latest = size - 1
-        self.boxes = {name: self._stacked_box(name, box) for name, box in boxes.items()}
+        self.boxes = {**boxes, **{name: self._stacked_box(name, box) for name, box in stacked.items()}}
 
-    def refill(self, parts: Parts, is_first: Mask) -> None:
-        """Fill the stacks of environments whose episode begins with its first observation.
-
-        Args:
-            parts: by name, shape (n_envs, ...).
-            is_first: which environments. Shape (n_envs,).
-        """
+    def refill(self, parts: Parts, infos: Mapping[str, Any], is_first: Mask) -> None:
+        """See `Remembered.refill`."""
         for name, frames in self._frames.items():
             frames[:, is_first] = parts[name][is_first]
 
-    def push(self, parts: Parts) -> None:
-        """Add the latest observation of every environment; parts by name, shape (n_envs, ...)."""
+    def push(self, parts: Parts, infos: Mapping[str, Any]) -> None:
+        """See `Remembered.push`."""
         self._latest = (self._latest + 1) % self._size
         for name, frames in self._frames.items():
             frames[self._latest] = frames[self._latest + self._size] = parts[name]
 
-    def stack_frames(self, parts: Parts) -> Parts:
-        """Return the latest observations, shape (n_envs, ...), with what is stacked of them as (n_envs, size, ...)."""
+    def added_to(self, parts: Parts) -> Parts:
+        """Return the latest observations, what is stacked of them as (n_envs, size, ...)."""
         return {name: self._stack(name) if name in self._frames else part for name, part in parts.items()}
 
     def _stack(self, name: str) -> NDArray[Any]:
@@ -116,8 +125,6 @@ class FrameHistory:
         return stack.reshape(len(stack), -1) if name == FLAT else stack
 
     def _stacked_box(self, name: str, box: spaces.Box) -> spaces.Box:
-        if name in self._excluded:
-            return box
         low, high = (np.repeat(bound[None], self._size, axis=0) for bound in (box.low, box.high))
         if name == FLAT:
             low, high = low.ravel(), high.ravel()
@@ -131,47 +138,40 @@ class BestPairs:
     first plane's; a new pair enters only if its reward beats the worst one kept.
 
     Args:
-        size: how many are kept.
+        boxes: space of each part of one environment.
+        size: how many pairs are kept.
         n_free: components of an action.
         n_envs: environments of the batch.
+
+    Raises:
+        InvalidValueError: if there is a part called `memory` already.
     """
 
-    def __init__(self, size: int, n_free: int, n_envs: int) -> None:
+    def __init__(self, boxes: dict[str, spaces.Box], size: int, n_free: int, n_envs: int) -> None:
+        if MEMORY in boxes:
+            raise InvalidValueError(f"the observation already has a part {MEMORY!r}, which BestActionMemory adds")
         self.pairs = np.zeros((n_envs, size, n_free + 1), dtype=np.float32)
-        self._size, self._n_free = size, n_free
+        low, high = [-1.0] * (n_free + 1), [1.0] * n_free + [0.0]
+        box = spaces.Box(np.tile(low, size).astype(np.float32), np.tile(high, size).astype(np.float32))
+        self.boxes = {FLAT: flat_space({**boxes, MEMORY: box})} if FLAT in boxes else {**boxes, MEMORY: box}
 
-    @property
-    def box(self) -> spaces.Box:
-        """Space of one environment's pairs, in a row: (action, reward) of the best, then of the next."""
-        low, high = [-1.0] * (self._n_free + 1), [1.0] * self._n_free + [0.0]
-        return spaces.Box(
-            np.tile(low, self._size).astype(np.float32), np.tile(high, self._size).astype(np.float32), dtype=np.float32
-        )
+    def refill(self, parts: Parts, infos: Mapping[str, Any], is_first: Mask) -> None:
+        """Make all pairs of environments whose episode begins those of its first plane."""
+        self.pairs[is_first] = _paired(infos)[is_first, None]
 
-    def refill(self, actions: NDArray[Any], rewards: NDArray[Any], is_first: Mask) -> None:
-        """Make all pairs of environments whose episode begins those of its first plane.
-
-        Args:
-            actions: shape (n_envs, n_free).
-            rewards: shape (n_envs,).
-            is_first: which environments. Shape (n_envs,).
-        """
-        self.pairs[is_first] = self._paired(actions, rewards)[is_first, None]
-
-    def push(self, actions: NDArray[Any], rewards: NDArray[Any]) -> None:
-        """Add the latest pair of every environment where it is good enough; shapes as in `refill`."""
-        enters = rewards.astype(np.float32) > self.pairs[:, -1, -1]
+    def push(self, parts: Parts, infos: Mapping[str, Any]) -> None:
+        """Add the latest pair of every environment where it is good enough."""
+        enters = infos["reward"].astype(np.float32) > self.pairs[:, -1, -1]
         if enters.any():
-            self.pairs[enters, -1] = self._paired(actions, rewards)[enters]
+            self.pairs[enters, -1] = _paired(infos)[enters]
             order = np.argsort(-self.pairs[enters, :, -1], axis=1, kind="stable")
             self.pairs[enters] = np.take_along_axis(self.pairs[enters], order[:, :, None], axis=1)
 
-    def flat(self) -> NDArray[np.float32]:
-        """Return the pairs of each environment in a row, shape (n_envs, size * (n_free + 1))."""
-        return self.pairs.reshape(len(self.pairs), -1).copy()
+    def added_to(self, parts: Parts) -> Parts:
+        """Return the latest observations with each environment's pairs in a row, (action, reward) of the best first."""
+        pairs = self.pairs.reshape(len(self.pairs), -1).copy()
+        return {FLAT: np.concatenate([parts[FLAT], pairs], axis=-1)} if FLAT in parts else {**parts, MEMORY: pairs}
 
-    def _paired(self, actions: NDArray[Any], rewards: NDArray[Any]) -> NDArray[np.float32]:
-        pairs = np.empty((len(rewards), self._n_free + 1), dtype=np.float32)
-        pairs[:, :-1] = actions
-        pairs[:, -1] = rewards
-        return pairs
+
+def _paired(infos: Mapping[str, Any]) -> NDArray[np.float32]:
+    return np.column_stack([infos["action"], infos["reward"]]).astype(np.float32)

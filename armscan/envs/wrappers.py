@@ -1,4 +1,4 @@
-"""What is put around the environment: frame stack and memory of the best actions.
+"""What is put around one environment or many: frame stack and memory of the best actions.
 
 Gymnasium's own frame stack can leave out no part of an observation, and copies what it stacks twice: with images at
 full size it takes 107 microseconds where this one takes 43. Where both can be used they give the same; a test holds it.
@@ -6,62 +6,56 @@ full size it takes 107 microseconds where this one takes 43. Where both can be u
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 
-from armscan.envs.history import (
-    FLAT,
-    BestPairs,
-    FrameHistory,
-    boxes_of,
-    observation_of,
-    parts_of,
-    space_of,
-)
+from armscan.envs.history import BestPairs, FrameHistory, Remembered, boxes_of, observation_of, parts_of, space_of
 from armscan.envs.rules import Observed
-from armscan.envs.spaces import Parts, flat_space
+from armscan.envs.vector_env import VectorStep, reset_each
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_int
 from armscan.volumes.plane import FloatArray
 
 Env = gym.Env[Any, FloatArray]
-MEMORY = "memory"
 # Observations of a stack, and pairs of a memory.
 MOST_KEPT = 1000
 # Of the one environment that is wrapped.
 ALL = np.array([True])
 
 
-def check_env(env: Any, kind: type[Any]) -> Any:
-    """Return `env` if it is an environment of the given kind."""
-    if not isinstance(env, kind):
-        raise InvalidValueError(f"env is {env!r}, but it must be a gymnasium {kind.__name__}")
-    return env
+class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs):
+    """A wrapper whose observation depends on those before it in the episode; a batch of one."""
 
-
-class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs, ABC):
-    """A wrapper whose observation depends on those before it in the episode."""
+    def __init__(self, env: Env, remembered: Remembered, **arguments: Any) -> None:
+        RecordConstructorArgs.__init__(self, **arguments)
+        gym.Wrapper.__init__(self, env)
+        self.remembered = remembered
+        self.observation_space = space_of(remembered.boxes)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
         """Start an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._remembering(observation, info, is_first=True), info
+        parts, infos = _batch_of_one(observation, info)
+        self.remembered.refill(parts, infos, ALL)
+        return self._with_memory(parts), info
 
     def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Take a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._remembering(observation, info, is_first=False), float(reward), terminated, truncated, info
+        parts, infos = _batch_of_one(observation, info)
+        self.remembered.push(parts, infos)
+        return self._with_memory(parts), float(reward), terminated, truncated, info
 
-    @abstractmethod
-    def _remembering(self, observation: Observed, info: dict[str, Any], *, is_first: bool) -> Observed:
-        """Add an observation to the memory; return it with the memory."""
+    def _with_memory(self, parts: dict[str, Any]) -> Observed:
+        return observation_of({name: part[0] for name, part in self.remembered.added_to(parts).items()})
 
 
 class FrameStack(_Remembering):
@@ -79,20 +73,9 @@ class FrameStack(_Remembering):
     """
 
     def __init__(self, env: Env, stack: int, *, exclude: Collection[str] = ()) -> None:
-        boxes = boxes_of(check_env(env, gym.Env).observation_space, "FrameStack")
-        size = check_int("stack", stack, at_least=1, at_most=MOST_KEPT)
-        self._history = FrameHistory(boxes, size, exclude, 1)
-        RecordConstructorArgs.__init__(self, stack=stack, exclude=exclude)
-        gym.Wrapper.__init__(self, env)
-        self.observation_space = space_of(self._history.boxes)
-
-    def _remembering(self, observation: Observed, info: dict[str, Any], *, is_first: bool) -> Observed:
-        batch = {name: part[None] for name, part in parts_of(observation).items()}
-        if is_first:
-            self._history.refill(batch, ALL)
-        else:
-            self._history.push(batch)
-        return observation_of({name: part[0] for name, part in self._history.stack_frames(batch).items()})
+        boxes = boxes_of(_checked(env, gym.Env).observation_space, "FrameStack")
+        history = FrameHistory(boxes, check_int("stack", stack, at_least=1, at_most=MOST_KEPT), exclude, 1)
+        super().__init__(env, history, stack=stack, exclude=exclude)
 
 
 class BestActionMemory(_Remembering):
@@ -110,37 +93,83 @@ class BestActionMemory(_Remembering):
     """
 
     def __init__(self, env: Env, memory: int) -> None:
-        n_free = int(np.prod(check_env(env, gym.Env).action_space.shape or ()))
-        self._best = BestPairs(check_int("memory", memory, at_least=1, at_most=MOST_KEPT), n_free, 1)
-        boxes = with_memory_box(boxes_of(env.observation_space, "BestActionMemory"), self._best)
-        RecordConstructorArgs.__init__(self, memory=memory)
-        gym.Wrapper.__init__(self, env)
-        self.observation_space = space_of(boxes)
-
-    def _remembering(self, observation: Observed, info: dict[str, Any], *, is_first: bool) -> Observed:
-        actions, rewards = info["action"][None], np.array([info["reward"]])
-        if is_first:
-            self._best.refill(actions, rewards, ALL)
-        else:
-            self._best.push(actions, rewards)
-        return observation_of(with_memory(parts_of(observation), self._best.flat()[0]))
+        boxes = boxes_of(_checked(env, gym.Env).observation_space, "BestActionMemory")
+        size = check_int("memory", memory, at_least=1, at_most=MOST_KEPT)
+        super().__init__(env, BestPairs(boxes, size, _n_free(env.action_space), 1), memory=memory)
 
 
-def with_memory_box(boxes: dict[str, gym.spaces.Box], best: BestPairs) -> dict[str, gym.spaces.Box]:
-    """Return the boxes of an observation with a memory.
+class _VectorRemembering(VectorWrapper):
+    """A wrapper whose observations depend on those before them in the episodes."""
 
-    Raises:
-        InvalidValueError: if there is a part of that name already.
+    def __init__(self, env: VectorEnv[Any, Any, Any], remembered: Remembered) -> None:
+        super().__init__(env)
+        self.remembered = remembered
+        self.single_observation_space = space_of(remembered.boxes)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._has_ended = np.zeros(env.num_envs, dtype=np.bool_)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observed, dict[str, Any]]:
+        """Start episodes."""
+        observations, infos = reset_each(self.env, seed, options)
+        parts, is_first = parts_of(observations), infos["_reward"]
+        self._has_ended &= ~is_first
+        self.remembered.refill(parts, infos, is_first)
+        return observation_of(self.remembered.added_to(parts)), infos
+
+    def step(self, actions: Any) -> VectorStep:
+        """Take a step in every environment."""
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        parts = parts_of(observations)
+        self.remembered.push(parts, infos)
+        if self._has_ended.any():
+            self.remembered.refill(parts, infos, self._has_ended)
+        self._has_ended = terminated | truncated
+        return observation_of(self.remembered.added_to(parts)), rewards, terminated, truncated, infos
+
+
+class VectorFrameStack(_VectorRemembering):
+    """`FrameStack` for many environments.
+
+    Args:
+        env: the environments.
+        stack: as in `FrameStack`.
+        exclude: as in `FrameStack`.
     """
-    if MEMORY in boxes:
-        raise InvalidValueError(f"the observation already has a part {MEMORY!r}, which BestActionMemory adds")
-    if FLAT in boxes:
-        return {FLAT: flat_space({FLAT: boxes[FLAT], MEMORY: best.box})}
-    return {**boxes, MEMORY: best.box}
+
+    def __init__(self, env: VectorEnv[Any, Any, Any], stack: int, *, exclude: Collection[str] = ()) -> None:
+        boxes = boxes_of(_checked(env, VectorEnv).single_observation_space, "VectorFrameStack")
+        size = check_int("stack", stack, at_least=1, at_most=MOST_KEPT)
+        super().__init__(env, FrameHistory(boxes, size, exclude, env.num_envs))
 
 
-def with_memory(parts: Parts, pairs: np.ndarray[Any, np.dtype[np.float32]]) -> Parts:
-    """Return the parts of an observation, or of a batch, with the pairs."""
-    if FLAT in parts:
-        return {FLAT: np.concatenate([parts[FLAT], pairs], axis=-1)}
-    return {**parts, MEMORY: pairs}
+class VectorBestActionMemory(_VectorRemembering):
+    """`BestActionMemory` for many environments.
+
+    Args:
+        env: the environments.
+        memory: as in `BestActionMemory`.
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any], memory: int) -> None:
+        boxes = boxes_of(_checked(env, VectorEnv).single_observation_space, "VectorBestActionMemory")
+        size = check_int("memory", memory, at_least=1, at_most=MOST_KEPT)
+        super().__init__(env, BestPairs(boxes, size, _n_free(env.single_action_space), env.num_envs))
+
+
+def _checked(env: Any, kind: type[Any]) -> Any:
+    """Return `env` if it is an environment of the given kind."""
+    if not isinstance(env, kind):
+        raise InvalidValueError(f"env is {env!r}, but it must be a gymnasium {kind.__name__}")
+    return env
+
+
+def _n_free(action_space: gym.Space[Any]) -> int:
+    return int(np.prod(action_space.shape or ()))
+
+
+def _batch_of_one(observation: Observed, info: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the parts of an observation and what is remembered of `info`, each as a batch of one."""
+    infos = {key: np.asarray(info[key])[None] for key in ("action", "reward") if key in info}
+    return {name: part[None] for name, part in parts_of(observation).items()}, infos

@@ -94,8 +94,8 @@ def test_memory_remembers_clipped_actions(phantom):
     env = make_armscan_env([phantom], memory=1)
     env.reset(seed=1)
     _, reward, *_ = env.step(np.array([5.0]))
-    assert reward <= env.get_wrapper_attr("_best").pairs[0, 0, -1]
-    assert np.abs(env.get_wrapper_attr("_best").pairs[0, :, :-1]).max() <= 1
+    assert reward <= env.get_wrapper_attr("remembered").pairs[0, 0, -1]
+    assert np.abs(env.get_wrapper_attr("remembered").pairs[0, :, :-1]).max() <= 1
 
 
 @pytest.mark.parametrize("arguments", [{"stack": 0}, {"stack": 1.5}, {"memory": -1}, {"memory": "a"}])
