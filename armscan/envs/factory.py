@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from gymnasium.vector import VectorEnv
 
@@ -24,6 +24,8 @@ from armscan.envs.wrappers import (
 from armscan.errors import InvalidValueError, listed
 from armscan.utils.validation import check_bool, check_int
 from armscan.volumes import LabelVolume
+
+AnyEnv = TypeVar("AnyEnv")
 
 
 class EnvFactory:
@@ -78,9 +80,8 @@ def make_armscan_env(
         stack_memory: whether the memory is stacked with the rest; otherwise it is added after the stack.
         **kwargs: the other arguments of `ArmscanEnv`.
     """
-    env = ArmscanEnv(volumes, **kwargs)
-    wrapped: Env = _wrapped(env, FrameStack, BestActionMemory, stack, stack_exclude, memory, stack_memory)
-    return wrapped
+    env: Env = ArmscanEnv(volumes, **kwargs)
+    return _wrapped(env, FrameStack, BestActionMemory, stack, stack_exclude, memory, stack_memory)
 
 
 def make_armscan_vector_env(
@@ -105,19 +106,18 @@ def make_armscan_vector_env(
         **kwargs: the other arguments of `ArmscanVectorEnv`.
     """
     env: VectorEnv[Any, Any, Any] = ArmscanVectorEnv(num_envs, volumes, **kwargs)
-    env = _wrapped(env, VectorFrameStack, VectorBestActionMemory, stack, stack_exclude, memory, stack_memory)
-    return env
+    return _wrapped(env, VectorFrameStack, VectorBestActionMemory, stack, stack_exclude, memory, stack_memory)
 
 
 def _wrapped(
-    env: Any,
-    stack_frames: Callable[..., Any],
-    keep_best: Callable[..., Any],
+    env: AnyEnv,
+    stack_frames: Callable[..., AnyEnv],
+    keep_best: Callable[..., AnyEnv],
     stack: int,
     stack_exclude: Sequence[str],
     memory: int,
     stack_memory: bool,
-) -> Any:
+) -> AnyEnv:
     """Return an environment, or many, with the wrappers that are asked for."""
     is_stacked = check_int("stack", stack, at_least=1, at_most=MOST_KEPT) > 1
     has_memory = check_int("memory", memory, at_least=0, at_most=MOST_KEPT) > 0
@@ -129,8 +129,8 @@ def _wrapped(
     if has_memory and not stack_memory:
         env = keep_best(env, memory)
     if not is_stacked:
-        space = env.single_observation_space if isinstance(env, VectorEnv) else env.observation_space
-        check_exclusions(stack_exclude, boxes_of(space, "FrameStack"))
+        space = "single_observation_space" if isinstance(env, VectorEnv) else "observation_space"
+        check_exclusions(stack_exclude, boxes_of(getattr(env, space), "FrameStack"))
     return env
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
+import os
 import reprlib
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ from ruamel.yaml import YAML
 from yaml.representer import SafeRepresenter
 
 from armscan.errors import InvalidValueError, ManifestError, VolumeError, listed
-from armscan.utils.files import atomic_write
+from armscan.utils.files import atomic_write, sha256
 from armscan.utils.validation import check_float, check_path
 from armscan.volumes.header_checks import CHECKS
 from armscan.volumes.plane import ManipulatorAction
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 MANIFEST_NAMES = ("manifest.yaml", "manifest.yml", "manifest.json", "optimal_actions.json")
 ENTRIES_ONLY = MANIFEST_NAMES[-1]
 NEW_MANIFEST = MANIFEST_NAMES[0]
+# Collections within each other; a manifest has five at the most.
+DEEPEST = 50
 
 Document = dict[str, Any]
 
@@ -43,18 +45,15 @@ def volume_files(folder: Path) -> dict[str, Path]:
         VolumeError: if the folder does not exist, cannot be read, or holds no volume.
     """
     try:
-        if not folder.is_dir():
-            what = "is a file, not a folder" if folder.exists() else "does not exist"
-            raise VolumeError(f"{folder}: the folder of volumes {what}")
-        files = {file.name: file for file in sorted(folder.iterdir()) if file.name.endswith(tuple(CHECKS))}
-        files = {name: file for name, file in files.items() if file.is_file()}
+        found = [file for file in sorted(folder.iterdir()) if file.name.endswith(tuple(CHECKS)) and file.is_file()]
+    except FileNotFoundError as error:
+        raise VolumeError(f"{folder}: the folder of volumes does not exist") from error
     except (OSError, ValueError) as error:
-        if isinstance(error, VolumeError):
-            raise
-        raise VolumeError(f"{folder}: the folder of volumes cannot be read ({error})") from error
-    if not files:
+        reason = (error.strerror if isinstance(error, OSError) else None) or error
+        raise VolumeError(f"{folder}: the folder of volumes cannot be read ({reason})") from error
+    if not found:
         raise VolumeError(f"{folder}: the folder holds no volume (files ending in {listed(CHECKS)})")
-    return files
+    return {file.name: file for file in found}
 
 
 def find_manifest(folder: Path) -> Path | None:
@@ -117,17 +116,10 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
     files = volume_files(folder)
     if unknown := [name for name in recorded if name not in files]:
         raise ManifestError(f"{folder}: a plane is given for {listed(unknown)}, but the folder holds {listed(files)}")
-    with _alone_with(folder):
+    # What two write at the same time, one would lose. The lock is not in the folder, where it would stay behind.
+    lock = Path(tempfile.gettempdir()) / f"armscan-{sha256(os.fsencode(folder.resolve()))[:16]}.lock"
+    with FileLock(lock):
         return _recorded(folder, recorded, files)
-
-
-@contextmanager
-def _alone_with(folder: Path) -> Iterator[None]:
-    """Keep others that write planes of this folder waiting: what two write at the same time, one would lose."""
-    digest = hashlib.sha256(str(folder.resolve()).encode(errors="surrogateescape")).hexdigest()[:16]
-    # Not in the folder, where it would stay behind.
-    with FileLock(Path(tempfile.gettempdir()) / f"armscan-{digest}.lock"):
-        yield
 
 
 def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str, Path]) -> Path:
@@ -148,8 +140,12 @@ def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str
             is_shared = any(other is entry for key, other in entries.items() if key != name)
             entries[name] = dict(entry) if is_shared else entry
             entries[name].update(keys)
-        text = _dumped(entries if path.name == ENTRIES_ONLY else document, path).encode()
-        atomic_write(path, lambda file: file.write(text))
+        text = StringIO()
+        if path.suffix == ".json":
+            text.write(json.dumps(entries if path.name == ENTRIES_ONLY else document, indent=1) + "\n")
+        else:
+            _round_trip().dump(document, text)
+        atomic_write(path, lambda file: file.write(text.getvalue().encode()))
     # ruamel.yaml refuses some odd texts that PyYAML reads, with exceptions of many types.
     except Exception as error:
         raise ManifestError(f"{path}: the manifest cannot be written ({error})") from error
@@ -173,25 +169,26 @@ def _checked_planes(planes: Any) -> dict[str, Document]:
     return recorded
 
 
-def _problem(error: yaml.MarkedYAMLError) -> str:
-    """Return what is wrong in a YAML text, and where, without PyYAML's excerpt of it."""
-    mark = error.problem_mark
-    where = "" if mark is None else f" in line {mark.line + 1}, column {mark.column + 1}"
-    return f"{error.problem or error.context}{where}"
-
-
 def _load(path: Path) -> Document:
     """Read the file, JSON or YAML, without validation."""
-    language, load = ("JSON", _load_json) if path.suffix == ".json" else ("YAML", _load_yaml)
+    is_json = path.suffix == ".json"
     try:
-        document = load(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
+        document = json.loads(text, object_pairs_hook=_without_duplicates) if is_json else _load_yaml(text)
     except OSError as error:
         raise ManifestError(f"{path}: the manifest cannot be read ({error.strerror or error})") from error
     # On some damaged texts PyYAML raises exceptions of other types: KeyError, AttributeError, ...
     except Exception as error:
-        reason = _problem(error) if isinstance(error, yaml.MarkedYAMLError) else " ".join(str(error).split())[:300]
-        raise ManifestError(f"{path}: the manifest cannot be read as {language} ({reason})") from error
-    if document is None and language == "YAML":
+        reason = " ".join(str(error).split())[:300]
+        if isinstance(error, yaml.MarkedYAMLError):
+            # Without PyYAML's excerpt of the text.
+            mark = error.problem_mark
+            where = "" if mark is None else f" in line {mark.line + 1}, column {mark.column + 1}"
+            reason = f"{error.problem or error.context}{where}"
+        raise ManifestError(
+            f"{path}: the manifest cannot be read as {'JSON' if is_json else 'YAML'} ({reason})"
+        ) from error
+    if document is None and not is_json:
         # An empty file, or nothing but comments.
         document = {}
     if not isinstance(document, dict):
@@ -199,34 +196,35 @@ def _load(path: Path) -> Document:
     return {"volumes": document} if path.name == ENTRIES_ONLY else document
 
 
-def _load_json(text: str) -> Any:
-    def without_duplicates(pairs: list[tuple[str, Any]]) -> Document:
-        """Refuse what JSON allows and everybody regrets: a key that is there twice, the first one forgotten."""
-        _check_no_duplicates([key for key, _ in pairs])
-        return dict(pairs)
-
-    return json.loads(text, object_pairs_hook=without_duplicates)
-
-
 def _load_yaml(text: str) -> Any:
-    class Loader(yaml.SafeLoader):
-        """Refuses a key that is there twice."""
+    """Read YAML, unless it is nested more deeply than any manifest, or a mapping has a key twice."""
+    # Of each collection that is open, the nodes in it.
+    open_nodes: list[list[yaml.NodeEvent]] = [[]]
+    for event in yaml.parse(text, yaml.CSafeLoader):
+        if isinstance(event, yaml.CollectionEndEvent):
+            nodes = open_nodes.pop()
+            if isinstance(event, yaml.MappingEndEvent):
+                keys = [key.value for key in nodes[::2] if isinstance(key, yaml.ScalarEvent)]
+                # The key of what is merged may be there for each of it.
+                _check_no_duplicates([key for key in keys if key != "<<"])
+        elif isinstance(event, yaml.NodeEvent):
+            open_nodes[-1].append(event)
+            if isinstance(event, yaml.CollectionStartEvent):
+                open_nodes.append([])
+        if len(open_nodes) > DEEPEST:
+            raise ValueError(f"it is nested more than {DEEPEST} deep")
+    return yaml.load(text, yaml.CSafeLoader)
 
-        def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-            node = super().compose_mapping_node(anchor)
-            keys = (key for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-            _check_no_duplicates([key.value for key in keys if key.tag != "tag:yaml.org,2002:merge"])
-            return node
 
-    return yaml.load(text, Loader)
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> Document:
+    """Refuse what JSON allows and everybody regrets: a key that is there twice, the first one forgotten."""
+    _check_no_duplicates([key for key, _ in pairs])
+    return dict(pairs)
 
 
 def _check_no_duplicates(keys: list[str]) -> None:
-    seen: set[str] = set()
-    for key in keys:
-        if key in seen:
-            raise ValueError(f"the key {key!r} is there twice")
-        seen.add(key)
+    if len(set(keys)) < len(keys):
+        raise ValueError(f"the key {Counter(keys).most_common(1)[0][0]!r} is there twice")
 
 
 def _round_trip() -> YAML:
@@ -236,14 +234,6 @@ def _round_trip() -> YAML:
     # YAML 1.1, which manifests are read as, wants a dot in a number with an exponent.
     editor.representer.add_representer(float, SafeRepresenter.represent_float)
     return editor
-
-
-def _dumped(contents: Document, path: Path) -> str:
-    if path.suffix == ".json":
-        return json.dumps(contents, indent=1) + "\n"
-    text = StringIO()
-    _round_trip().dump(contents, text)
-    return text.getvalue()
 
 
 def _checked(document: Document, path: Path) -> Manifest:

@@ -29,7 +29,7 @@ def test_read_dataset_names_a_missing_folder(tmp_path):
 
 
 def test_read_dataset_refuses_a_file_as_folder(write_labelmap):
-    with pytest.raises(VolumeError, match="is a file, not a folder"):
+    with pytest.raises(VolumeError, match=r"the folder of volumes cannot be read [(]Not a directory"):
         read_dataset(write_labelmap())
 
 

@@ -270,5 +270,5 @@ def test_record_planes_writes_through_a_link_and_keeps_its_permissions(folder, t
 
 def test_manifest_that_is_no_yaml_is_answered_with_the_place(folder):
     (folder / "manifest.yaml").write_text("volumes:\n  a.nii.gz: {exclude: bad: motion}\n")
-    with pytest.raises(ManifestError, match=r"as YAML \(expected .* in line 2, column \d+\)"):
+    with pytest.raises(ManifestError, match=r"as YAML \(did not find expected .* in line 2, column \d+\)"):
         open_dataset(folder)
