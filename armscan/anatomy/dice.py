@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.volumes.volume import LABEL_NAMES, LANDMARK_LABELS
+from armscan.volumes import LABEL_NAMES, LANDMARK_LABELS
 
 
 def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) -> dict[str, float]:

@@ -26,8 +26,8 @@ from armscan.envs.panels import (
     slice_panel,
 )
 from armscan.envs.scene import slice_geometry
+from armscan.volumes import LABEL_NAMES, LabelVolume
 from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance
-from armscan.volumes.volume import LABEL_NAMES, LabelVolume
 
 WIDTH, HEIGHT = 860, 512
 # (left, top, right, bottom)

@@ -14,7 +14,7 @@ from armscan.envs.observations import SliceGeometry, View, smallest_shape
 from armscan.envs.spaces import Parts
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_ints
-from armscan.volumes.volume import LABEL_NAMES, LANDMARK_LABELS
+from armscan.volumes import LABEL_NAMES, LANDMARK_LABELS
 
 Shape = tuple[int, int]
 LONGEST_SIDE_PX = 4096

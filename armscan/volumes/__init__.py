@@ -1,14 +1,14 @@
 """What the agent moves through: labelmap volumes, their files, phantom wrists, and the slicing plane."""
 
 from armscan.volumes.dataset import Dataset, open_dataset, read_dataset
-from armscan.volumes.labelmap import LabelMap
+from armscan.volumes.labelmap import LABEL_NAMES, LANDMARK_LABELS, LabelMap
 from armscan.volumes.manifest import MANIFEST_NAMES, record_planes
 from armscan.volumes.markups import read_markup, write_markup
 from armscan.volumes.phantom import load_phantom, load_phantoms, make_phantom
 from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance, shift_into
 from armscan.volumes.reading import read_volume
 from armscan.volumes.summary import VolumeReport
-from armscan.volumes.volume import LABEL_NAMES, LANDMARK_LABELS, LabelVolume
+from armscan.volumes.volume import LabelVolume
 
 __all__ = [
     "LABEL_NAMES",

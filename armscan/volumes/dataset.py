@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from armscan.errors import InvalidValueError, ManifestError, listed
+from armscan.errors import ManifestError, listed
 from armscan.utils.validation import check_choice, check_path
 from armscan.volumes.manifest import MANIFEST_NAMES, find_manifest, read_manifest, volume_entries, volume_files
 from armscan.volumes.reading import ReadingOptions, read_stored
@@ -33,9 +33,6 @@ class Dataset:
         subjects: whose arm each of them is, by file name; a volume without a subject is its own.
         splits: `train`, `validation` or `test` by file name, None where the manifest has no splits.
         excluded: why a volume of the folder was left out, by file name.
-
-    Raises:
-        InvalidValueError: if one of them is something else, or `reports`, `subjects` or `splits` are of other volumes.
     """
 
     volumes: dict[str, LabelVolume]
@@ -43,14 +40,6 @@ class Dataset:
     subjects: dict[str, str]
     splits: dict[str, str] | None = None
     excluded: dict[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for name, kind in (("volumes", LabelVolume), ("reports", VolumeReport), ("subjects", str), ("excluded", str)):
-            _check_mapping(name, getattr(self, name), kind, None if name == "excluded" else self.volumes)
-        if self.splits is not None:
-            _check_mapping("splits", self.splits, str, self.volumes)
-            for split in self.splits.values():
-                check_choice("a split", split, SPLITS)
 
     def volumes_of(self, split: str) -> dict[str, LabelVolume]:
         """Return the volumes of `train`, `validation` or `test` by file name; none where there are no splits."""
@@ -109,14 +98,6 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
         splits=splits,
         excluded={name: str(entry.exclude) for name, entry in entries.items() if entry.exclude},
     )
-
-
-def _check_mapping(name: str, value: Any, kind: type, volumes: dict[str, LabelVolume] | None) -> None:
-    """Raise `InvalidValueError` unless `value` holds one of a kind for each of the volumes, where they are given."""
-    if not isinstance(value, dict) or not all(isinstance(each, kind) for each in value.values()):
-        raise InvalidValueError(f"{name} is {value!r}, but it must be a dict with a {kind.__name__} by file name")
-    if volumes is not None and value.keys() != volumes.keys():
-        raise InvalidValueError(f"{name} is of {list(value)}, but it must be of the volumes: {list(volumes)}")
 
 
 def _split_of(splits: Splits, subjects: Mapping[str, str], used: Mapping[str, object], where: str) -> dict[str, str]:

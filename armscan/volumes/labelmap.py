@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from armscan.errors import InvalidValueError, VolumeError, listed
 from armscan.utils.validation import check_choice
-from armscan.volumes.volume import LABEL_NAMES
 
+LABEL_NAMES = {0: "background", 1: "bones", 2: "tendons", 3: "artery", 4: "nerve"}
+LANDMARK_LABELS = (1, 2, 3)
+ALLOWED_LABELS = "a labelmap holds " + ", ".join(f"{label} {tissue}" for label, tissue in LABEL_NAMES.items())
 TISSUE_LABELS = {name: label for label, name in LABEL_NAMES.items()}
 BACKGROUND = TISSUE_LABELS["background"]
 # Values this close together are looked up in one table; others are searched for.
@@ -129,15 +131,14 @@ def map_values(
     Raises:
         VolumeError: if the values are not whole numbers, or the label map does not name one of them.
     """
-    whole = _whole(values, where)
+    whole = check_whole(values, where)
     counts = count_values(whole)
     table = {value: (labels or STANDARD_LABELS).label_of(value) for value in counts}
     if unnamed := [value for value, label in table.items() if label is None]:
         if labels is None:
             raise VolumeError(
-                f"{where}: holds the values {shown(counts)}, but a labelmap holds "
-                f"{', '.join(f'{label} {tissue}' for label, tissue in LABEL_NAMES.items())} only; a label map says "
-                "what other values are"
+                f"{where}: holds the values {shown(counts)}, but {ALLOWED_LABELS} only; a label map says what other "
+                "values are"
             )
         raise VolumeError(
             f"{where}: holds {shown(unnamed)}, which the label map does not name; every value must be named, or others "
@@ -191,8 +192,8 @@ def shown(sources: Iterable[Source]) -> str:
     return ", ".join(names[:MAX_SHOWN]) + (f", ... ({len(names)} in all)" if len(names) > MAX_SHOWN else "")
 
 
-def _whole(values: NDArray[np.generic], where: str) -> NDArray[np.integer[Any]]:
-    """Return the values as integers."""
+def check_whole(values: NDArray[np.generic], where: str) -> NDArray[np.integer[Any]]:
+    """Return voxels of whole-valued floats or integers as integers; raise `VolumeError` for any other."""
     if np.issubdtype(values.dtype, np.integer):
         return values  # type: ignore[return-value]
     if not np.issubdtype(values.dtype, np.floating):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from armscan.errors import InvalidValueError, VolumeError
-from armscan.utils.validation import check_numbers
+from armscan.errors import VolumeError
 from armscan.volumes.volume import LabelVolume
 
 Spacing = tuple[float, float, float]
@@ -31,43 +29,31 @@ def resample(volume: LabelVolume, spacing: Spacing) -> LabelVolume:
 
     Args:
         volume: to resample; it is returned as it is where it already has the spacing.
-        spacing: (sx, sy, sz) in mm.
+        spacing: (sx, sy, sz) in mm, each above 0.
 
     Returns:
         The volume with as many voxels of that spacing as have their centres in it.
 
     Raises:
-        InvalidValueError: if the spacing is not three numbers above 0.
         VolumeError: if the volume would have more than 2^30 voxels.
     """
-    s_x, s_y, s_z = check_numbers("spacing", spacing, 3, "(sx, sy, sz) in mm")
-    if min(s_x, s_y, s_z) <= 0:
-        raise InvalidValueError(f"spacing is {spacing!r}, but each must be above 0 mm")
-    spacing = (s_x, s_y, s_z)
     # Files keep spacings with some six digits.
     if np.allclose(volume.spacing, spacing, rtol=1e-5, atol=0.0):
         return volume
+    # Deferred: it takes long to load, and few folders need it.
     import SimpleITK
 
-    steps = [(n - 0.5) * own / new for n, own, new in zip(volume.shape, volume.spacing, spacing, strict=True)]
-    if not math.prod(steps) <= MAX_VOXELS:
+    # A centre on the far edge itself is no longer inside.
+    n_voxels = np.divide((np.array(volume.shape) - 0.5) * volume.spacing, spacing)
+    if not n_voxels.prod() <= MAX_VOXELS:
         raise VolumeError(
-            f"{volume.name}: resampled from {volume.spacing} to {spacing} mm it would have {math.prod(steps):.3g} "
+            f"{volume.name}: resampled from {volume.spacing} to {spacing} mm it would have {n_voxels.prod():.3g} "
             f"voxels, but it must have at most {MAX_VOXELS}"
         )
+    size = np.maximum(1, np.ceil(n_voxels - 1e-6)).astype(int).tolist()
     # In the volume's own frame: the way to world coordinates is the same before and after.
     image = SimpleITK.GetImageFromArray(np.ascontiguousarray(volume.labels.transpose(2, 1, 0)))
     image.SetSpacing(volume.spacing)
-    # A centre on the far edge itself is no longer inside.
-    size = [max(1, math.ceil(step - 1e-6)) for step in steps]
-    finer = SimpleITK.Resample(
-        image,
-        size,
-        SimpleITK.Transform(),
-        SimpleITK.sitkNearestNeighbor,
-        (0.0, 0.0, 0.0),
-        spacing,
-        image.GetDirection(),
-    )
-    labels = SimpleITK.GetArrayFromImage(finer).transpose(2, 1, 0)
-    return replace(volume, labels=labels, spacing=spacing)
+    unmoved, nearest = SimpleITK.Transform(), SimpleITK.sitkNearestNeighbor
+    finer = SimpleITK.Resample(image, size, unmoved, nearest, image.GetOrigin(), spacing, image.GetDirection())
+    return replace(volume, labels=SimpleITK.GetArrayFromImage(finer).transpose(2, 1, 0), spacing=spacing)

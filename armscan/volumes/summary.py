@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Self
 
-from armscan.volumes.labelmap import BACKGROUND, Found, LabelMap, Source, count_values
+from armscan.volumes.labelmap import BACKGROUND, LABEL_NAMES, Found, LabelMap, Source, count_values
 from armscan.volumes.orientation import Crop, orientation_of
-from armscan.volumes.volume import LABEL_NAMES, LabelVolume
+from armscan.volumes.volume import LabelVolume
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from armscan.errors import InvalidValueError, VolumeError
 from armscan.utils.validation import check_int, check_numbers
+from armscan.volumes.labelmap import ALLOWED_LABELS, LABEL_NAMES, LANDMARK_LABELS, check_whole, shown
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
 from armscan.volumes.slicing import sample_plane
 
-LABEL_NAMES = {0: "background", 1: "bones", 2: "tendons", 3: "artery", 4: "nerve"}
-LANDMARK_LABELS = (1, 2, 3)
 LONGEST_SIDE_PX = 65536
 # Far beyond what any image has; the ratio of two spacings still is a number that a slice can be looked up with.
 SMALLEST_SPACING_MM, LARGEST_SPACING_MM = 1e-6, 1e6
@@ -55,7 +54,7 @@ class LabelVolume:
             raise VolumeError(f"the name of a volume is {self.name!r}, but it must be a text")
         object.__setattr__(self, "labels", _checked_labels(self.labels, self.name))
         object.__setattr__(self, "spacing", _checked_spacing(self.spacing, self.name))
-        object.__setattr__(self, "origin", _checked_origin(self.origin, self.name))
+        object.__setattr__(self, "origin", _checked_mm("origin", self.origin, self.name))
         object.__setattr__(self, "direction", _checked_direction(self.direction, self.name))
         if self.optimal_action is not None and not isinstance(self.optimal_action, ManipulatorAction):
             raise VolumeError(
@@ -153,20 +152,11 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
         raise VolumeError(f"{name}: the labels are no array ({error})") from error
     if labels.ndim != 3 or 0 in labels.shape:
         raise VolumeError(f"{name}: the image has shape {labels.shape}, but a labelmap must be 3-D and not empty")
-    if not np.issubdtype(labels.dtype, np.integer) and not np.issubdtype(labels.dtype, np.floating):
-        raise VolumeError(f"{name}: holds values of type {labels.dtype}, but a labelmap holds whole numbers")
-    allowed = ", ".join(f"{label} {tissue}" for label, tissue in LABEL_NAMES.items())
-    if np.issubdtype(labels.dtype, np.floating) and not (labels == np.floor(labels)).all():
-        raise VolumeError(
-            f"{name}: holds {labels.dtype} values between {labels.min():g} and {labels.max():g} that are not whole "
-            f"numbers: grey values? A labelmap holds {allowed}"
-        )
-    if labels.min() < 0 or labels.max() > max(LABEL_NAMES):
-        present = np.unique(labels)
-        received = ", ".join(f"{value:g}" for value in present[:8]) + (", ..." if present.size > 8 else "")
-        raise VolumeError(f"{name}: holds the values {received}, but a labelmap holds {allowed} only")
+    whole = check_whole(labels, name)
+    if whole.min() < 0 or whole.max() > max(LABEL_NAMES):
+        raise VolumeError(f"{name}: holds the values {shown(np.unique(whole).tolist())}, but {ALLOWED_LABELS} only")
     # A copy: what the caller does with the array afterwards must not change the volume.
-    checked = np.array(labels, dtype=np.uint8, order="C")
+    checked = np.array(whole, dtype=np.uint8, order="C")
     for label in LANDMARK_LABELS:
         if not (checked == label).any():
             raise VolumeError(
@@ -176,27 +166,21 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
     return checked
 
 
-def _checked_spacing(spacing: tuple[float, float, float], name: str) -> tuple[float, float, float]:
+def _checked_mm(key: str, numbers: Any, name: str) -> tuple[float, float, float]:
     try:
-        s_x, s_y, s_z = check_numbers("spacing", spacing, 3, "(sx, sy, sz) in mm")
-    except InvalidValueError as error:
-        raise VolumeError(f"{name}: {error}") from error
-    if min(s_x, s_y, s_z) <= 0:
-        raise VolumeError(f"{name}: spacing is {(s_x, s_y, s_z)}, but each must be above 0 mm")
-    if min(s_x, s_y, s_z) < SMALLEST_SPACING_MM or max(s_x, s_y, s_z) > LARGEST_SPACING_MM:
-        raise VolumeError(
-            f"{name}: spacing is {(s_x, s_y, s_z)}, but each must be from {SMALLEST_SPACING_MM:g} to "
-            f"{LARGEST_SPACING_MM:g} mm"
-        )
-    return s_x, s_y, s_z
-
-
-def _checked_origin(origin: tuple[float, float, float], name: str) -> tuple[float, float, float]:
-    try:
-        x, y, z = check_numbers("origin", origin, 3, "(x, y, z) in mm")
+        x, y, z = check_numbers(key, numbers, 3, "(x, y, z) in mm")
     except InvalidValueError as error:
         raise VolumeError(f"{name}: {error}") from error
     return x, y, z
+
+
+def _checked_spacing(spacing: tuple[float, float, float], name: str) -> tuple[float, float, float]:
+    checked = _checked_mm("spacing", spacing, name)
+    if min(checked) < SMALLEST_SPACING_MM or max(checked) > LARGEST_SPACING_MM:
+        raise VolumeError(
+            f"{name}: spacing is {checked}, but each must be from {SMALLEST_SPACING_MM:g} to {LARGEST_SPACING_MM:g} mm"
+        )
+    return checked
 
 
 def _checked_direction(direction: FloatArray, name: str) -> FloatArray:

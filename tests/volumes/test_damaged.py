@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 
 from armscan.errors import ArmscanError
 from armscan.volumes import LabelMap, LabelVolume, ManipulatorAction, open_dataset, read_volume, record_planes
-from armscan.volumes.dataset import Dataset
-from armscan.volumes.resampling import resample
 from tests.conftest import make_tiny_volume
 from tests.volumes.test_segmentation import NAMES, write_segmentation
 
@@ -196,15 +194,3 @@ def test_record_planes_and_label_map_answer_anything(write_labelmap, received):
     refuses(lambda: record_planes(folder, received))
     refuses(lambda: record_planes(folder, {"a.nrrd": received}))
     refuses(lambda: LabelMap.from_mapping(received))
-
-
-@SETTINGS
-@given(st.dictionaries(st.sampled_from(["volumes", "reports", "subjects", "splits", "excluded"]), anything, min_size=1))
-def test_dataset_answers_any_argument(changes):
-    refuses(lambda: Dataset(**({"volumes": {}, "reports": {}, "subjects": {}} | changes)))
-
-
-@SETTINGS
-@given(anything)
-def test_resampled_answers_any_spacing(spacing):
-    check_sound(refuses(lambda: resample(make_tiny_volume(), spacing)))

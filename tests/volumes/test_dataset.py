@@ -3,8 +3,7 @@
 import pytest
 
 from armscan.errors import InvalidValueError, ManifestError, VolumeError
-from armscan.volumes import Dataset, read_dataset
-from armscan.volumes.summary import StoredFile, VolumeReport
+from armscan.volumes import read_dataset
 
 PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
 
@@ -86,19 +85,3 @@ def test_read_dataset_says_what_is_wrong_in_the_manifest(write_labelmap, write_m
     write_labelmap("a.nii.gz")
     with pytest.raises(ManifestError, match=message):
         read_dataset(write_manifest(entries))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"volumes": []}, r"volumes is \[\], but it must be a dict with a LabelVolume by file name"),
-        ({"subjects": {"a": 3}}, r"subjects is {'a': 3}, but"),
-        ({"subjects": {}}, r"subjects is of \[\], but it must be of the volumes: \['a'\]"),
-        ({"splits": {"a": "trian"}}, "a split is 'trian', but it must be train, validation or test"),
-    ],
-)
-def test_dataset_refuses_what_does_not_fit(tiny_volume, changes, message):
-    stored = StoredFile(shape=(), spacing=(), orientation="LPS", found=(), missing=(), crop_mm=None)
-    reports = {"a": VolumeReport.of(tiny_volume, stored)}
-    with pytest.raises(InvalidValueError, match=message):
-        Dataset(**({"volumes": {"a": tiny_volume}, "reports": reports, "subjects": {"a": "S1"}} | changes))
