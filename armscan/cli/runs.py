@@ -74,14 +74,12 @@ def list_runs(form: str, children: bool, tracking: str, **selected: Any) -> None
 
     docs/runs.md explains the columns.
     """
-    from armscan.runs import Sizes, collapse, expand, find, sort_rows, write_entries
+    from armscan.runs import collapse, expand, find, sort_rows, write_entries
 
     with _open(tracking) as client:
         selection = _selection(**selected)
         found = find(client, selection)
-        entries = sort_rows(collapse(found, Sizes(client)), selection.sort, is_down=selection.is_down)[
-            : selection.limit
-        ]
+        entries = sort_rows(collapse(client, found), selection.sort, is_down=selection.is_down)[: selection.limit]
         if not entries and form == "table":
             print(f"no run of {client.uri} is selected")
         else:
@@ -106,35 +104,33 @@ def show(run: str, tracking: str) -> None:
 @runs.command(
     cls=Command,
     left="what was not removed by now is still there",
-    examples=["runs prune checkpoints --before 30d", "runs prune runs --status failed --before 7d --apply"],
+    examples=["runs prune checkpoints --before 30d", "runs prune folders --status failed --before 7d --apply"],
 )
-@click.argument("what", type=click.Choice(["checkpoints", "folders", "runs"]))
+@click.argument("what", type=click.Choice(["checkpoints", "folders"]))
 @_with_selection
 @click.option("--apply", is_flag=True, help="Remove; without it, nothing is touched.")
 @tracking_option()
 def prune(what: str, apply: bool, tracking: str, **selected: Any) -> int:
-    """Remove checkpoints, folders or runs.
+    """Remove checkpoints or folders of ended runs.
 
-    checkpoints: those of ended runs, from their folders. folders: those of ended runs, on this machine. runs: their
-    folders, and the runs are marked as deleted for `mlflow gc`. docs/runs.md says what is never removed.
+    checkpoints: from their folders. folders: all of their files on this machine. What is in the store stays: MLflow
+    deletes runs and artifacts. docs/runs.md says what is never removed.
     """
-    from armscan.runs import RUNS, Sizes, find, format_bytes, gc_hint, plan, print_plan, sort_rows
-    from armscan.runs.rows import RunRow
+    from rich.filesize import decimal
+
+    from armscan.runs import RunRow, find, plan, print_plan, sort_rows
 
     with _open(tracking) as client:
         selection = _selection(**selected)
-        sizes = Sizes(client)
-        entries = [RunRow(run, sizes) for run in find(client, selection)]
+        entries = [RunRow(client, run) for run in find(client, selection)]
         meant = sort_rows(entries, selection.sort, is_down=selection.is_down)[: selection.limit]
         cases = plan(client, [entry.run for entry in meant], what)
         if apply:
             return remove_planned(client, cases, what)
         print_plan(cases)
     taken = [case for case in cases if case.left is None]
-    freed = format_bytes(sum(case.n_bytes for case in taken))
+    freed = decimal(sum(case.n_bytes for case in taken))
     print(f"{what} of {len(taken)} of {len(cases)} runs would be removed, {freed}; nothing is touched")
-    if what == RUNS:
-        print(gc_hint(client.uri))
     if taken:
         words = click.get_current_context().obj
         print(f"remove it {shlex.join(['armscan', 'runs', 'prune', *words, '--apply'])}")
@@ -246,7 +242,9 @@ def _selection(
 
 def remove_planned(client: TrackingStore, cases: Sequence[Any], what: str) -> int:
     """Remove what is planned, run by run, and print how each went; return the exit code."""
-    from armscan.runs import RUNS, NotRemovedError, RunSkippedError, format_bytes, gc_hint, remove
+    from rich.filesize import decimal
+
+    from armscan.runs import RunSkippedError, remove
     from armscan.tracking.client import reason_in
 
     freed, n_removed, n_failed = 0, 0, 0
@@ -262,12 +260,10 @@ def remove_planned(client: TrackingStore, cases: Sequence[Any], what: str) -> in
         # An error of one store must not affect the runs of the others.
         except Exception as error:
             n_failed += 1
-            reason = error if isinstance(error, NotRemovedError) else reason_in(error)
+            reason = f"{error.filename}: {error.strerror}" if isinstance(error, PermissionError) else reason_in(error)
             print(f"{run_id} is not removed: {reason}", file=sys.stderr)
         else:
             freed, n_removed = freed + case.n_bytes, n_removed + 1
-            print(f"{run_id} removed, {format_bytes(case.n_bytes)}" + (f"; {note}" if note else ""), flush=True)
-    print(f"{what} of {n_removed} of {len(cases)} runs removed, {format_bytes(freed)}")
-    if what == RUNS:
-        print(gc_hint(client.uri))
+            print(f"{run_id} removed, {decimal(case.n_bytes)}" + (f"; {note}" if note else ""), flush=True)
+    print(f"{what} of {n_removed} of {len(cases)} runs removed, {decimal(freed)}")
     return 1 if n_failed else 0

@@ -1,82 +1,112 @@
-"""Remove what a plan says, run by run, each checked once more."""
+"""Remove the checkpoints or folders of ended runs: first planned, then run by run, each checked once more."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from mlflow.entities import LifecycleStage
-from mlflow.exceptions import MlflowException
+from mlflow.entities import Run
 
-from armscan.errors import ArmscanError
-from armscan.runs.prune_plan import CHECKPOINTS, RUNS, PruneItem, check, related_now
-from armscan.runs.run_folder import RunSkippedError, at_rest
-from armscan.tracking import TrackingStore, pending
-from armscan.tracking.client import NOT_THERE
-from armscan.utils.files import SQLITE_PREFIX
+from armscan.errors import TrackingError
+from armscan.runs.query import experiment_ids, search
+from armscan.runs.rows import PARENT_TAG
+from armscan.runs.run_folder import OwnFolder, RunSkippedError
+from armscan.tracking import TrackingStore, check_version, pending
+from armscan.tracking.sync import ENDED
+from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
-
-class NotRemovedError(ArmscanError):
-    """A file of a run cannot be removed; the message says which and why."""
+CHECKPOINTS, FOLDERS = "checkpoints", "folders"
 
 
-def remove(client: TrackingStore, case: PruneItem, what: str) -> str | None:
-    """Remove what a plan says of a run. The run itself is marked as deleted, for `mlflow gc` to remove.
+@dataclass(frozen=True)
+class PruneItem:
+    """What is to become of a run's files.
+
+    Args:
+        run: the run.
+        n_bytes: disk space that their removal frees, in bytes.
+        left: why they stay; None if they do not.
+    """
+
+    run: Run
+    n_bytes: int = 0
+    left: str | None = None
+
+
+def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneItem]:
+    """Return what is to become of runs; touch nothing.
+
+    Args:
+        client: their store.
+        runs: the selected runs.
+        what: `CHECKPOINTS` or `FOLDERS`.
+    """
+    everything = {run.info.run_id: run for run in search(client, experiment_ids(client))}
+    noted = defaultdict(set)
+    for run_id, run in everything.items():
+        noted[run.data.tags.get("folder")].add(run_id)
+    items = []
+    for run in runs:
+        try:
+            folder = _folder(run, everything, noted[run.data.tags.get("folder")] - {run.info.run_id})
+            with folder.held(is_planned=True):
+                items.append(PruneItem(run, sum(_files(folder, what).values())))
+        except (RunSkippedError, TrackingError) as error:
+            items.append(PruneItem(run, left=str(error)))
+    return items
+
+
+def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
+    """Remove what a plan says of a run.
 
     Args:
         client: the run's store.
-        case: the run's part of the plan.
-        what: one of `WHAT`.
+        item: the run's part of the plan.
+        what: `CHECKPOINTS` or `FOLDERS`.
 
     Returns:
-        Why the folder stays; None if it does not.
+        Why the folder stays; None if it is gone, or was to stay.
 
     Raises:
-        RunSkippedError: if the run must be left as it is now; nothing has been touched.
-        NotRemovedError: if a file cannot be removed.
+        RunSkippedError: if the files must be left as they are now; nothing has been touched.
+        OSError: if a file cannot be removed.
     """
-    run_id = case.run.info.run_id
-    try:
-        with at_rest(case.run) as held:
-            # Another process may have begun to use it since it was planned.
-            run = client.get_run(run_id)
-            if run.info.lifecycle_stage != LifecycleStage.ACTIVE:
-                raise RunSkippedError("somebody has deleted it meanwhile")
-            folder, note = check(run, what, related_now(client, run, case.related))
-            folder = held if folder is not None else None
-            if folder is not None:
-                _unlink(folder.checkpoints if what == CHECKPOINTS else folder.files)
-            if what == RUNS:
-                _delete(client, run_id)
-            if folder is None or what == CHECKPOINTS:
-                return note
-            pending.forget(run_id)
-            return None if folder.remove_emptied() else f"{folder.path} stays, with what is not the run's"
-    except MlflowException as error:
-        # Another prune and `mlflow gc` may have removed it between two looks.
-        if error.error_code != NOT_THERE:
-            raise
-        raise RunSkippedError("it is not there any more") from error
-
-
-def gc_hint(uri: str) -> str:
-    """Return how deleted runs are removed from a store."""
-    where = f" --backend-store-uri {uri} --tracking-uri {uri}" if uri.startswith(SQLITE_PREFIX) else ""
-    return f"MLflow marks runs as deleted, and removes them with their artifacts by: mlflow gc{where}"
-
-
-def _delete(client: TrackingStore, run_id: str) -> None:
-    try:
-        client.delete_run(run_id)
-    except MlflowException:
-        # Another process may just have done the same.
-        if client.get_run(run_id).info.lifecycle_stage == LifecycleStage.ACTIVE:
-            raise
-
-
-def _unlink(files: Iterable[Path]) -> None:
-    for file in files:
-        try:
+    run_id, parent_id = item.run.info.run_id, item.run.data.tags.get(PARENT_TAG, "")
+    folder = OwnFolder.of(item.run)
+    with folder.held():
+        # Another process may have begun to use it, or have removed it, since it was planned.
+        condition = f"attributes.run_id IN ('{run_id}', '{parent_id}')"
+        now = {run.info.run_id: run for run in search(client, experiment_ids(client), condition)}
+        if run_id not in now:
+            raise RunSkippedError("somebody has deleted it meanwhile")
+        for file in _files(_folder(now[run_id], now), what):
             file.unlink(missing_ok=True)
-        except OSError as error:
-            raise NotRemovedError(f"{file} cannot be removed: {error.strerror}") from error
+        if what == CHECKPOINTS:
+            return None
+        pending.forget(run_id)
+        return None if folder.remove_emptied() else f"{folder.path} stays, with what is not the run's"
+
+
+def _folder(run: Run, runs: Mapping[str, Run], sharing: Collection[str] = ()) -> OwnFolder:
+    """Return the folder of a run alone; raise if others share it, or if the run or its parent, in `runs`, may go on."""
+    check_version(run)
+    if run.info.status not in ENDED:
+        raise RunSkippedError(f"it is {run.info.status}, and could be resumed from there")
+    parent = runs.get(run.data.tags.get(PARENT_TAG, ""))
+    if parent is not None and parent.info.status not in ENDED:
+        raise RunSkippedError(f"its parent, run {parent.info.run_id}, is {parent.info.status}, and may resume it")
+    folder = OwnFolder.of(run)
+    if sharing:
+        raise RunSkippedError(f"{folder.path} is the folder of run {min(sharing)}, too")
+    return folder
+
+
+def _files(folder: OwnFolder, what: str) -> dict[Path, int]:
+    """Return the files to remove with their bytes; raise if there are none."""
+    checkpoints = (folder.path / LAST_CHECKPOINT, folder.path / BEST_CHECKPOINT)
+    files = {file: n for file, n in folder.files().items() if what == FOLDERS or file in checkpoints}
+    if not files:
+        raise RunSkippedError("its folder holds no checkpoint of it")
+    return files

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property
+from typing import Self
 
 from mlflow.entities import Run
+from mlflow.exceptions import MlflowException
+from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
+from requests import RequestException
 
-from armscan.runs.disk_usage import Size, Sizes
+from armscan.runs.run_folder import OwnFolder, RunSkippedError
+from armscan.tracking import TrackingStore
 from armscan.tracking.sync import ENDED
 
 PARENT_TAG = "mlflow.parentRunId"
@@ -18,19 +24,65 @@ Children = Mapping[str, Sequence[Run]]
 
 
 @dataclass(frozen=True)
+class Size:
+    """Bytes on disks.
+
+    Args:
+        in_folder: bytes of the runs' own files in their folders on this machine.
+        in_store: bytes of their artifacts; None if a store does not tell.
+    """
+
+    in_folder: int
+    in_store: int | None
+
+    @classmethod
+    def of(cls, client: TrackingStore, runs: Sequence[Run]) -> Self:
+        """Measure runs of a store."""
+        in_folder, in_store = 0, [artifacts_of(client, run) for run in runs]
+        for run in runs:
+            with contextlib.suppress(RunSkippedError):
+                in_folder += sum(OwnFolder.of(run).files().values())
+        known = [sum(files.values()) for files in in_store if files is not None]
+        return cls(in_folder, sum(known) if len(known) == len(in_store) else None)
+
+    @property
+    def n_bytes(self) -> int:
+        """All that is known."""
+        return self.in_folder + (self.in_store or 0)
+
+
+def artifacts_of(client: TrackingStore, run: Run) -> dict[str, int] | None:
+    """Return the bytes of each artifact of a run by its path; None if their store does not tell."""
+
+    def listed(path: str | None) -> Iterator[tuple[str, int]]:
+        for each in repository.list_artifacts(path):
+            if each.is_dir:
+                yield from listed(each.path)
+            else:
+                yield each.path, each.file_size or 0
+
+    try:
+        repository = get_artifact_repository(run.info.artifact_uri, tracking_uri=client.mlflow.tracking_uri)
+        return dict(listed(None))
+    # What is there is not lost because nobody can say how much it is.
+    except (MlflowException, RequestException, OSError):
+        return None
+
+
+@dataclass(frozen=True)
 class RunRow:
     """A run of a list.
 
     Args:
+        client: the run's store, asked for sizes when they are needed.
         run: the run.
-        sizes: measures it, when it is asked for.
         below: the runs that it has called forth, and theirs, as far as they are meant.
         depth: 0 where it stands by itself, 1 for a child that is shown below its parent, and so on.
         is_unfolded: whether those below have lines of their own.
     """
 
+    client: TrackingStore = field(repr=False)
     run: Run
-    sizes: Sizes = field(repr=False)
     below: tuple[Run, ...] = ()
     depth: int = 0
     is_unfolded: bool = True
@@ -38,12 +90,12 @@ class RunRow:
     @cached_property
     def size(self) -> Size:
         """Of the run, and of those that are folded into it."""
-        return sum((self.sizes.of(run) for run in (() if self.is_unfolded else self.below)), self.sizes.of(self.run))
+        return Size.of(self.client, [self.run, *(() if self.is_unfolded else self.below)])
 
     @property
     def started(self) -> datetime:
         """When it was started."""
-        return datetime.fromtimestamp(self.run.info.start_time / 1000).astimezone()
+        return started(self.run)
 
     @property
     def duration_s(self) -> float | None:
@@ -55,12 +107,12 @@ class RunRow:
     @property
     def success_rate(self) -> float | None:
         """On the test volumes; None where it was not judged."""
-        return self._metric("test_volumes/success_rate")
+        return self.run.data.metrics.get("test_volumes/success_rate")
 
     @property
     def mean_steps(self) -> float | None:
-        """Likewise."""
-        return self._metric("test_volumes/mean_steps")
+        """Mean steps on the test volumes; None where it was not judged."""
+        return self.run.data.metrics.get("test_volumes/mean_steps")
 
     def value_of(self, sort: str) -> float | None:
         """Return what it is sorted by, `started`, `duration`, `success`, `steps` or `size`; None where it has none."""
@@ -76,15 +128,16 @@ class RunRow:
             case _:
                 return float(self.run.info.start_time)
 
-    def _metric(self, name: str) -> float | None:
-        value: float | None = self.run.data.metrics.get(name)
-        return value
+
+def started(run: Run) -> datetime:
+    """Return when a run was started, in local time."""
+    return datetime.fromtimestamp(run.info.start_time / 1000).astimezone()
 
 
-def collapse(runs: Sequence[Run], sizes: Sizes) -> list[RunRow]:
+def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
     """Return runs without those whose parent is among them, which are folded into it."""
     children, tops = _family(runs)
-    return [RunRow(run, sizes, tuple(_beneath(run, children)), is_unfolded=False) for run in tops]
+    return [RunRow(client, run, tuple(_beneath(run, children)), is_unfolded=False) for run in tops]
 
 
 def expand(entries: Sequence[RunRow], runs: Sequence[Run]) -> list[RunRow]:
@@ -96,12 +149,12 @@ def expand(entries: Sequence[RunRow], runs: Sequence[Run]) -> list[RunRow]:
     """
     children, _ = _family(runs)
 
-    def lines(run: Run, sizes: Sizes, depth: int) -> Iterator[RunRow]:
-        yield RunRow(run, sizes, tuple(_beneath(run, children)), depth)
+    def lines(client: TrackingStore, run: Run, depth: int) -> Iterator[RunRow]:
+        yield RunRow(client, run, tuple(_beneath(run, children)), depth)
         for child in children[run.info.run_id]:
-            yield from lines(child, sizes, depth + 1)
+            yield from lines(client, child, depth + 1)
 
-    return [line for entry in entries for line in lines(entry.run, entry.sizes, 0)]
+    return [line for entry in entries for line in lines(entry.client, entry.run, 0)]
 
 
 def sort_rows(entries: Sequence[RunRow], sort: str, *, is_down: bool) -> list[RunRow]:

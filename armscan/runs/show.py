@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from mlflow.entities import Run
 from rich.console import Console
+from rich.filesize import decimal
 from rich.text import Text
 
 from armscan.config.command_hints import evaluate_command, resume_command, video_command
 from armscan.experiment.console import ID_CHARS, RESULT_ROWS
-from armscan.runs.disk_usage import Sizes
 from armscan.runs.query import experiment_ids, search
-from armscan.runs.rows import PARENT_TAG, RunRow
-from armscan.runs.run_folder import FolderNotOwnedError, OwnFolder, RunSkippedError, check_at_rest
-from armscan.runs.tables import format_bytes, format_duration, narrow_table
+from armscan.runs.rows import PARENT_TAG, RunRow, artifacts_of
+from armscan.runs.run_folder import OwnFolder, RunSkippedError
+from armscan.runs.tables import format_duration, narrow_table
 from armscan.tracking import EVALUATED_TAG, TrackingStore
 from armscan.tracking.run import FAILURE_TAG
 from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
@@ -35,18 +35,22 @@ def show(client: TrackingStore, run: Run, uri: str) -> None:
         run: the run.
         uri: of the store, as somebody would type it.
     """
-    console, sizes = Console(), Sizes(client)
-    entry = RunRow(run, sizes)
+    console, entry = Console(), RunRow(client, run)
     tags = {name: value for name, value in run.data.tags.items() if value}
     _print_pairs(console, _facts(run, entry))
     _print_figures(console, run)
     console.print("\ntags", style="bold")
     shown = {*STARTED_BY, FAILURE_TAG, PARENT_TAG}
     _print_pairs(console, {name: tags[name] for name in sorted(tags) if name not in shown and not _is_mlflows(name)})
-    _print_files(console, run, sizes)
+    artifacts = artifacts_of(client, run)
+    folder = _print_folder(console, run)
+    if artifacts is None:
+        console.print(f"\nartifacts in {run.info.artifact_uri}: their store does not answer", style="bold")
+    else:
+        _print_sizes(console, f"artifacts in {run.info.artifact_uri}", artifacts)
     children = search(client, experiment_ids(client), f"tags.mlflow.parentRunId = '{run.info.run_id}'")
     _print_children(console, children)
-    _print_commands(console, uri, run, sizes)
+    _print_commands(console, uri, run, folder, artifacts or {})
 
 
 def _facts(run: Run, entry: RunRow) -> dict[str, str]:
@@ -97,33 +101,30 @@ def _print_figures(console: Console, run: Run) -> None:
     console.print(table)
 
 
-def _print_files(console: Console, run: Run, sizes: Sizes) -> None:
-    """Print what lies in the run's folder, and among its artifacts."""
+def _print_folder(console: Console, run: Run) -> OwnFolder | None:
+    """Print what lies in the run's folder, and what is at work there; return the folder."""
     try:
         ours = OwnFolder.of(run)
-    except FolderNotOwnedError as error:
+    except RunSkippedError as error:
         console.print(f"\nfolder: {error}", style="bold", soft_wrap=True)
-    else:
-        console.print(Text(f"\nfolder {ours.path}, {format_bytes(ours.n_bytes)}", style="bold"), soft_wrap=True)
-        _print_sizes(console, {str(file.relative_to(ours.path)): file.lstat().st_size for file in ours.files})
-        try:
-            check_at_rest(run)
-        except RunSkippedError as error:
-            console.print(Text(str(error)), soft_wrap=True)
-    artifacts = sizes.artifacts(run)
-    if artifacts is None:
-        console.print(f"\nartifacts in {run.info.artifact_uri}: their store does not answer", style="bold")
-        return
-    total = format_bytes(sum(artifacts.values()))
-    console.print(Text(f"\nartifacts in {run.info.artifact_uri}, {total}", style="bold"), soft_wrap=True)
-    _print_sizes(console, artifacts)
+        return None
+    _print_sizes(
+        console, f"folder {ours.path}", {str(file.relative_to(ours.path)): n for file, n in ours.files().items()}
+    )
+    try:
+        with ours.held(is_planned=True):
+            pass
+    except RunSkippedError as error:
+        console.print(Text(str(error)), soft_wrap=True)
+    return ours
 
 
-def _print_sizes(console: Console, files: dict[str, int]) -> None:
+def _print_sizes(console: Console, where: str, files: dict[str, int]) -> None:
+    console.print(Text(f"\n{where}, {decimal(sum(files.values()))}", style="bold"), soft_wrap=True)
     table = narrow_table("", ">")
     table.show_header = False
     for name, n_bytes in sorted(files.items()):
-        table.add_row(Text(name), format_bytes(n_bytes))
+        table.add_row(Text(name), decimal(n_bytes))
     console.print(table)
 
 
@@ -137,18 +138,13 @@ def _print_children(console: Console, children: Sequence[Run]) -> None:
     console.print(table)
 
 
-def _print_commands(console: Console, uri: str, run: Run, sizes: Sizes) -> None:
+def _print_commands(console: Console, uri: str, run: Run, folder: OwnFolder | None, artifacts: Collection[str]) -> None:
     """Print the commands that resume a run, evaluate and record its agent, if it has kept what they need."""
     run_id = run.info.run_id
     commands = {}
-    try:
-        is_resumable = (OwnFolder.of(run).path / LAST_CHECKPOINT).exists() and run.info.status != "FINISHED"
-    except FolderNotOwnedError:
-        is_resumable = False
-    if is_resumable:
+    if folder is not None and (folder.path / LAST_CHECKPOINT).exists() and run.info.status != "FINISHED":
         commands["resume"] = resume_command(run_id, uri)
-    is_evaluation = EVALUATED_TAG in run.data.tags
-    if not is_evaluation and BEST_CHECKPOINT in (sizes.artifacts(run) or ()):
+    if EVALUATED_TAG not in run.data.tags and BEST_CHECKPOINT in artifacts:
         commands |= {"evaluate": evaluate_command(run_id, uri), "record": video_command(run_id, uri)}
     if commands:
         console.print()

@@ -10,26 +10,17 @@ from datetime import datetime
 from typing import Any
 
 from rich.console import Console
+from rich.filesize import decimal
 from rich.table import Table
 from rich.text import Text
 
 from armscan.experiment.console import ID_CHARS
-from armscan.runs.prune_plan import PruneItem
-from armscan.runs.rows import PARENT_TAG, RunRow
+from armscan.runs.prune import PruneItem
+from armscan.runs.rows import PARENT_TAG, RunRow, started
 
-UNITS = ("B", "kB", "MB", "GB", "TB")
 MISSING = "-"
 # Of a name, which a multirun's words may be.
 MAX_NAME_CHARS = 80
-
-
-def format_bytes(n_bytes: float) -> str:
-    """Return bytes as a person reads them: 1.2 MB."""
-    for unit in UNITS[:-1]:
-        if n_bytes < 999.5:
-            return f"{n_bytes:.0f} {unit}" if unit == "B" or n_bytes >= 99.95 else f"{n_bytes:.3g} {unit}"
-        n_bytes /= 1000
-    return f"{n_bytes:.3g} {UNITS[-1]}"
 
 
 def format_duration(seconds: float | None) -> str:
@@ -73,7 +64,7 @@ def _table(entries: Sequence[RunRow]) -> Table:
     table = narrow_table("id", "name", "status", "started", "took>", "success>", "steps>", "size>", "below>")
     for entry in entries:
         success, steps = entry.success_rate, entry.mean_steps
-        size = format_bytes(entry.size.n_bytes) + ("" if entry.size.in_store is not None else "+?")
+        size = decimal(entry.size.n_bytes) + ("" if entry.size.in_store is not None else "+?")
         table.add_row(
             entry.run.info.run_id[:ID_CHARS],
             Text("  " * entry.depth + shortened(entry.run.info.run_name)),
@@ -133,11 +124,9 @@ def print_plan(cases: Sequence[PruneItem]) -> None:
         table = narrow_table("id", "name", "status", "started", "frees>")
         for case in taken:
             info = case.run.info
-            started = datetime.fromtimestamp(info.start_time / 1000).astimezone()
-            row = (info.run_id[:ID_CHARS], Text(shortened(info.run_name)), info.status.lower(), format_time(started))
-            table.add_row(*row, format_bytes(case.n_bytes))
+            row = (info.run_id[:ID_CHARS], Text(shortened(info.run_name)), info.status.lower())
+            table.add_row(*row, format_time(started(case.run)), decimal(case.n_bytes))
         console.print(table)
     for case in cases:
-        if case.left or case.note:
-            what = f"stays: {case.left}" if case.left else f"all but its folder: {case.note}"
-            console.print(Text(f"{case.run.info.run_id[:ID_CHARS]} {what}"), soft_wrap=True)
+        if case.left:
+            console.print(Text(f"{case.run.info.run_id[:ID_CHARS]} stays: {case.left}"), soft_wrap=True)

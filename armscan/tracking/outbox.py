@@ -209,6 +209,11 @@ def file_of(folder: Path, run_id: str) -> Path:
     return folder / OUTBOX_FOLDER / f"{run_id}{SUFFIX}"
 
 
+def file_and_place(value: str | list[str]) -> tuple[str, str | None]:
+    """Return the name of a file to upload, relative to the run's folder, and its folder among the artifacts."""
+    return (value, None) if isinstance(value, str) else (value[0], value[1])
+
+
 def outbox_files(folder: Path) -> list[Path]:
     """Return the paths of all outboxes in a folder, recursively."""
     return sorted(folder.rglob(f"{OUTBOX_FOLDER}/*{SUFFIX}"))

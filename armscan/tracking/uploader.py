@@ -15,7 +15,7 @@ from mlflow.exceptions import MlflowException
 
 from armscan.errors import TrackingError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, why_away
-from armscan.tracking.outbox import CHANNELS, Channel, Outbox
+from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
 from armscan.utils.log import log
 from armscan.utils.retry import FIRST_PAUSE_S
 
@@ -135,7 +135,7 @@ def deliver(outbox: Outbox, client: MlflowClient, channel: Channel, *, is_whole:
         if not entries:
             return n_delivered
         for entry in entries if channel == "files" and not is_whole else ():
-            if not (file := outbox.folder / _file_of(entry["file"])[0]).exists():
+            if not (file := outbox.folder / file_and_place(entry["file"])[0]).exists():
                 raise FileNotFoundError(f"{file} is not there")
         for kind, group in itertools.groupby(entries, key=lambda entry: next(iter(entry))):
             _deliver(client, outbox, kind, [entry[kind] for entry in group])
@@ -162,7 +162,7 @@ def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any])
             for status, at_ms in values:
                 _set_status(client, run_id, status, at_ms)
         case "file":
-            for name, place in map(_file_of, values):
+            for name, place in map(file_and_place, values):
                 _keep_file(client, run_id, outbox.folder / name, place)
         case "address":
             return
@@ -189,14 +189,6 @@ def _set_status(client: MlflowClient, run_id: str, status: str, at_ms: int) -> N
         client.update_run(run_id, status=status)
     else:
         client.set_terminated(run_id, status, end_time=at_ms)
-
-
-def _file_of(value: str | list[str]) -> tuple[str, str | None]:
-    """Return the name of a file to upload, and its folder among the artifacts."""
-    if isinstance(value, str):
-        return value, None
-    name, place = value
-    return name, place
 
 
 def _keep_file(client: MlflowClient, run_id: str, path: Path, place: str | None) -> None:

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from armscan.runs.tables import format_bytes, format_duration
+from armscan.runs.tables import format_duration
 
 DAY_S = 86400.0
 
@@ -164,7 +164,7 @@ def test_show_tells_everything_of_a_run(make_run, store, answer, tmp_path):
     assert (code, errors) == (0, "")
     for told in (
         *(run_id, "failed after", "no reason", "agent=sac seed=3", 40 * "a", "something.new", "[red]x", child[:8]),
-        *("last validation", "test volumes", "75.0%", "9.25", "best.pt", "1 kB", ".hydra/config.yaml", "evaluation: x"),
+        *("last validation", "test volumes", "75.0%", "9.25", "best.pt", "1.0 kB", ".hydra/config.yaml", "evaluation: x"),
         str(tmp_path / "outputs" / "tiny"),
         f"resume    python -m armscan.run resume={run_id}\n",
         f"evaluate  armscan evaluate {run_id}\n",
@@ -184,10 +184,7 @@ def test_show_of_a_parent_offers_nothing_that_it_cannot_do(family, answer):
     assert "resume " not in printed
 
 
-def test_sizes_and_times_are_readable():
-    assert [format_bytes(n) for n in (0, 999, 1000, 12_345, 999_400, 999_600, 1.5e9, 2e15)] == [
-        *("0 B", "999 B", "1 kB", "12.3 kB", "999 kB", "1 MB", "1.5 GB", "2e+03 TB")
-    ]
+def test_times_are_readable():
     assert [format_duration(s) for s in (None, 5, 65, 3605, 100_000)] == ["-", "0:05", "1:05", "1:00:05", "1d 3h"]
 
 

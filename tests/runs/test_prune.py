@@ -4,13 +4,10 @@ import errno
 import json
 import shutil
 import sqlite3
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from armscan.runs import prune
 from armscan.tracking import pending
 from armscan.tracking.outbox import file_of
 from armscan.utils.files import LOCK_FILE
@@ -30,7 +27,7 @@ def artifacts_of(folder, run_id):
 def test_nothing_is_touched_without_apply_and_the_command_that_does_it_is_told(answer, make_run, snapshot, tmp_path):
     run_id = make_run()
     before = snapshot(), ids_in(tmp_path)
-    for what in ("checkpoints", "folders", "runs"):
+    for what in ("checkpoints", "folders"):
         code, printed, errors = answer("prune", what, "--before=2100-01-01")
         assert (code, errors) == (0, "")
         assert run_id[:8] in printed
@@ -44,7 +41,7 @@ def test_checkpoints_leave_everything_else(answer, make_run, snapshot, tmp_path)
     before = snapshot()
     code, printed, _ = answer("prune", "checkpoints", "--apply")
     assert code == 0
-    assert f"{run_id} removed, 3 kB\n" in printed
+    assert f"{run_id} removed, 3.0 kB\n" in printed
     gone = {file.relative_to(tmp_path).as_posix() for file in before.keys() - snapshot().keys()}
     assert gone == {"outputs/tiny/best.pt", "outputs/tiny/last.pt"}
     assert artifacts_of(tmp_path, run_id) == ["best.pt", "config.yaml", "last.pt"]
@@ -59,43 +56,25 @@ def test_folders_leave_the_store(answer, make_run, tmp_path):
     assert (ids_in(tmp_path), len(artifacts_of(tmp_path, run_id))) == ({run_id}, 3)
 
 
-def test_runs_are_deleted_with_their_folders_for_mlflow_gc_to_remove(answer, make_run, store, tmp_path):
-    old, kept = make_run("old", tags={"choice.agent": "sac"}), make_run("kept", tags={"choice.agent": "ppo"})
-    before = answer("list", "--agent=sac", "--format=csv")[1]
-    code, printed, _ = answer("prune", "runs", "--agent=sac", "--apply")
-    assert code == 0
-    command = printed.rpartition("mlflow gc ")[2].split()
-    assert old in before
-    assert (ids_in(tmp_path), ids_in(tmp_path, "deleted")) == ({kept}, {old})
-    assert not (tmp_path / "outputs" / "old").exists()
-    assert (tmp_path / "outputs" / "kept" / "best.pt").exists()
-    # Until then it can be restored.
-    assert len(artifacts_of(tmp_path, old)) == 3
-    subprocess.run([sys.executable, "-m", "mlflow", "gc", *command], check=True, capture_output=True)
-    assert ids_in(tmp_path, "deleted") == set()
-    assert not artifacts_of(tmp_path, old)
-    assert len(artifacts_of(tmp_path, kept)) == 3
-
-
 def kept_files():
     """The checkpoints and configurations below the folder that the command is in, with their contents."""
     return {file: file.read_bytes() for file in Path.cwd().rglob("*") if file.suffix in (".pt", ".yaml")}
 
 
-def assert_stays(answer, run_id, reason, what="runs", n_touched=0, run_words=()):
+def assert_stays(answer, run_id, reason, what="folders"):
     """Checks that a run is left with a reason, in the dry run and where it counts, and that this is no failure."""
-    planned = answer("prune", what, *run_words)[1]
+    planned = answer("prune", what)[1]
     kept = kept_files()
     assert f"{run_id[:8]} stays: {reason}" in planned, planned
-    code, printed, errors = answer("prune", what, "--apply", *run_words)
+    code, printed, errors = answer("prune", what, "--apply")
     assert (code, errors) == (0, "")
     assert f"{run_id} stays: {reason}" in printed
-    assert f"{what} of {n_touched} of " in printed
+    assert f"{what} of 0 of " in printed
     assert run_id in answer("list", "--children", "--format=csv")[1]
-    assert n_touched or kept_files() == kept
+    assert kept_files() == kept
 
 
-WHAT = pytest.mark.parametrize("what", ["checkpoints", "folders", "runs"])
+WHAT = pytest.mark.parametrize("what", ["checkpoints", "folders"])
 
 
 @WHAT
@@ -124,14 +103,6 @@ def test_what_is_not_delivered_is_left(answer, make_run, tmp_path, what):
     assert_stays(answer, run_id, f"not all of it is delivered: armscan runs sync {folder} does that", what)
 
 
-def test_what_is_not_delivered_is_left_where_no_host_was_noted(answer, make_run, tmp_path):
-    folder = tmp_path / "outputs" / "tiny"
-    run_id, _ = no_host(folder, make_run)
-    with file_of(folder, run_id).open("a") as outbox:
-        outbox.write('{"tags": {"a": "b"}}\n')
-    assert_stays(answer, run_id, "not all of it is delivered")
-
-
 @WHAT
 def test_damaged_outbox_is_left(answer, make_run, tmp_path, what):
     run_id = make_run()
@@ -140,17 +111,9 @@ def test_damaged_outbox_is_left(answer, make_run, tmp_path, what):
 
 
 @WHAT
-def test_run_of_a_registered_model_version_is_left(answer, make_run, store, what):
-    run_id = make_run()
-    store[0].create_registered_model("wrist")
-    store[0].create_model_version("wrist", source=store[0].get_run(run_id).info.artifact_uri, run_id=run_id)
-    assert_stays(answer, run_id, "a version of a registered model belongs to it", what)
-
-
-@WHAT
 def test_run_of_a_newer_armscan_is_listed_and_shown_and_left(answer, make_run, what):
     run_id = make_run(tags={"armscan.version": "99.1.0"})
-    assert_stays(answer, run_id, "it was made by armscan 99.1.0, which is newer than this", what)
+    assert_stays(answer, run_id, f"run {run_id} was made by armscan 99.1.0, but this is ", what)
     assert run_id[:8] in answer("list")[1]
     assert "99.1.0" in answer("show", run_id)[1]
 
@@ -162,53 +125,14 @@ def test_children_of_a_parent_that_is_running_are_left(answer, make_run, store, 
     run_id = make_run(parent_id=parent_id)
     assert_stays(answer, run_id, f"its parent, run {parent_id}, is RUNNING", what)
     client.set_terminated(parent_id, "FINISHED")
-    assert "1 of 2 runs" in answer("prune", what)[1] or what == "runs"
+    assert "1 of 2 runs" in answer("prune", what)[1]
 
 
-def test_parent_stays_with_a_child_that_stays_and_goes_with_all(answer, make_run, store, locked, tmp_path):
-    client, experiment_id = store
-    parent_id = client.create_run(experiment_id, name="multirun", tags={}).info.run_id
-    client.set_terminated(parent_id, "FINISHED")
-    children = [make_run(f"job{number}", parent_id=parent_id) for number in range(2)]
-    assert_stays(
-        answer,
-        parent_id,
-        f"2 of its children stay, such as run {min(children)}",
-        run_words=["--where=attributes.run_name = 'multirun'"],
-    )
-    shutil.rmtree(tmp_path / "outputs" / "job1")
-    (tmp_path / "outputs" / "job0" / LOCK_FILE).touch()
-    locked(tmp_path / "outputs" / "job0" / LOCK_FILE)
-    assert_stays(answer, parent_id, f"1 of its children stay, such as run {children[0]}", n_touched=1)
-    assert ids_in(tmp_path) == {parent_id, children[0]}
-
-
-def test_parent_goes_with_its_children(answer, make_run, store, tmp_path):
-    client, experiment_id = store
-    parent_id = client.create_run(experiment_id, name="multirun", tags={}).info.run_id
-    client.set_terminated(parent_id, "FINISHED")
-    make_run("job", parent_id=parent_id)
-    assert answer("prune", "runs", "--apply")[0] == 0
-    assert ids_in(tmp_path) == set()
-
-
-@pytest.mark.parametrize("what", ["checkpoints", "folders"])
+@WHAT
 def test_run_that_could_go_on_keeps_its_folder(answer, make_run, store, what):
     run_id = make_run()
     store[0].update_run(run_id, status="RUNNING")
     assert_stays(answer, run_id, "it is RUNNING, and could be resumed from there", what)
-
-
-def test_dead_run_is_removed_where_it_is_certain_and_left_where_it_is_not(answer, make_run, store, tmp_path):
-    here, elsewhere = make_run("here"), make_run("elsewhere", tags={"host": "another"})
-    evaluation = store[0].create_run(store[1], name="evaluation", tags={}).info.run_id
-    for run_id in (here, elsewhere):
-        store[0].update_run(run_id, status="RUNNING")
-    code, printed, _ = answer("prune", "runs", "--apply")
-    assert code == 0
-    assert ids_in(tmp_path) == {elsewhere, evaluation}
-    for run_id in (elsewhere, evaluation):
-        assert f"{run_id} stays: it is RUNNING, and nobody can tell from here whether it goes on: " in printed
 
 
 def another_host(folder, make_run):
@@ -254,20 +178,10 @@ def relative(folder, make_run):
 @pytest.mark.parametrize(
     "change", [another_host, no_host, another_config, no_config, a_link_above, anothers_outbox, relative]
 )
-@pytest.mark.parametrize("what", ["folders", "runs"])
-def test_folder_that_is_not_certainly_the_runs_is_left_and_said_so(answer, make_run, snapshot, tmp_path, change, what):
-    folder = tmp_path / "outputs" / "tiny"
-    run_id, reason = change(folder, make_run)
-    before = {file for file in snapshot() if file.is_relative_to(folder)}
-    if what == "folders":
-        assert_stays(answer, run_id, reason, what)
-    else:
-        code, printed, errors = answer("prune", "runs", "--apply")
-        assert (code, errors) == (0, "")
-        assert f"{run_id} removed" in printed
-        assert f"; {reason}" in printed
-        assert ids_in(tmp_path) == set()
-    assert {file for file in snapshot() if file.is_relative_to(folder)} == before
+@WHAT
+def test_folder_that_is_not_certainly_the_runs_is_left_and_said_so(answer, make_run, tmp_path, change, what):
+    run_id, reason = change(tmp_path / "outputs" / "tiny", make_run)
+    assert_stays(answer, run_id, reason, what)
 
 
 def test_folder_of_two_runs_is_left(answer, make_run, tmp_path):
@@ -310,14 +224,12 @@ def test_run_that_cannot_be_removed_is_one_line_and_the_rest_goes_on(answer, mak
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "unlink", refused)
-        code, printed, errors = answer("prune", "runs", "--apply")
+        code, printed, errors = answer("prune", "folders", "--apply")
     assert code == 1
     assert f"{other} removed" in printed
-    assert errors == f"{stuck} is not removed: {tmp_path}/outputs/stuck/last.pt cannot be removed: Permission denied"
+    assert errors == f"{stuck} is not removed: {tmp_path}/outputs/stuck/last.pt: Permission denied"
     # It is still there, and can be tried again.
-    assert ids_in(tmp_path) == {stuck}
-    assert answer("prune", "runs", "--apply")[0] == 0
-    assert ids_in(tmp_path) == set()
+    assert answer("prune", "folders", "--apply")[0] == 0
     assert not (tmp_path / "outputs" / "stuck").exists()
 
 
@@ -356,35 +268,36 @@ def test_files_beside_a_policy_that_are_not_the_runs_stay(answer, make_run, tmp_
 
 
 def test_removal_that_is_interrupted_can_be_tried_again(answer, make_run, monkeypatch, tmp_path):
-    run_id = make_run()
+    make_run()
+    unlink = Path.unlink
 
-    def interrupted(*_):
-        raise KeyboardInterrupt
+    def interrupted(file, **options):
+        if file.name == "config.yaml":
+            raise KeyboardInterrupt
+        unlink(file, **options)
 
     with monkeypatch.context() as patched:
-        patched.setattr(prune, "_delete", interrupted)
-        assert answer("prune", "runs", "--apply")[0] == 130
-    (row,) = json.loads(answer("list", "--format=json")[1])
-    assert row["run_id"] == run_id
-    assert answer("prune", "runs", "--apply")[0] == 0
-    assert ids_in(tmp_path) == set()
+        patched.setattr(Path, "unlink", interrupted)
+        assert answer("prune", "folders", "--apply")[0] == 130
+    assert not (tmp_path / "outputs" / "tiny" / "last.pt").exists()
+    assert answer("prune", "folders", "--apply")[0] == 0
+    assert not (tmp_path / "outputs" / "tiny").exists()
 
 
 def test_run_that_somebody_has_deleted_stays_as_it_is(answer, make_run, store, tmp_path):
     deleted = make_run("deleted")
     store[0].delete_run(deleted)
-    for what in ("checkpoints", "folders", "runs"):
+    for what in ("checkpoints", "folders"):
         assert "0 of 0 runs" in answer("prune", what, "--apply")[1]
     assert (tmp_path / "outputs" / "deleted" / "best.pt").exists()
     assert len(artifacts_of(tmp_path, deleted)) == 3
 
 
-@pytest.mark.parametrize("what", ["folders", "runs"])
-def test_note_of_a_run_goes_with_its_folder(answer, make_run, monkeypatch, tmp_path, what):
+def test_note_of_a_run_goes_with_its_folder(answer, make_run, monkeypatch, tmp_path):
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
     run_id = make_run()
     # As a run leaves it whose rest was delivered by `armscan runs sync`.
     note = tmp_path / "cache" / pending.FOLDER / run_id
     note.write_text(str(file_of(tmp_path / "outputs" / "tiny", run_id)))
-    assert answer("prune", what, "--apply")[0] == 0
+    assert answer("prune", "folders", "--apply")[0] == 0
     assert not note.exists()
