@@ -66,7 +66,8 @@ def load_original(tracking: str, run_id: str) -> Original:
         config = from_its_folder(OmegaConf.create(run.config(Path(folder))), run.tags)
         volumes = run.volumes(Path(folder))
         text = run.text(ENVIRONMENT_FILE, Path(folder))
-    config.tracking.uri, config.tracking.experiment = tracking, run.experiment_name
+    config.tracking.uri = tracking
+    config.tracking.experiment = run.client.get_experiment(run.experiment_id).name
     setup = RunSetup.build(config)
     if volumes is not None:
         check_unchanged(volumes, setup.fingerprints, f"run {run.run_id} was started with")

@@ -36,10 +36,10 @@ class TrackingStore:
 
     Args:
         connect: opens the store.
-        uri: of the store, as it may be shown.
-        retry_s: how long it is waited for; None for not at all.
-        wait_s: how long a run waits for it at its end.
-        system_metrics_s: seconds between two looks at the machine while a run trains; None for none.
+        uri: its address, as it may be shown.
+        wait_s: seconds for which a run waits for it at its end.
+        retry_s: seconds to wait for it otherwise. Default: None, it is not waited for.
+        system_metrics_s: seconds between two looks at the machine while a run trains. Default: None, no looks.
     """
 
     def __init__(
@@ -47,8 +47,8 @@ class TrackingStore:
         connect: Callable[[], MlflowClient],
         uri: str,
         *,
-        retry_s: float | None,
         wait_s: float,
+        retry_s: float | None = None,
         system_metrics_s: float | None = None,
     ) -> None:
         self.uri, self.wait_s, self.system_metrics_s = uri, wait_s, system_metrics_s

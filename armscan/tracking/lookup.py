@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 from mlflow.entities import Run
+from packaging.version import Version
 
 import armscan
 from armscan.config.legacy import migrate
@@ -35,21 +36,19 @@ class FoundRun:
     """A run in the store.
 
     Args:
-        client: of the store.
-        uri: of the store.
-        experiment_id: that the run is in.
-        experiment_name: of that one.
-        run_id: of the run.
+        client: the run's store.
+        uri: MLflow tracking URI, as somebody typed it.
+        experiment_id: MLflow experiment ID.
+        run_id: MLflow run ID.
         name: what the UI calls it.
         status: how it ended, or that it is RUNNING.
-        tags: of the run.
-        files: its artifacts, by their paths.
+        tags: its tags.
+        files: paths of its artifacts.
     """
 
     client: TrackingStore = field(repr=False)
     uri: str
     experiment_id: str
-    experiment_name: str
     run_id: str
     name: str
     status: str
@@ -111,8 +110,8 @@ def load_run(uri: str, run_id: str) -> FoundRun:
     """Return a run with what it has kept.
 
     Args:
-        uri: of the store.
-        run_id: as in `find_run`.
+        uri: MLflow tracking URI.
+        run_id: MLflow run ID, or its first characters.
 
     Raises:
         TrackingError: if no run is meant, or several are, or the store does not exist or cannot be used.
@@ -124,7 +123,16 @@ def load_run(uri: str, run_id: str) -> FoundRun:
         if jobs := jobs_of(client, run):
             ids = listed([job.info.run_id for job in jobs])
             raise TrackingError(f"run {run.info.run_id} is the parent of a multirun: give one of its jobs, {ids}")
-        return _found(client, uri, run)
+        return FoundRun(
+            client=client,
+            uri=uri,
+            experiment_id=run.info.experiment_id,
+            run_id=run.info.run_id,
+            name=run.info.run_name,
+            status=run.info.status,
+            tags=dict(run.data.tags),
+            files=tuple(artifact.path for artifact in client.list_artifacts(run.info.run_id)),
+        )
 
 
 def find_run(client: TrackingStore, run_id: str) -> Run:
@@ -159,33 +167,14 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
 def check_version(run: Run) -> None:
     """Raise `TrackingError` where a run was made by a newer version, which may have kept it otherwise."""
     version = run.data.tags.get(VERSION_TAG, armscan.__version__)
-    if release(version) > release(armscan.__version__):
+    if Version(version).release > Version(armscan.__version__).release:
         raise TrackingError(
             f"run {run.info.run_id} was made by armscan {version}, but this is {armscan.__version__}: "
             "it needs that version or a newer one"
         )
 
 
-def release(version: str) -> tuple[int, ...]:
-    """Return a version of armscan as numbers, to be compared."""
-    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
-
-
 def jobs_of(client: TrackingStore, run: Run) -> list[Run]:
     """Return the runs of a multirun's jobs, by its parent run; none where the run is another."""
     children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
     return [child for child in children if EVALUATED_TAG not in child.data.tags]
-
-
-def _found(client: TrackingStore, uri: str, run: Run) -> FoundRun:
-    return FoundRun(
-        client=client,
-        uri=uri,
-        experiment_id=run.info.experiment_id,
-        experiment_name=client.get_experiment(run.info.experiment_id).name,
-        run_id=run.info.run_id,
-        name=run.info.run_name,
-        status=run.info.status,
-        tags=dict(run.data.tags),
-        files=tuple(artifact.path for artifact in client.list_artifacts(run.info.run_id)),
-    )

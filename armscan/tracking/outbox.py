@@ -113,8 +113,8 @@ class OutboxFile:
     def _read(self, line: bytes) -> Entry:
         try:
             entry = json.loads(line)
-        except ValueError as error:
-            raise TrackingError(f"{self.file}: a line of it is damaged: {line[:50]!r}") from error
+        except ValueError:
+            entry = None
         if not isinstance(entry, dict):
             raise TrackingError(f"{self.file}: a line of it is damaged: {line[:50]!r}")
         return entry
@@ -122,10 +122,9 @@ class OutboxFile:
     def _read_delivered(self) -> dict[Channel, int]:
         """Return how far each channel is uploaded; an impossible position is ignored: uploading twice does no harm."""
         try:
-            said = json.loads(self._delivered_file.read_bytes())
-        except (FileNotFoundError, ValueError):
-            said = None
-        ends = said if isinstance(said, dict) else {}
+            ends = dict(json.loads(self._delivered_file.read_bytes()))
+        except (FileNotFoundError, ValueError, TypeError):
+            return {}
         return {channel: ends[channel] for channel in CHANNELS if self._is_end_of_a_line(ends.get(channel))}
 
     def _is_end_of_a_line(self, end: Any) -> bool:

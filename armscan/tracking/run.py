@@ -41,10 +41,10 @@ class TrackedRun:
     `armscan runs sync FOLDER` uploads what a store that was away has missed.
 
     Args:
-        store: that it is in.
-        outbox: of the run.
+        store: the run's store.
+        outbox: the run's outbox.
         name: what the UI calls the run.
-        logged: the names and steps of the figures that are there already, which are not logged again.
+        logged: names and steps of the figures that are there already, which are not logged again.
     """
 
     def __init__(
@@ -74,18 +74,18 @@ class TrackedRun:
         """Make a new run.
 
         Args:
-            store: that it is made in.
-            experiment_id: of the run.
+            store: the store that it is made in.
+            experiment_id: MLflow experiment ID.
             name: what the UI calls the run.
             config: the resolved configuration; its leaves become parameters.
             tags: further tags.
-            folder: of the run.
-            parent_id: the run that this one is a child of, None for none.
+            folder: the run's folder.
+            parent_id: the run that this one is a child of. Default: None, no parent.
         """
         parent = {"mlflow.parentRunId": parent_id} if parent_id else {}
         run = store.create_run(experiment_id, name=name, tags={**source_tags(), **tags, **parent})
         tracked = cls.joined(store, run.info.run_id, name=name, folder=folder)
-        tracked.log_config(config)
+        tracked._log_config(config)
         return tracked
 
     @classmethod
@@ -100,11 +100,11 @@ class TrackedRun:
         """Open a run again that was interrupted, as if nothing had happened to it.
 
         Args:
-            store: that it is in.
-            run_id: of the run.
-            folder: of the run.
-            config: as it was started with; parameters that were not logged any more are.
-            tags: to set anew.
+            store: the run's store.
+            run_id: MLflow run ID.
+            folder: the run's folder.
+            config: the configuration that it was started with; parameters that are missing are logged.
+            tags: tags to set anew.
         """
         run = store.get_run(run_id)
         n_resumed = int(run.data.tags.get("resumed", "0")) + 1
@@ -118,9 +118,11 @@ class TrackedRun:
         tracked.set_status("RUNNING")
         tracked._add(untagged=FAILURE_TAG)
         tracked.set_tags(dict(tags) | changed | {"resumed": str(n_resumed)})
-        tracked.log_config(config)
+        tracked._log_config(config)
         if (diff := source().diff) and f"resumed.{DIFF_SUM}" in changed:
-            tracked.keep(RESUMED_DIFF_FILE.format(n_resumed), diff)
+            file = folder / RESUMED_DIFF_FILE.format(n_resumed)
+            atomic_write(file, lambda opened: opened.write(diff))
+            tracked.log_files(file)
         return tracked
 
     def set_tags(self, tags: Mapping[str, str]) -> None:
@@ -128,8 +130,7 @@ class TrackedRun:
         if tags:
             self._add(tags=tags_of(tags))
 
-    def log_config(self, config: Mapping[str, Any]) -> None:
-        """Log a configuration's leaves as parameters; those that are there already stay as they are."""
+    def _log_config(self, config: Mapping[str, Any]) -> None:
         if params := params_of(config):
             self._add(params=params)
 
@@ -139,8 +140,11 @@ class TrackedRun:
             self.on_epoch(report)
         if (every_s := self._store.system_metrics_s) is not None:
             looks = [step for name, step in self._logged if name.startswith(PREFIX)]
-            take = self._log_system_metrics
-            self._system = SystemMetrics(take, every_s=every_s, first=max(looks, default=-1) + 1)
+            self._system = SystemMetrics(
+                lambda figures, number: self.log_figures(figures, n_env_steps=number),
+                every_s=every_s,
+                first=max(looks, default=-1) + 1,
+            )
 
     def on_epoch(self, report: EpochReport) -> None:
         """Log an epoch's figures by environment step."""
@@ -149,13 +153,10 @@ class TrackedRun:
         self.log_figures(figures, n_env_steps=report.n_env_steps)
 
     def on_end(self) -> None:
-        """Do nothing: evaluation and artifacts follow the training."""
+        """Watch the machine no longer; evaluation and artifacts follow."""
         if self._system is not None:
             self._system.finish()
             self._system = None
-
-    def _log_system_metrics(self, figures: Mapping[str, float], number: int) -> None:
-        self.log_figures(figures, n_env_steps=number)
 
     def log_figures(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
         """Log figures at an environment step; none twice."""
@@ -168,12 +169,6 @@ class TrackedRun:
         ]
         if points:
             self._add(metrics=points)
-
-    def keep(self, name: str, contents: bytes) -> None:
-        """Keep something as a file of the run's folder, and as an artifact."""
-        file = self._outbox.folder / name
-        atomic_write(file, lambda opened: opened.write(contents))
-        self.log_files(file)
 
     def log_files(self, *files: Path) -> None:
         """Keep files as artifacts; they stay as they are until the run has ended."""
@@ -192,10 +187,10 @@ class TrackedRun:
         """Log the final evaluations, and keep what the run has made in its folder.
 
         Args:
-            result: of the training; the evaluations are logged at the step of its best epoch, whose weights they judge.
-                None where there was nothing to learn.
-            evaluations: by the name of their volumes.
-            folder: of the run; the learning curve's picture and the evaluations' figures are added to it.
+            result: the training's; evaluations are logged at its best epoch, whose weights they judge. None where there
+                was nothing to learn.
+            evaluations: evaluations by the name of their volumes.
+            folder: the run's folder; the learning curve's picture and the evaluations' figures are added to it.
         """
         for name, evaluation in evaluations.items():
             prefix = name.replace(" ", "_").replace("-", "_")
@@ -234,9 +229,9 @@ class TrackedRun:
         """Close the run as FINISHED, FAILED (with the reason) or KILLED, and wait until the store has all of it.
 
         Args:
-            status: of the run.
-            reason: of its failure.
-            wait_s: how long a store is waited for that is away; as long as the configuration says where it is None.
+            status: FINISHED, FAILED or KILLED.
+            reason: why it failed. Default: None.
+            wait_s: seconds to wait for a store that is away. Default: what the configuration says.
 
         Returns:
             Whether the store has all of it; the rest is in the folder of the run.

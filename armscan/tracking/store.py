@@ -61,13 +61,13 @@ def open_store(
     """Open a tracking store and make the experiment where it does not exist yet.
 
     Args:
-        uri: of the store, such as `sqlite:///mlruns.db` or the address of an MLflow server.
-        experiment: the experiment's name.
+        uri: MLflow tracking URI, such as `sqlite:///mlruns.db` or the address of an MLflow server.
+        experiment: name of the experiment.
         artifacts: folder of its artifacts where the store is a database; a server has its own place for them.
-        wait_s: how long a run waits for it at its end.
-        system_metrics_s: seconds between two looks at the machine while a run trains; None for none.
-        policy: whether runs keep their policies in it; only checked here, with the rest of the section.
-        retry_s: how long it is waited for otherwise, already while it is opened; None for not at all.
+        wait_s: seconds for which a run waits for it at its end.
+        system_metrics_s: seconds between two looks at the machine while a run trains. Default: None, no looks.
+        policy: whether runs keep their policies in it; only checked here, with the rest of the section. Default: True.
+        retry_s: seconds to wait for it otherwise, already while it is opened. Default: None, it is not waited for.
 
     Returns:
         The store, and the experiment's id.
@@ -80,8 +80,8 @@ def open_store(
     check_float("tracking.wait_s", wait_s, at_least=0.0)
     if system_metrics_s is not None:
         check_float("tracking.system_metrics_s", system_metrics_s, above=0.0)
-    connected = partial(_store, wait_s=wait_s, system_metrics_s=system_metrics_s, retry_s=retry_s)
     check_bool("tracking.policy", policy)
+    connected = partial(_store, wait_s=wait_s, system_metrics_s=system_metrics_s, retry_s=retry_s)
     with store_errors(uri):
         if not uri.startswith(SQLITE_PREFIX):
             store = connected(uri)
@@ -113,7 +113,7 @@ def open_existing_store(uri: str) -> TrackingStore:
         _check_is_store(uri, database)
         uri = f"{SQLITE_PREFIX}{database}"
     with store_errors(uri):
-        store = _store(uri, wait_s=USUAL_WAIT_S, system_metrics_s=None, retry_s=None)
+        store = _store(uri, wait_s=USUAL_WAIT_S)
         store.search_experiments(max_results=1)
         return store
 
@@ -132,21 +132,20 @@ def _check_is_store(uri: str, database: Path) -> None:
         )
 
 
-def _store(uri: str, *, wait_s: float, system_metrics_s: float | None, retry_s: float | None) -> TrackingStore:
-    connect = partial(MlflowClient, tracking_uri=_address(uri))
-    return TrackingStore(connect, uri, retry_s=retry_s, wait_s=wait_s, system_metrics_s=system_metrics_s)
+def _store(
+    uri: str, *, wait_s: float, system_metrics_s: float | None = None, retry_s: float | None = None
+) -> TrackingStore:
+    """Return an open store; its client gets the driver and the password of a database."""
+    address = uri
+    if uri.startswith("postgresql"):
+        address = database_url(uri, TRACKING_PASSWORD).render_as_string(hide_password=False)
+    connect = partial(MlflowClient, tracking_uri=address)
+    return TrackingStore(connect, uri, wait_s=wait_s, system_metrics_s=system_metrics_s, retry_s=retry_s)
 
 
 def absolute(uri: str) -> str:
     """Return the address of a store as it is understood from everywhere."""
     return f"{SQLITE_PREFIX}{sqlite_file(uri)}" if uri.startswith(SQLITE_PREFIX) else uri
-
-
-def _address(uri: str) -> str:
-    """Return the address of a store with its driver and password."""
-    if not uri.startswith("postgresql"):
-        return uri
-    return database_url(uri, TRACKING_PASSWORD).render_as_string(hide_password=False)
 
 
 def _check_texts(**values: object) -> None:

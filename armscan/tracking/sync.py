@@ -46,8 +46,8 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore]) -> list[Delivery]
     """Deliver what the runs in a folder, and in the folders in it, have left.
 
     Args:
-        folder: of a run, of a study, or above them.
-        opened: opens a store by its address.
+        folder: folder of a run, of a study, or above them.
+        opened: opens a store by its address; called once for each address.
 
     Returns:
         What became of each run that had something left.
@@ -55,39 +55,33 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore]) -> list[Delivery]
     deliveries: list[Delivery] = []
     stores: dict[str, TrackingStore | TrackingError] = {}
     for file in outbox_files(folder):
+        run_id = None
         try:
-            outbox = Outbox(file, timeout_s=0.0)
+            with contextlib.closing(Outbox(file, timeout_s=0.0)) as outbox:
+                run_id, uri = outbox.address.run_id, outbox.address.uri
+                if outbox.is_delivered:
+                    continue
+                if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
+                    deliveries.append(Delivery(outbox.folder, run_id, 0, str(store)))
+                else:
+                    deliveries.append(_delivered(outbox, store))
+                stores[uri] = store
         except FileNotFoundError:
-            # Its run was removed since.
+            # Its run was removed meanwhile.
             continue
-        except (FolderInUseError, TrackingError) as error:
-            left = IN_USE if isinstance(error, FolderInUseError) else str(error)
-            deliveries.append(Delivery(file.parent.parent, None, 0, left))
-            continue
-        with contextlib.closing(outbox):
-            deliveries += _what_became_of(outbox, opened, stores)
+        except FolderInUseError:
+            deliveries.append(Delivery(file.parent.parent, None, 0, IN_USE))
+        except (OSError, TrackingError) as error:
+            deliveries.append(Delivery(file.parent.parent, run_id, 0, str(error)))
     return deliveries
 
 
-def _what_became_of(
-    outbox: Outbox, opened: Callable[[str], TrackingStore], stores: dict[str, TrackingStore | TrackingError]
-) -> list[Delivery]:
-    """Return what became of a run's entries, nothing where none were left."""
-    run_id, uri = outbox.address.run_id, outbox.address.uri
+def _opened(opened: Callable[[str], TrackingStore], uri: str) -> TrackingStore | TrackingError:
+    """Open a store; return why it cannot be used, so that it is not waited for again with the next run."""
     try:
-        if outbox.is_delivered:
-            return []
-        if uri not in stores:
-            try:
-                stores[uri] = opened(uri)
-            except TrackingError as error:
-                # Not to be waited for again with the next run.
-                stores[uri] = error
-        if isinstance(store := stores[uri], TrackingError):
-            raise store
+        return opened(uri)
     except TrackingError as error:
-        return [Delivery(outbox.folder, run_id, 0, str(error))]
-    return [_delivered(outbox, store)]
+        return error
 
 
 def _delivered(outbox: Outbox, store: TrackingStore) -> Delivery:

@@ -6,7 +6,6 @@ import itertools
 import threading
 import time
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 from mlflow import MlflowClient
@@ -157,13 +156,23 @@ def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any])
                 client.log_batch(run_id, tags=[RunTag(*pair) for pair in batch])
         case "untagged":
             for tag in values:
-                _delete_tag(client, run_id, tag)
+                try:
+                    client.delete_tag(run_id, tag)
+                except MlflowException as error:
+                    if error.error_code != NOT_THERE:
+                        raise
         case "status":
             for status, at_ms in values:
-                _set_status(client, run_id, status, at_ms)
+                if status == "RUNNING":
+                    client.update_run(run_id, status=status)
+                else:
+                    client.set_terminated(run_id, status, end_time=at_ms)
         case "file":
             for name, place in map(file_and_place, values):
-                _keep_file(client, run_id, outbox.folder / name, place)
+                if (file := outbox.folder / name).exists():
+                    client.log_artifact(run_id, str(file), place)
+                else:
+                    log(f"run {run_id}: {file} was removed before the store could keep it")
         case "address":
             return
         case _:
@@ -174,25 +183,3 @@ def _batches(values: Iterable[Any], size: int) -> Iterable[Sequence[Any]]:
     rest = iter(values)
     while batch := list(itertools.islice(rest, size)):
         yield batch
-
-
-def _delete_tag(client: MlflowClient, run_id: str, tag: str) -> None:
-    try:
-        client.delete_tag(run_id, tag)
-    except MlflowException as error:
-        if error.error_code != NOT_THERE:
-            raise
-
-
-def _set_status(client: MlflowClient, run_id: str, status: str, at_ms: int) -> None:
-    if status == "RUNNING":
-        client.update_run(run_id, status=status)
-    else:
-        client.set_terminated(run_id, status, end_time=at_ms)
-
-
-def _keep_file(client: MlflowClient, run_id: str, path: Path, place: str | None) -> None:
-    if not path.exists():
-        log(f"run {run_id}: {path} was removed before the store could keep it")
-        return
-    client.log_artifact(run_id, str(path), place)

@@ -163,7 +163,7 @@ def test_runs_of_a_server_are_listed_and_removed(tracking_server, make_run, answ
     one = f"--where=attributes.run_id = '{run_id}'"
     assert "folders of 1 of 1 runs would be removed" in answer("prune", "folders", one, *words)[1]
     assert all(file.exists() for file in files)
-    code, printed, errors = answer("prune", "folders", "--apply", one, *words)
+    code, _, errors = answer("prune", "folders", "--apply", one, *words)
     assert (code, errors) == (0, "")
     assert all(file.exists() for file in files)
     assert not (tmp_path / "outputs" / "a").exists()

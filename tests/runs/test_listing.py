@@ -164,7 +164,16 @@ def test_show_tells_everything_of_a_run(make_run, store, answer, tmp_path):
     assert (code, errors) == (0, "")
     for told in (
         *(run_id, "failed after", "no reason", "agent=sac seed=3", 40 * "a", "something.new", "[red]x", child[:8]),
-        *("last validation", "test volumes", "75.0%", "9.25", "best.pt", "1.0 kB", ".hydra/config.yaml", "evaluation: x"),
+        *(
+            "last validation",
+            "test volumes",
+            "75.0%",
+            "9.25",
+            "best.pt",
+            "1.0 kB",
+            ".hydra/config.yaml",
+            "evaluation: x",
+        ),
         str(tmp_path / "outputs" / "tiny"),
         f"resume    python -m armscan.run resume={run_id}\n",
         f"evaluate  armscan evaluate {run_id}\n",
