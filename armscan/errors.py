@@ -92,19 +92,6 @@ class StorageAwayError(StudyError, AwayError):
     """The storage of a study cannot be reached, and is not waited for any longer."""
 
 
-class ServerError(ArmscanError, RuntimeError):
-    """A server that a command has started does not answer, or has ended by itself.
-
-    Args:
-        message: of one line.
-        log: the end of what the server has said.
-    """
-
-    def __init__(self, message: str, *, log: str) -> None:
-        super().__init__(message)
-        self.log = log
-
-
 def is_interruption(error: BaseException | None) -> bool:
     """Whether an error is an interrupt, or came of one: raised inside compiled code, it can come out as any other."""
     while error is not None:

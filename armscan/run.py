@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from armscan.config.compose import application
 from armscan.config.credentials import check_words
 from armscan.config.defaults import MULTIRUN, PLAN, RESUME
-from armscan.config.error_messages import one_line_message, silence_library_warnings
+from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
 from armscan.errors import is_interruption
 from armscan.experiment.cleanup import remove_if_untracked
@@ -31,6 +31,7 @@ from armscan.experiment.invocation import Invocation
 from armscan.experiment.job import INTERRUPTED
 from armscan.launch.job_process import start_job
 from armscan.launch.multirun import Multirun, end_multirun
+from armscan.utils.log import silence_library_warnings
 
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
 
@@ -39,11 +40,12 @@ def run(config: DictConfig) -> None:
     """Run what Hydra has composed: a single run, one job of a multirun, or one worker of a study."""
     if config.get("study") is not None:
         # Deferred, because only studies need Optuna.
+        from armscan.sweeps.study.arguments import words_of_trials
         from armscan.sweeps.workers.supervisor import run_worker
 
         hydra_config = HydraConfig.get()
-        words = [*hydra_config.overrides.task, *hydra_config.overrides.hydra]
-        run_worker(config, words, Path(hydra_config.sweep.dir))
+        words = words_of_trials([*hydra_config.overrides.task, *hydra_config.overrides.hydra])
+        run_worker(words, int(config.study.worker), Path(hydra_config.sweep.dir))
         return
     invocation = Invocation.current()
     if invocation.job is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armscan.cli.options import Command, CommaSeparated, FilePath, clustering_option
+from armscan.cli.options import FILE_PATH, CommaSeparated, clustering_option, examples
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -27,7 +27,7 @@ def data() -> None:
     """Inspect, label and explore volumes."""
 
 
-@data.command(cls=Command, left="nothing was written", examples=["data inspect wrists"])
+@data.command(epilog=examples("data inspect wrists"))
 @click.argument("folder")
 def inspect(folder: str) -> None:
     """Print what the volumes of FOLDER hold.
@@ -42,23 +42,22 @@ def inspect(folder: str) -> None:
 
 
 @data.command(
-    cls=Command,
-    left="the planes found so far are in the manifest",
-    examples=["data label wrists", "data label wrists --volume a.nii.gz --markup moved.mrk.json"],
+    epilog=examples("data label wrists", "data label wrists --volume a.nii.gz --markup moved.mrk.json"),
 )
 @click.argument("folder")
 @click.option("--volumes", type=CommaSeparated("NAME"), help="Only these volumes, by their file names.")
 @click.option("--overwrite", is_flag=True, help="Also label volumes that have a plane.")
 @click.option(
     "--pictures",
-    type=FilePath("FOLDER"),
+    type=FILE_PATH,
+    metavar="FOLDER",
     show_default=f"FOLDER/{PICTURES}",
     help="Folder of the pictures of the planes.",
 )
 @click.option("--markups", is_flag=True, help="Write each plane as a markups file (.mrk.json) for 3D Slicer, too.")
-@click.option("--markup", type=FilePath("FILE"), help="Read the plane of --volume from this markups file.")
+@click.option("--markup", type=FILE_PATH, metavar="FILE", help="Read the plane of --volume from this markups file.")
 @click.option("--volume", metavar="NAME", help="Volume of --markup.")
-@clustering_option()
+@clustering_option
 def label(
     folder: str,
     volumes: tuple[str, ...] | None,
@@ -105,10 +104,10 @@ def label(
     return 2 if failures else 0
 
 
-@data.command(cls=Command, left="nothing is written", examples=["data explore wrists --volume a.nii.gz"])
+@data.command(epilog=examples("data explore wrists --volume a.nii.gz"))
 @click.argument("folder", required=False)
 @click.option("--volume", metavar="NAME", help="Volume to begin with.  [default: the first]")
-@clustering_option()
+@clustering_option
 def explore(folder: str | None, volume: str | None, clustering: str | None) -> None:
     """Move the plane by sliders in a window.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armscan.cli.options import Command, FilePath, clustering_option, is_given, one_line, tracking_option
+from armscan.cli.options import FILE_PATH, clustering_option, examples, is_given, tracking_option
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import LARGEST_SEED, check_int
 
@@ -26,14 +26,12 @@ OPTIONS = {
 
 
 @click.command(
-    cls=Command,
-    left="no metrics or video were written",
-    examples=[
+    epilog=examples(
         "evaluate 3bf2",
         "evaluate 3bf2 --data wrists --success-threshold 0.01",
         "evaluate 3bf2 --data phantom --phantoms 12 --video",
         "evaluate --agent random --data wrists projection=zy",
-    ],
+    ),
 )
 @click.argument("run", nargs=-1, metavar="[RUN | KEY=VALUE...]")
 @click.option("--agent", metavar="NAME", help="Evaluate an agent that needs no training instead of a run's.")
@@ -58,7 +56,8 @@ OPTIONS = {
 @click.option("--video", is_flag=True, help="Record the episodes as GIF and MP4 instead; nothing is tracked.")
 @click.option(
     "--out",
-    type=FilePath("PATH"),
+    type=FILE_PATH,
+    metavar="PATH",
     help="JSON file of metrics and episodes, or folder of the video.  [default: in evaluations or films]",
 )
 @click.option(
@@ -66,14 +65,14 @@ OPTIONS = {
 )
 @click.option("--max-steps", type=click.IntRange(1), help="End episodes after so many steps.")
 @click.option("--start", type=click.Choice(["middle", "random"]), help="Where episodes start.")
-@clustering_option()
+@clustering_option
 @click.option(
     "--deterministic-eval/--no-deterministic-eval",
     default=None,
     help="Take the policy's mean action, or sample its actions.",
 )
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Where the network computes.")
-@tracking_option("MLflow tracking store of the run and of the evaluation.")
+@tracking_option(help="MLflow tracking store of the run and of the evaluation.")
 @click.option(
     "--tracking-experiment",
     metavar="NAME",
@@ -118,24 +117,20 @@ def evaluate(
     # Deferred: a mistake on the command line is answered before these are loaded.
     from armscan import evaluation
     from armscan.config.defaults import default_tracking
-    from armscan.config.error_messages import silence_library_warnings
     from armscan.evaluation.apply import apply
 
-    silence_library_warnings()
     n_episodes = episodes or (N_VIDEO_EPISODES if video else N_EPISODES)
     store = default_tracking() | {"uri": tracking}
     if tracking_experiment is not None:
         store["experiment"] = tracking_experiment
-    with one_line(overrides):
-        subject = (
-            evaluation.agent_of_run(tracking, run[0], changes)
-            if agent is None
-            else evaluation.agent_of_overrides(overrides, folder, changes)
-        )
-        if video:
-            applied = apply(subject, data, phantoms, render_mode="rgb_array")
-        else:
-            applied = apply(subject, data, phantoms, check=lambda groups: _check_episodes(n_episodes, groups))
+    if agent is None:
+        subject = evaluation.agent_of_run(tracking, run[0], changes)
+    else:
+        subject = evaluation.agent_of_overrides(overrides, folder, changes)
+    if video:
+        applied = apply(subject, data, phantoms, render_mode="rgb_array")
+    else:
+        applied = apply(subject, data, phantoms, check=lambda groups: _check_episodes(n_episodes, groups))
     if video:
         from armscan.evaluation.video import record_video
         from armscan.experiment.console import from_here

@@ -10,14 +10,38 @@ import click
 
 from armscan.cli.data import data
 from armscan.cli.evaluate import evaluate
-from armscan.cli.options import TRACEBACKS, Interrupted
 from armscan.cli.policy import policy
 from armscan.cli.report import report
-from armscan.cli.run import run
 from armscan.cli.runs import runs
 from armscan.cli.ui import ui
+from armscan.errors import is_interruption
+from armscan.utils.log import silence_library_warnings
 
 PROGRAM = "armscan"
+TRACEBACKS = "ARMSCAN_TRACEBACKS"
+INTERRUPTED = 130
+
+
+class PassedOn(click.Command):
+    """A command that takes its arguments as they are, options included."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Keep the arguments for the command."""
+        ctx.args = args
+        return args
+
+
+@click.command(cls=PassedOn, add_help_option=False)
+@click.pass_context
+def run(ctx: click.Context) -> int:
+    """Train an agent, run a sweep or a study (Hydra).
+
+    Same as python -m armscan.run.
+    """
+    from armscan.run import main
+
+    sys.argv[1:] = ctx.args
+    return main()
 
 
 @click.group(
@@ -42,25 +66,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: 2 for a mistake, 130 for an interrupt, else the command's own.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
+    silence_library_warnings()
     try:
-        return armscan.main(words, prog_name=PROGRAM, standalone_mode=False) or 0
+        return armscan.main(words, prog_name=PROGRAM, standalone_mode=False, obj=words) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
-        return error.exit_code
-    except Interrupted as error:
-        print(f"\n{error.message}", file=sys.stderr)
         return error.exit_code
     except click.ClickException as error:
         print(f"error: {' '.join(error.format_message().split())}", file=sys.stderr)
         return error.exit_code
-    except click.Abort:
-        print("\ninterrupted", file=sys.stderr)
-        return Interrupted.exit_code
     except Exception as error:
+        if is_interruption(error):
+            print("interrupted", file=sys.stderr)
+            return INTERRUPTED
         # Deferred: it loads Hydra.
         from armscan.config.error_messages import one_line_message
 
-        line = one_line_message(error, words)
+        line = one_line_message(error)
         if line is None or os.environ.get(TRACEBACKS):
             raise
         print(f"error: {line}", file=sys.stderr)

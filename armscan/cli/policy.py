@@ -7,10 +7,8 @@ from pathlib import Path
 
 import click
 
-from armscan.cli.options import Command, FilePath, tracking_option
+from armscan.cli.options import FILE_PATH, examples, tracking_option
 from armscan.errors import InvalidValueError
-
-LEFT = "nothing was exported or registered"
 
 
 @click.group()
@@ -18,11 +16,12 @@ def policy() -> None:
     """Export or register the policy of a run."""
 
 
-@policy.command(cls=Command, left=LEFT, examples=["policy export 3bf2 --out wrist-model"])
+@policy.command(epilog=examples("policy export 3bf2 --out wrist-model"))
 @click.argument("run")
 @click.option(
     "--out",
-    type=FilePath("FOLDER"),
+    type=FILE_PATH,
+    metavar="FOLDER",
     required=True,
     help="Folder of the model. An exported model there is replaced, nothing else.",
 )
@@ -34,11 +33,9 @@ def export(run: str, out: Path, tracking: str) -> None:
     docs/policy.md describes its input and output.
     """
     # Deferred: a mistake on the command line is answered before these are loaded.
-    from armscan.config.error_messages import silence_library_warnings
     from armscan.policies.model import is_model, others_in
     from armscan.runs.policy_registry import export_policy
 
-    silence_library_warnings()
     if out.exists() and not is_model(out):
         raise InvalidValueError(f"--out is {str(out)!r}, but something else is there, and would be lost: name another")
     if out.exists() and (others := others_in(out)):
@@ -48,19 +45,17 @@ def export(run: str, out: Path, tracking: str) -> None:
     _print_usage(str(out))
 
 
-@policy.command(cls=Command, left=LEFT, examples=["policy register 3bf2 --name wrist"])
+@policy.command(epilog=examples("policy register 3bf2 --name wrist"))
 @click.argument("run")
 @click.option("--name", required=True, help="Name of the registered model, which is created if there is none.")
-@tracking_option("MLflow tracking store; its model registry is used.")
+@tracking_option(help="MLflow tracking store; its model registry is used.")
 def register(run: str, name: str, tracking: str) -> None:
     """Register the policy of RUN in MLflow's model registry.
 
     RUN is an MLflow run ID or its first four or more characters. Each call registers a new version.
     """
-    from armscan.config.error_messages import silence_library_warnings
     from armscan.runs.policy_registry import register_policy
 
-    silence_library_warnings()
     address = register_policy(tracking, run, name)
     print(f"registered {address}")
     print(f"its store  export MLFLOW_TRACKING_URI={shlex.quote(tracking)}")

@@ -7,16 +7,14 @@ from pathlib import Path
 
 import click
 
-from armscan.cli.options import Command, FilePath, is_given, storage_option, tracking_option
+from armscan.cli.options import FILE_PATH, examples, is_given, storage_option, tracking_option
 from armscan.errors import InvalidValueError, StudyError, listed
 
 # The option with the place of what the report is of.
 PLACES = {"study": "storage", "runs": "tracking"}
 
 
-@click.command(
-    cls=Command, left="the report may be incomplete", examples=["report --study sac_y", "report --runs 4f2a,91c0"]
-)
+@click.command(epilog=examples("report --study sac_y", "report --runs 4f2a,91c0"))
 @click.option("--study", metavar="NAME", help="Report on this study.")
 @click.option(
     "--runs",
@@ -24,9 +22,9 @@ PLACES = {"study": "storage", "runs": "tracking"}
     help="Compare these runs: MLflow run IDs or their beginnings. A multirun or a trial stands for all trainings below "
     "it, experiment:NAME for an MLflow experiment.",
 )
-@click.option("--out", type=FilePath("FOLDER"), help="Folder of the report.  [default: a new one in reports]")
-@storage_option("Optuna storage of the study.")
-@tracking_option("MLflow tracking store of the runs.")
+@click.option("--out", type=FILE_PATH, metavar="FOLDER", help="Folder of the report.  [default: a new one in reports]")
+@storage_option(help="Optuna storage of the study.")
+@tracking_option(help="MLflow tracking store of the runs.")
 def report(study: str | None, runs: str | None, out: Path | None, storage: str, tracking: str) -> None:
     """Report on a study, or compare runs.
 
@@ -41,10 +39,8 @@ def report(study: str | None, runs: str | None, out: Path | None, storage: str, 
         raise click.UsageError(f"--{PLACES[other]} is given, but it is for --{other}, and this report is of --{of}")
     _check_folder(out)
     # Deferred: a mistake on the command line is answered before these are loaded.
-    from armscan.config.error_messages import silence_library_warnings
     from armscan.reports.runs import compare_runs
 
-    silence_library_warnings()
     if runs is not None:
         file = compare_runs(runs, tracking, None if out is None else str(out))
     elif study is not None:

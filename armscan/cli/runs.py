@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armscan.cli.options import Command, CommaSeparated, FilePath, Moment, UriParam, tracking_option
+from armscan.cli.options import FILE_PATH, CommaSeparated, Moment, UriParam, examples, tracking_option
 
 if TYPE_CHECKING:
     from armscan.runs.query import Selection
@@ -61,9 +61,7 @@ def runs() -> None:
 
 @runs.command(
     "list",
-    cls=Command,
-    left="nothing was changed",
-    examples=["runs list --status failed,killed --since 7d", "runs list --agent sac --sort -success --limit 5"],
+    epilog=examples("runs list --status failed,killed --since 7d", "runs list --agent sac --sort -success --limit 5"),
 )
 @_with_selection
 @click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), default="table", help="Output format.")
@@ -86,7 +84,7 @@ def list_runs(form: str, children: bool, tracking: str, **selected: Any) -> None
             write_entries(expand(entries, found) if children else entries, form)
 
 
-@runs.command(cls=Command, left="nothing was changed", examples=["runs show 3bf2"])
+@runs.command(epilog=examples("runs show 3bf2"))
 @click.argument("run")
 @tracking_option()
 def show(run: str, tracking: str) -> None:
@@ -102,9 +100,7 @@ def show(run: str, tracking: str) -> None:
 
 
 @runs.command(
-    cls=Command,
-    left="what was not removed by now is still there",
-    examples=["runs prune checkpoints --before 30d", "runs prune folders --status failed --before 7d --apply"],
+    epilog=examples("runs prune checkpoints --before 30d", "runs prune folders --status failed --before 7d --apply"),
 )
 @click.argument("what", type=click.Choice(["checkpoints", "folders"]))
 @_with_selection
@@ -132,14 +128,11 @@ def prune(what: str, apply: bool, tracking: str, **selected: Any) -> int:
     freed = decimal(sum(case.n_bytes for case in taken))
     print(f"{what} of {len(taken)} of {len(cases)} runs would be removed, {freed}; nothing is touched")
     if taken:
-        words = click.get_current_context().obj
-        print(f"remove it {shlex.join(['armscan', 'runs', 'prune', *words, '--apply'])}")
+        print(f"remove it {shlex.join(['armscan', *click.get_current_context().obj, '--apply'])}")
     return 0
 
 
-@runs.command(
-    cls=Command, left="what was not delivered is still there", examples=["runs sync outputs", "runs sync studies/sac_y"]
-)
+@runs.command(epilog=examples("runs sync outputs", "runs sync studies/sac_y"))
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--tracking", type=UriParam(), help="MLflow tracking store.  [default: the one that each run names]")
 def sync(folder: Path, tracking: str | None) -> int:
@@ -148,11 +141,9 @@ def sync(folder: Path, tracking: str | None) -> int:
     FOLDER is the folder of a run, of a study, or above them. What is delivered already is not delivered again; runs
     that are still going on deliver for themselves. Exit code: 1 if something is left.
     """
-    from armscan.config.error_messages import silence_library_warnings
     from armscan.tracking import open_existing_store
     from armscan.tracking import sync as deliver
 
-    silence_library_warnings()
     opened = cache(lambda tracked_in: open_existing_store(tracking or tracked_in))
     deliveries = deliver(folder, opened)
     for delivery in deliveries:
@@ -165,13 +156,13 @@ def sync(folder: Path, tracking: str | None) -> int:
 
 
 @runs.command(
-    cls=Command,
-    left="the reproduction is not complete",
-    examples=["runs reproduce 3bf2 --dry-run", "runs reproduce 3bf2 --out again"],
+    epilog=examples("runs reproduce 3bf2 --dry-run", "runs reproduce 3bf2 --out again"),
 )
 @click.argument("run")
 @click.option("--dry-run", is_flag=True, help="Only list what differs from the run.")
-@click.option("--out", type=FilePath("FOLDER"), show_default="reproductions/ID-TIME", help="Folder of the new run.")
+@click.option(
+    "--out", type=FILE_PATH, metavar="FOLDER", show_default="reproductions/ID-TIME", help="Folder of the new run."
+)
 @tracking_option()
 def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str) -> int:
     """Run a run once more, and compare every metric.
@@ -181,14 +172,12 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str) -> int:
     of the old one, and is tracked beside it. Exit code: 0 if all metrics are equal (with --dry-run: if nothing
     differs), else 1.
     """
-    from armscan.config.error_messages import silence_library_warnings
     from armscan.utils.threads import limit_threads
 
     # As a run is computed.
     limit_threads()
     from armscan.runs import reproduce as reproduction
 
-    silence_library_warnings()
     original = reproduction.load_original(tracking, run)
     differences = reproduction.differences(original)
     print(f"run {original.run.run_id}: {original.run.name}")
@@ -209,11 +198,9 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str) -> int:
 @contextmanager
 def _open(uri: str) -> Iterator[TrackingStore]:
     """Open a store; turn its errors into a `TrackingError`."""
-    from armscan.config.error_messages import silence_library_warnings
     from armscan.tracking import open_existing_store
     from armscan.tracking.store import store_errors
 
-    silence_library_warnings()
     client = open_existing_store(uri)
     with store_errors(client.uri):
         yield client

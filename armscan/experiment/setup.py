@@ -10,10 +10,10 @@ import torch
 from omegaconf import DictConfig
 
 from armscan.agents import Learner
-from armscan.config.error_messages import silence_library_warnings
 from armscan.experiment.build import Experiment, build_experiment
 from armscan.training import CheckpointProvenance, Fingerprints, TrainingDomain
 from armscan.training.rollout import Env
+from armscan.utils.log import silence_library_warnings
 
 
 @dataclass(frozen=True, kw_only=True)

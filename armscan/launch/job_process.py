@@ -16,7 +16,7 @@ from armscan.config.error_messages import one_line_message
 from armscan.experiment.cleanup import remove_if_untracked
 from armscan.experiment.invocation import Invocation
 from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, Job
-from armscan.utils.processes import ParentProcess
+from armscan.utils.processes import on_parent_exit
 
 # What a job's process runs; it may be interrupted while it is still importing.
 JOB_PROGRAM = """
@@ -41,7 +41,7 @@ def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
 
 def run_job() -> None:
     """One job of a multirun, handed over on standard input: a failure is noted, and does not stop the others."""
-    ParentProcess().on_exit(partial(os.kill, os.getpid(), signal.SIGTERM))
+    on_parent_exit(partial(os.kill, os.getpid(), signal.SIGTERM))
     config, invocation = pickle.load(sys.stdin.buffer)
     job: Job = invocation.job
 

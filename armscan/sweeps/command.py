@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 
 from armscan.config.credentials import check_address
 from armscan.config.defaults import TRACKING_URI, to_plain
-from armscan.config.error_messages import silence_library_warnings
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher
 from armscan.sweeps.results.progress import print_result
 from armscan.sweeps.study.arguments import STORAGE, StudyCommand
@@ -18,6 +17,7 @@ from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.study import existing_study
 from armscan.sweeps.tasks.attempt import composed
 from armscan.sweeps.workers.launch import run_workers
+from armscan.utils.log import silence_library_warnings
 
 
 def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:

@@ -1,9 +1,8 @@
-"""Servers for the browser of this machine, as child processes that end with this one."""
+"""Servers for the browser of this machine: Optuna's dashboard in a thread, MLflow's UI in a process."""
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import signal
 import socket
@@ -11,134 +10,119 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import IO
+from collections.abc import Iterator
+from pathlib import Path
+from socketserver import ThreadingMixIn
+from threading import Thread
+from typing import IO, TYPE_CHECKING
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from armscan.config.credentials import mask_passwords
-from armscan.errors import InvalidValueError, ServerError
+from armscan.config.credentials import TRACKING_PASSWORD, database_url, mask_passwords
+from armscan.errors import InvalidValueError, TrackingError
+from armscan.ui.mlflow_server import END_S
+
+if TYPE_CHECKING:
+    from armscan.sweeps.storage.storage import Storage
 
 HOST = "127.0.0.1"
-START_S, END_S, POLL_S = 120.0, 5.0, 0.1
+START_S, POLL_S = 120.0, 0.1
 LOG_BYTES = 2000
+MLFLOW_OPTIONS = ("--host", HOST, "--workers", "1", "--uvicorn-opts=--no-access-log")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Server:
-    """A server to start.
-
-    Args:
-        title: name of the program, for messages.
-        program: name of the program in `armscan.ui.serve`.
-        arguments: the program's arguments after the port.
-        option: command-line option that sets the port.
-        port: port on 127.0.0.1.
-    """
-
-    title: str
-    program: str
-    arguments: tuple[str, ...]
-    option: str
-    port: int
-
-    @property
-    def address(self) -> str:
-        """URL for the browser."""
-        return f"http://{HOST}:{self.port}"
-
-    def check_port(self) -> None:
-        """Raise `InvalidValueError` if the port cannot be used."""
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((HOST, self.port))
-            except OSError as error:
-                why = "is taken" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
-                raise InvalidValueError(
-                    f"{self.option} is {self.port}, but that port of {HOST} {why}: give another"
-                ) from error
+class _Threaded(ThreadingMixIn, WSGIServer):
+    daemon_threads = True
 
 
-class ServerProcess:
-    """A running server.
+class _Quiet(WSGIRequestHandler):
+    def log_request(self, code: int | str = "-", size: int | str = "-") -> None:
+        """Log errors only."""
+
+
+def check_port(option: str, port: int) -> None:
+    """Check that a server of this machine can use a port.
 
     Args:
-        server: server to start.
-        log: receives the output.
+        option: the command-line option that sets the port, for the message.
+        port: the port on 127.0.0.1.
+
+    Raises:
+        InvalidValueError: if it cannot be used.
     """
+    try:
+        socket.create_server((HOST, port)).close()
+    except OSError as error:
+        reason = os.strerror(error.errno or 0).lower()
+        raise InvalidValueError(f"{option} is {port}, but {HOST}:{port} cannot be used ({reason})") from error
 
-    def __init__(self, server: Server, log: IO[bytes]) -> None:
-        self.server, self._log = server, log
-        # A session, thus a process group, of its own: Ctrl-C reaches only this process. It ends when its standard input
-        # is closed, also by the death of this process.
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "armscan.ui.serve", server.program, str(server.port), *server.arguments],
-            stdin=subprocess.PIPE,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-        )
 
-    def wait_until_answering(self, processes: Sequence[ServerProcess]) -> None:
-        """Wait until the server answers.
+def start_dashboard(storage: Storage, artifacts: Path, port: int) -> str:
+    """Serve Optuna's dashboard for the rest of this process; return its address.
 
-        Args:
-            processes: the processes that must stay alive meanwhile.
+    Its own program would open a journal without the lock that workers use.
 
-        Raises:
-            ServerError: if it does not answer in time, or one of the processes has ended.
-        """
-        until_s = time.monotonic() + START_S
-        while not self._is_answering():
-            for each in processes:
-                each.check()
-            if time.monotonic() > until_s:
-                raise self._error(f"does not answer within {START_S:g} s of its start")
-            time.sleep(POLL_S)
+    Args:
+        storage: the storage of the studies.
+        artifacts: the folder of the plots that it shows.
+        port: the port on 127.0.0.1.
+    """
+    from optuna.artifacts import FileSystemArtifactStore
+    from optuna_dashboard import wsgi
 
-    def check(self) -> None:
-        """Raise `ServerError` if the server has ended."""
-        code = self._process.poll()
-        if code is not None:
-            how = f"with exit code {code}" if code >= 0 else f"by {signal.Signals(-code).name}"
-            raise self._error(f"has ended by itself, {how}")
-
-    def ask_to_end(self) -> None:
-        """Ask the server to end, by closing its standard input."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-
-    def end(self) -> None:
-        """Wait until the server has ended, and kill what is left of its process group."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(END_S)
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
-
-    def _is_answering(self) -> bool:
-        try:
-            socket.create_connection((HOST, self.server.port), timeout=POLL_S).close()
-        except OSError:
-            return False
-        return True
-
-    def _error(self, what: str) -> ServerError:
-        self._log.seek(max(0, self._log.seek(0, os.SEEK_END) - LOG_BYTES))
-        log = mask_passwords(self._log.read().decode(errors="replace"))
-        return ServerError(f"{self.server.title} {what}", log=log.strip())
+    application = wsgi(storage.optuna, artifact_store=FileSystemArtifactStore(artifacts))
+    server = make_server(HOST, port, application, server_class=_Threaded, handler_class=_Quiet)
+    Thread(target=server.serve_forever, daemon=True).start()
+    return f"http://{HOST}:{port}"
 
 
 @contextlib.contextmanager
-def running(servers: Sequence[Server]) -> Iterator[list[ServerProcess]]:
-    """Run servers for as long as the context lasts."""
-    with contextlib.ExitStack() as logs:
-        processes: list[ServerProcess] = []
+def mlflow_server(uri: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Serve MLflow's UI inside the context, which begins once the server answers.
+
+    Args:
+        uri: the address of a database with runs, without a password.
+        port: the port on 127.0.0.1.
+
+    Raises:
+        TrackingError: if the server does not answer in time, or ends by itself; the end of its log is printed.
+    """
+    store = database_url(uri, TRACKING_PASSWORD).render_as_string(hide_password=False)
+    # In the environment, because anyone can read the command line of a process. Without jobs: eight processes fewer.
+    environment = os.environ | {"MLFLOW_BACKEND_STORE_URI": store, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+    environment.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    environment.pop("MLFLOW_TRACKING_URI", None)
+    command = [sys.executable, "-m", "armscan.ui.mlflow_server", *MLFLOW_OPTIONS, "--port", str(port)]
+    with tempfile.TemporaryFile() as log:
+        # In a process group of its own, which a Ctrl-C does not reach.
+        process = subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
         try:
-            processes.extend(ServerProcess(each, logs.enter_context(tempfile.TemporaryFile())) for each in servers)
-            yield processes
+            until_s = time.monotonic() + START_S
+            while process.poll() is None and not _is_answering(port):
+                if time.monotonic() > until_s:
+                    raise _failed(log, f"does not answer within {START_S:g} s of its start")
+                time.sleep(POLL_S)
+            if process.poll() is None:
+                yield process
+            if process.poll() is not None:
+                raise _failed(log, f"has ended by itself, with exit code {process.returncode}")
         finally:
-            for process in processes:
-                process.ask_to_end()
-            for process in processes:
-                process.end()
+            with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
+                os.killpg(process.pid, signal.SIGTERM)
+                process.wait(END_S)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def _is_answering(port: int) -> bool:
+    try:
+        socket.create_connection((HOST, port), timeout=POLL_S).close()
+    except OSError:
+        return False
+    return True
+
+
+def _failed(log: IO[bytes], what: str) -> TrackingError:
+    log.seek(max(0, log.seek(0, os.SEEK_END) - LOG_BYTES))
+    print(mask_passwords(log.read().decode(errors="replace")).strip(), file=sys.stderr)
+    return TrackingError(f"MLflow {what}; the end of its log is above")

@@ -1,10 +1,31 @@
-"""What a process says of itself while it works: in the log of a worker, or on the screen."""
+"""What a process says while it works, and what its libraries are not to say."""
 
 from __future__ import annotations
 
+import logging
+import warnings
 from datetime import datetime
 
 
 def log(text: str) -> None:
     """Print a line with the time; what a worker prints is its log."""
     print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
+
+
+def silence_library_warnings() -> None:
+    """Keep warnings of libraries that a user can do nothing about off the screen."""
+    for message in (
+        "Gym has been unmaintained",
+        ".*is an experimental feature.*",
+        ".*Deprecat.*",
+        ".*is not divisible by the number of test environments.*",
+        # Our values of a launcher are checked against the launcher's own, as they should be.
+        r"\s*'hydra/launcher/.*' is validated against ConfigStore schema",
+    ):
+        warnings.filterwarnings("ignore", message=message)
+    for category in (DeprecationWarning, FutureWarning, PendingDeprecationWarning):
+        warnings.filterwarnings("ignore", category=category)
+    # What Hydra tells of a class that is not there is in the error, too.
+    logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
+    logging.getLogger("tianshou").setLevel(logging.ERROR)
+    logging.getLogger("sensai").setLevel(logging.ERROR)

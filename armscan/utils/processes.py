@@ -1,49 +1,87 @@
-"""Processes of this machine: whether one is still the same, and whether the parent of this one is gone."""
+"""Processes: whether one is still the same, and the end of the parent of this one."""
 
 from __future__ import annotations
 
+import json
 import os
+import socket
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Self
 
-POLL_S = 1.0
+import psutil
+
+from armscan.utils.files import atomic_write
+
+POLL_S = 0.5
 
 
 def process_start(pid: int) -> str:
-    """Return when a process was started, in clock ticks since boot, which tells it from a later one with its ID.
-
-    Not by psutil, whose start times move when the clock of the machine is set.
+    """Return when a process was started, which tells it from a later one with its ID, however the clock is set.
 
     Returns:
         An empty text if there is no such process, or if it has ended and has not been waited for.
     """
     try:
-        # The name before it, in brackets, may hold anything.
-        state, *others = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        return "" if state == "Z" else others[18]
-    except (OSError, ValueError, IndexError):
+        process = psutil.Process(pid)
+        # On Linux, the seconds since boot; psutil adds the time of the boot, which moves with the clock.
+        since_s = psutil.boot_time() if psutil.LINUX else 0.0
+        return "" if process.status() == psutil.STATUS_ZOMBIE else f"{process.create_time() - since_s:.2f}"
+    except psutil.Error:
         return ""
 
 
-class ParentProcess:
-    """The process that started this one."""
+@dataclass(frozen=True)
+class ProcessInfo:
+    """A process, so that others can tell whether it is still alive.
 
-    def __init__(self) -> None:
-        self._pid = os.getppid()
+    Args:
+        host: the machine that it runs on.
+        pid: its ID there.
+        started: when it was started, see `process_start`.
+        directory: the directory that it works in; empty if nobody has to know.
+    """
+
+    host: str
+    pid: int
+    started: str
+    directory: str = ""
+
+    @classmethod
+    def current(cls, directory: str = "") -> Self:
+        """Return the current process."""
+        return cls(socket.gethostname(), os.getpid(), process_start(os.getpid()), directory)
+
+    @classmethod
+    def read(cls, file: Path) -> Self:
+        """Return the process that a file describes."""
+        return cls(**json.loads(file.read_text()))
+
+    def write(self, file: Path) -> None:
+        """Write it to a file."""
+        atomic_write(file, lambda opened: opened.write(json.dumps(asdict(self)).encode()))
 
     @property
-    def is_gone(self) -> bool:
-        """Whether it has ended."""
-        return os.getppid() != self._pid
+    def is_here(self) -> bool:
+        """Whether it is a process of this machine, of which it is known whether it is alive."""
+        return self.host == socket.gethostname()
 
-    def on_exit(self, action: Callable[[], object]) -> None:
-        """Call `action` in a thread once the parent has ended."""
+    @property
+    def is_alive(self) -> bool:
+        """Whether it has not ended; a process of another machine is taken to be alive."""
+        return not self.is_here or process_start(self.pid) == self.started
 
-        def watch() -> None:
-            while not self.is_gone:
-                time.sleep(POLL_S)
-            action()
 
-        threading.Thread(target=watch, daemon=True).start()
+def on_parent_exit(action: Callable[[], object]) -> None:
+    """Call `action` in a thread once the process that started this one has ended."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(POLL_S)
+        action()
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -29,12 +29,12 @@ from typing import Any, NamedTuple
 import psutil
 
 from armscan.config.defaults import to_plain
-from armscan.config.error_messages import silence_library_warnings
 from armscan.experiment.runner import train_agent
 from armscan.experiment.setup import RunSetup
 from armscan.sweeps.tasks.attempt import composed
 from armscan.tracking import TrackedRun, open_store
 from armscan.training import EpochReport
+from armscan.utils.log import silence_library_warnings
 from tests.support.mlflow_server import MlflowServer, mlflow_server
 
 THREADS = ("uploader", "pending", "system metrics")

@@ -23,8 +23,8 @@ import torch
 from tianshou.utils.torch_utils import policy_within_training_step
 
 from armscan.agents import MLP, SAC, AgentSetup, Compute, Multimodal, Network
-from armscan.config.error_messages import silence_library_warnings
 from armscan.envs import EnvFactory, SliceChannelsObservation
+from armscan.utils.log import silence_library_warnings
 from armscan.volumes import load_phantoms
 
 N_ROUNDS, N_RANDOM_STEPS, ROUND_S = 5, 1_000, 3.0

@@ -19,9 +19,9 @@ from PIL import Image
 
 from armscan.config.defaults import default_storage, default_tracking
 from armscan.config.services import DASHBOARD_PORT, MLFLOW_PORT
+from armscan.sweeps.storage.storage import existing_storage
 from armscan.tracking.store import open_existing_store
-from armscan.ui.servers import running
-from armscan.ui.show import find_runs, find_studies
+from armscan.ui.servers import HOST, mlflow_server, start_dashboard
 from tests.support.browser import chromium
 
 PICTURES = Path(__file__).parents[2] / "docs" / "images"
@@ -83,17 +83,12 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     os.chdir(folder)
     subprocess.run([sys.executable, "-m", "armscan.run", *STUDY], check=True)
-    stores = (
-        find_studies(default_storage(), Path("optuna.artifacts"), DASHBOARD_PORT),
-        find_runs(default_tracking()["uri"], MLFLOW_PORT),
-    )
-    servers = [store.server for store in stores]
+    storage = existing_storage(default_storage())
+    assert storage is not None
     studies, runs = PICTURES / "ui_dashboard.png", PICTURES / "ui_mlflow.png"
-    with running(servers) as processes:
-        for process in processes:
-            process.wait_until_answering(processes)
-        look_at_study(servers[0].address, studies)
-        look_at_runs(servers[1].address, runs)
+    look_at_study(start_dashboard(storage, Path("optuna.artifacts"), DASHBOARD_PORT), studies)
+    with mlflow_server(default_tracking()["uri"], MLFLOW_PORT):
+        look_at_runs(f"http://{HOST}:{MLFLOW_PORT}", runs)
     for file in (studies, runs):
         make_small(file)
 

@@ -373,7 +373,7 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         ([run_id, "experiment=x"], f"'{run_id} experiment=x' configures an agent: give --agent NAME with it"),
         (
             ["--agent=random", "experiment=best_zy", "--data=phantom"],
-            "experiment sets agent.lr_end_factor, but the agent",
+            "Error in call to target 'armscan.agents.baselines.Random': TypeError(",
         ),
         ([run_id, "--tracking-experiment=x"], "--tracking-experiment is for --agent without --video"),
         (["--agent=random", "experiment=x"], "experiment is 'x', but it must be best_full, "),

@@ -1,7 +1,6 @@
 """The program: its commands with good and bad words, how it ends, what it loads."""
 
 import os
-import shlex
 import subprocess
 import sys
 
@@ -11,7 +10,6 @@ import pytest
 from armscan.cli.evaluate import evaluate
 from armscan.cli.main import armscan as program
 from armscan.cli.main import main
-from armscan.cli.options import Command
 from armscan.config.defaults import CHANGES
 from armscan.errors import VolumeError
 
@@ -21,12 +19,12 @@ def commands(group=program, path=()):
     for name, command in group.commands.items():
         if isinstance(command, click.Group):
             yield from commands(command, (*path, name))
-        elif isinstance(command, Command):
+        elif name != "run":
             yield (*path, name), command
 
 
 COMMANDS = dict(commands())
-EXAMPLES = [example for command in COMMANDS.values() for example in command.examples]
+EXAMPLES = [line.split()[1:] for command in COMMANDS.values() for line in command.epilog.splitlines()[2:]]
 
 
 def test_commands_are_those_of_the_documentation():
@@ -41,16 +39,15 @@ def test_command_explains_itself_and_each_option(path, capsys):
     assert main([*path, "--help"]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith(f"Usage: armscan {' '.join(path)} ")
-    assert f"\nExamples:\n  armscan {' '.join(path)}" in printed
+    assert f"\n  Examples:\n    armscan {' '.join(path)}" in printed
     assert all(option.help for option in COMMANDS[path].params if isinstance(option, click.Option))
 
 
-@pytest.mark.parametrize("example", EXAMPLES)
-def test_examples_are_good_words(example, tmp_path, monkeypatch):
+@pytest.mark.parametrize("words", EXAMPLES, ids=" ".join)
+def test_examples_are_good_words(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for folder in ("outputs", "studies/sac_y"):
         (tmp_path / folder).mkdir(parents=True)
-    words = shlex.split(example)
     path = next(path for path in COMMANDS if list(path) == words[: len(path)])
     COMMANDS[path].make_context(" ".join(path), words[len(path) :])
 
@@ -103,7 +100,7 @@ def test_mistakes_and_interrupts_are_one_line(monkeypatch, capsys):
     assert raising(monkeypatch, VolumeError("a: is no\n volume")) == 2
     assert capsys.readouterr().err == "error: a: is no volume\n"
     assert raising(monkeypatch, KeyboardInterrupt()) == 130
-    assert capsys.readouterr().err == "\ninterrupted; nothing was written\n"
+    assert capsys.readouterr().err == "\ninterrupted\n"
 
 
 def test_faults_of_the_program_are_not_hidden(monkeypatch):

@@ -60,7 +60,7 @@ def test_old_key_on_the_command_line_is_answered_with_the_new_one(old, added):
     with pytest.raises(Exception, match="Could not override") as raised:
         compose(words)
     opposite = ", which means the opposite" if old in INVERTED else ""
-    assert one_line_message(raised.value, words) == f"{old} has been renamed: give {new}{opposite}"
+    assert one_line_message(raised.value) == f"{old} has been renamed: give {new}{opposite}"
 
 
 def test_configuration_of_this_version_is_not_changed():

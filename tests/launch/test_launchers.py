@@ -7,9 +7,9 @@ import pytest
 from omegaconf import OmegaConf
 
 from armscan.config.compose import compose
-from armscan.config.error_messages import silence_library_warnings
 from armscan.errors import InvalidValueError
 from armscan.launch.launchers import check_launcher
+from armscan.utils.log import silence_library_warnings
 
 
 @pytest.mark.parametrize(

@@ -254,7 +254,7 @@ def test_study_answers_mistakes_in_one_line_before_anything_is_there(tmp_path, m
     few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
     with pytest.raises((ArmscanError, HydraException)) as raised:
         run_study([*words, *few], launch=lambda _: pytest.fail("workers were launched"))
-    answer = one_line_message(raised.value, words)
+    answer = one_line_message(raised.value)
     assert answer is not None
     assert line in answer
     assert "\n" not in answer
@@ -269,7 +269,7 @@ def test_study_answers_a_damaged_file_in_one_line(tmp_path, monkeypatch, content
     (tmp_path / "sweeps" / "mine.yaml").write_bytes(contents.encode("latin-1"))
     with pytest.raises((YAMLError, UnicodeDecodeError)) as raised:
         run_study(["-m", "sweep=mine"], launch=pytest.fail)
-    answer = one_line_message(raised.value, [])
+    answer = one_line_message(raised.value)
     assert answer is not None
     assert answer.startswith("a file of the configuration cannot be read: ")
 

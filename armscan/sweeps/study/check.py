@@ -40,5 +40,5 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
             with_it, _ = composed([*words, *overrides])
             task.check(with_it)
         except (ArmscanError, HydraException, OmegaConfBaseException, ValueError) as error:
-            line = one_line_message(error, [*words, *overrides]) or str(error)
+            line = one_line_message(error) or str(error)
             raise InvalidValueError(f"study.space: {' '.join(overrides)} is not allowed: {line}") from error

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
 from optuna.trial import FrozenTrial, Trial
@@ -17,7 +15,7 @@ from armscan.sweeps.scheduling.outcome import PendingWrites, TrialOutcome
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import HOLDER, LEASE
 from armscan.utils.log import log
-from armscan.utils.processes import process_start
+from armscan.utils.processes import ProcessInfo
 
 HEARTBEAT_S, POLL_S = 10.0, 0.25
 # Without a heartbeat for so long a worker counts as dead: a busy storage may delay some.
@@ -44,13 +42,13 @@ class LivenessCheck:
         self.interval_s = HEARTBEAT_S
         # By trial: its last heartbeat, when it was last checked, and for how long it had been the same by then.
         self._seen: dict[int, tuple[Any, float, float]] = {}
-        self._host = socket.gethostname()
 
     def is_dead(self, trial: FrozenTrial) -> bool:
         """Whether the worker of a running trial has ended, or has not renewed its lease for long."""
         lease = trial.user_attrs.get(LEASE, {})
-        if lease.get("host") == self._host and Path("/proc/self/stat").exists():
-            return process_start(lease["pid"]) != str(lease["started"])
+        holder = ProcessInfo(lease.get("host", ""), lease.get("pid", 0), str(lease.get("started")))
+        if holder.is_here:
+            return not holder.is_alive
         heartbeat = lease.get("worker"), lease.get("beat")
         now_s = time.monotonic()
         before, checked_s, silent_s = self._seen.get(trial.number, (None, now_s, 0.0))
@@ -84,14 +82,7 @@ class Heartbeat:
         on_death: Callable[[FrozenTrial], None],
         is_told_to_leave_soon: Callable[[], bool] = lambda: False,
     ) -> None:
-        pid = os.getpid()
-        self._lease: dict[str, Any] = {
-            "worker": worker,
-            "host": socket.gethostname(),
-            "pid": pid,
-            "started": process_start(pid),
-            "beat": 0,
-        }
+        self._lease: dict[str, Any] = {"worker": worker, **asdict(ProcessInfo.current()), "beat": 0}
         self._scheduler, self._liveness = scheduler, LivenessCheck()
         self._is_told_to_leave, self._leave, self._on_death = is_told_to_leave, leave, on_death
         self._is_told_to_leave_soon = is_told_to_leave_soon

@@ -29,13 +29,12 @@ from armscan.sweeps.workers.supervisor import (
     LAUNCHER_FILE,
     STOP_FILE,
     WORKER_FILES,
-    ProcessInfo,
     keep_gpus,
     local_workers,
 )
 from armscan.tracking import TrackedRun, sync
 from armscan.tracking.run import SHORT_WAIT_S
-from armscan.utils.processes import process_start
+from armscan.utils.processes import ProcessInfo
 from armscan.utils.retry import no_retry
 
 # Time that workers have to leave before their launcher is interrupted and those on this machine are killed; through a
@@ -63,7 +62,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     started = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
     folder = working_folder() / opened.folder / "workers" / started
     folder.mkdir(parents=True)
-    ProcessInfo.current().write(folder / LAUNCHER_FILE)
+    ProcessInfo.current(str(working_folder())).write(folder / LAUNCHER_FILE)
     words = _words(opened, given, launcher, folder)
     tracked = TrackedRun.joined(opened.client, opened.run_id, name=opened.settings.name, folder=folder)
     tracked.set_status("RUNNING")
@@ -199,5 +198,5 @@ def _end_workers(folder: Path) -> None:
     while (alive := local_workers(folder)) and time.monotonic() < until_s:
         time.sleep(0.05)
     for worker in alive:
-        if process_start(worker.pid) == worker.started:
+        if worker.is_alive:
             os.kill(worker.pid, signal.SIGKILL)

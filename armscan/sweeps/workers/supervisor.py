@@ -5,7 +5,6 @@ The supervisor does nothing else: nothing slow to import, such as torch and MLfl
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 import signal
@@ -14,18 +13,12 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import BinaryIO
 
-from omegaconf import DictConfig
-
-from armscan.config.sources import working_folder
 from armscan.errors import AwayError, StudyError
-from armscan.sweeps.study.arguments import words_of_trials
 from armscan.sweeps.workers.slurm import SOON, Notice
-from armscan.utils.files import atomic_write
-from armscan.utils.processes import ParentProcess, process_start
+from armscan.utils.processes import ProcessInfo, on_parent_exit
 
 LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
 # Exit codes of a worker that was told to leave, of one whose storage was away for too long, and of all that are not
@@ -48,68 +41,19 @@ except KeyboardInterrupt:
 """
 
 
-@dataclass(frozen=True)
-class ProcessInfo:
-    """A process, so that others can tell whether it is still alive.
-
-    Args:
-        host: that it runs on.
-        pid: its process.
-        started: see `process_start`.
-        directory: that it works in.
-    """
-
-    host: str
-    pid: int
-    started: str
-    directory: str
-
-    @classmethod
-    def current(cls) -> Self:
-        """Return the current process."""
-        return cls(socket.gethostname(), os.getpid(), process_start(os.getpid()), str(working_folder()))
-
-    @classmethod
-    def read(cls, file: Path) -> Self:
-        """Return the process that a file describes."""
-        return cls(**json.loads(file.read_text()))
-
-    def write(self, file: Path) -> None:
-        """Write it to a file."""
-        atomic_write(file, lambda opened: opened.write(json.dumps(asdict(self)).encode()))
-
-    @property
-    def is_gone(self) -> bool:
-        """Whether it is known to have ended; never known of a process on another machine."""
-        is_here = self.host == socket.gethostname() and self.started != ""
-        return is_here and process_start(self.pid) != self.started
-
-
 def local_workers(folder: Path) -> list[ProcessInfo]:
     """Return the workers of a start that are alive on this machine."""
     workers = [ProcessInfo.read(file) for file in folder.glob(WORKER_FILES)]
-    host = socket.gethostname()
-    return [each for each in workers if each.host == host and process_start(each.pid) == each.started]
+    return [each for each in workers if each.is_here and each.is_alive]
 
 
-def run_worker(config: DictConfig, words: Sequence[str], folder: Path) -> None:
-    """Run one job of a launcher: a worker, restarted when it is killed.
-
-    Args:
-        config: with the number of the worker.
-        words: of the worker's job.
-        folder: of the workers of this start.
-    """
-    supervise(words_of_trials(words), int(config.study.worker), folder)
-
-
-def supervise(words: Sequence[str], number: int, folder: Path) -> None:
-    """Run a worker, and restart it when it is killed, until it ends by itself.
+def run_worker(words: Sequence[str], number: int, folder: Path) -> None:
+    """Run one job of a launcher: a worker, restarted when it is killed, until it ends by itself.
 
     Args:
-        words: of the study.
-        number: of the worker.
-        folder: of the workers of one start; each writes its log there.
+        words: the words of the study.
+        number: the number of the worker, from 0.
+        folder: the folder of the workers of one start; each writes its log there.
 
     Raises:
         StudyError: if this machine does not see the folders of the launcher's.
@@ -119,11 +63,11 @@ def supervise(words: Sequence[str], number: int, folder: Path) -> None:
     if os.getpid() != launcher.pid:
         # A Ctrl-C reaches all processes of a terminal, but it is the launcher that asks the workers to leave.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    study_input = pickle.dumps((list(words), number, str(folder)))
+    study_input = pickle.dumps((list(words), number, folder))
     n_errors = 0
     with Notice.taken() as notice, (folder / f"worker-{number}.log").open("ab") as log_file:
         for _ in range(MAX_RESTARTS):
-            if launcher.is_gone or (folder / STOP_FILE).exists():
+            if not launcher.is_alive or (folder / STOP_FILE).exists():
                 return
             code = _worked(study_input, launcher.directory, log_file, notice)
             if notice.is_given and code not in (0, AWAY):
@@ -138,19 +82,12 @@ def supervise(words: Sequence[str], number: int, folder: Path) -> None:
 
 def _launcher_of(folder: Path) -> ProcessInfo:
     """Return the process that launched this start; raises if this machine does not see its folders."""
-    file = folder / LAUNCHER_FILE
-    if not file.exists():
-        raise _not_seen(folder)
-    launcher = ProcessInfo.read(file)
-    if not Path(launcher.directory).is_dir():
-        raise _not_seen(Path(launcher.directory))
-    return launcher
-
-
-def _not_seen(folder: Path) -> StudyError:
-    return StudyError(
-        f"{folder} of the machine that the study was started on is not seen by {socket.gethostname()}: all machines "
-        "with workers must share it"
+    is_seen = (file := folder / LAUNCHER_FILE).exists()
+    if is_seen and Path((launcher := ProcessInfo.read(file)).directory).is_dir():
+        return launcher
+    raise StudyError(
+        f"{launcher.directory if is_seen else folder} of the machine that the study was started on is not seen by "
+        f"{socket.gethostname()}: all machines with workers must share it"
     )
 
 
@@ -187,10 +124,11 @@ def _environment() -> dict[str, str]:
 
 def worker_main() -> None:
     """Run the process of a worker, which reads its study from standard input."""
-    words, number, folder_name = pickle.load(sys.stdin.buffer)
-    folder, parent = Path(folder_name), ParentProcess()
+    is_asked, is_asked_soon = threading.Event(), threading.Event()
+    on_parent_exit(is_asked.set)
+    words, number, folder = pickle.load(sys.stdin.buffer)
     ProcessInfo.current().write(folder / f"worker-{number}.json")
-    launcher, is_asked, is_asked_soon = ProcessInfo.read(folder / LAUNCHER_FILE), threading.Event(), threading.Event()
+    launcher = ProcessInfo.read(folder / LAUNCHER_FILE)
     late = threading.Timer(SOON_S, is_asked.set)
     late.daemon = True
 
@@ -207,8 +145,7 @@ def worker_main() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def is_told_to_leave() -> bool:
-        is_alone = parent.is_gone or launcher.is_gone
-        return is_asked.is_set() or is_alone or (folder / STOP_FILE).exists()
+        return is_asked.is_set() or not launcher.is_alive or (folder / STOP_FILE).exists()
 
     from armscan.sweeps.workers.worker import work
     from armscan.utils.log import log

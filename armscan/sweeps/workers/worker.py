@@ -16,7 +16,7 @@ from optuna.trial import Trial, TrialState
 
 from armscan.config.command_hints import run_command
 from armscan.config.defaults import MULTIRUN, to_plain
-from armscan.config.error_messages import one_line_message, silence_library_warnings
+from armscan.config.error_messages import one_line_message
 from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.sweeps.scheduling.outcome import TrialOutcome
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF
@@ -32,7 +32,7 @@ from armscan.sweeps.workers.heartbeat import Heartbeat, LimitReachedError
 from armscan.tracking import TrackedRun
 from armscan.tracking.run import SHORT_WAIT_S
 from armscan.utils.files import CONFIG_FILE, SHA256_TAGS
-from armscan.utils.log import log
+from armscan.utils.log import log, silence_library_warnings
 
 WAIT_S = 1.0
 MAX_REASON_CHARS = 2000
