@@ -18,7 +18,6 @@ RunArray = NDArray[np.int32]
 Pixels = NDArray[np.uint8]
 
 
-@numba.njit(cache=True, nogil=True)
 def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -> IntArray:
     """Return for each row distance d = 0, 1, .. the largest w with (d row_step)^2 + (w col_step)^2 <= eps^2.
 
@@ -27,19 +26,11 @@ def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -
         row_step: distance of neighbouring rows.
         col_step: distance of neighbouring columns.
     """
-    widths = np.empty(int(np.floor(eps / row_step)) + 2, dtype=np.int64)
-    n_rows = 0
-    for d in range(widths.size):
-        if (d * row_step) ** 2 > eps * eps:
-            break
-        width = int(np.floor(np.sqrt(eps * eps - (d * row_step) ** 2) / col_step))
-        while (d * row_step) ** 2 + ((width + 1) * col_step) ** 2 <= eps * eps:
-            width += 1
-        while width > 0 and (d * row_step) ** 2 + (width * col_step) ** 2 > eps * eps:
-            width -= 1
-        widths[d] = width
-        n_rows += 1
-    return widths[:n_rows]
+    rows, columns = np.arange(int(eps / row_step) + 2), np.arange(int(eps / col_step) + 2)
+    with np.errstate(over="ignore"):
+        is_inside = (rows[:, None] * row_step) ** 2 + (columns * col_step) ** 2 <= eps * eps
+    n_inside: IntArray = is_inside.sum(axis=1)
+    return n_inside[n_inside > 0] - 1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -50,18 +41,11 @@ def count_disc_pixels(half_widths: IntArray) -> int:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _find_core(mask: Pixels, stride: int, half_widths: IntArray, min_samples: int, zero: Any) -> Pixels:
-    """Mark the core pixels of a flat mask.
+    """Return 0 or 1 for each pixel but the margins of a flat mask: whether it is a core pixel.
 
-    Args:
-        mask: 0 or 1, rows of `stride` with as many columns of margin as the disc is wide, and as many rows above and
-            below as it is high, so that no disc leaves it.
-        stride: see above.
-        half_widths: of the disc.
-        min_samples: pixels in the disc that make a core pixel.
-        zero: of the smallest type that holds the disc's number of pixels: small types are summed many at a time.
-
-    Returns:
-        0 or 1 for each pixel but the margins.
+    The mask's rows of `stride` have as many columns of margin as the disc is wide, and as many rows above and below as
+    it is high, so that no disc leaves it. `zero` is of the smallest type that holds the disc's number of pixels: small
+    types are summed many at a time.
     """
     pad, reach = half_widths[0], half_widths.size - 1
     first = reach * stride + pad
@@ -85,16 +69,6 @@ def _find_core(mask: Pixels, stride: int, half_widths: IntArray, min_samples: in
     for i in range(n_pixels):
         core[i] = inside[i] & np.uint8(counted[i] >= min_samples)
     return core
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _core_pixels(mask: Pixels, stride: int, half_widths: IntArray, min_samples: int) -> Pixels:
-    n_in_disc = count_disc_pixels(half_widths)
-    if n_in_disc < 2**8:
-        return _find_core(mask, stride, half_widths, min_samples, np.uint8(0))
-    if n_in_disc < 2**16:
-        return _find_core(mask, stride, half_widths, min_samples, np.uint16(0))
-    return _find_core(mask, stride, half_widths, min_samples, np.uint32(0))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -207,11 +181,9 @@ def _bounding_box(slice_xz: Pixels, label: int) -> tuple[int, int, int, int]:
 def _cluster(
     slice_xz: Pixels, label: int, half_widths: IntArray, min_samples: int
 ) -> tuple[int, int, Pixels, RunArray, IntArray]:
-    """Clusters a label's pixels.
+    """Clusters a label's pixels: the first row and column of the box about them; their mask and clusters in the box.
 
-    Returns:
-        The first row and column of the box about them; the mask and the cluster of each pixel in the box (see
-        `_reached`); and for each cluster, noise last, the number of its pixels and the sums of their rows and columns.
+    Last, for each cluster, noise at the end, the number of its pixels and the sums of their rows and columns.
     """
     row_first, row_stop, col_first, col_stop = _bounding_box(slice_xz, label)
     n_rows, n_cols = row_stop - row_first, col_stop - col_first
@@ -224,7 +196,11 @@ def _cluster(
         line = slice_xz[row_first + row, col_first:col_stop]
         for col in range(n_cols):
             mask[row, col] = line[col] == label
-    core = _core_pixels(flat, stride, half_widths, min_samples).reshape((n_rows, stride))
+    if count_disc_pixels(half_widths) < 2**8:
+        flat_core = _find_core(flat, stride, half_widths, min_samples, np.uint8(0))
+    else:
+        flat_core = _find_core(flat, stride, half_widths, min_samples, np.uint32(0))
+    core = flat_core.reshape((n_rows, stride))
     # Below an eps of one column not even the next pixel is a neighbour, and every run is a single pixel.
     starts, stops, first_run = _find_runs(core, n_cols, n_cols if pad >= 1 else 1)
     numbers, n_clusters = _number_runs(starts, stops, first_run, half_widths)
@@ -274,10 +250,10 @@ def summarise_label(
     """Clusters the pixels of a label, and keeps of it only what rewards and observations need.
 
     Args:
-        slice_xz: as in `cluster_label`.
-        label: likewise.
-        half_widths: likewise.
-        min_samples: likewise.
+        slice_xz: labels, indexed [across, depth].
+        label: whose pixels.
+        half_widths: of the disc of neighbours, as in `cluster_label`.
+        min_samples: neighbours that make a core pixel, as in `cluster_label`.
         summary: filled with the number of clusters, the number of pixels in them, and the mean of their centres,
             (across, depth) in pixels, 0 where there is none; shape (4,).
     """

@@ -57,7 +57,7 @@ class PixelTissue:
 
     def neighbourhood(self, pixel_mm: tuple[float, float]) -> Neighbourhood:
         """See `Tissue.neighbourhood`."""
-        return Neighbourhood(disc_half_widths(float(self.eps_px)), self.min_samples)
+        return Neighbourhood(disc_half_widths(self.eps_px), self.min_samples)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class MetricTissue:
                 f"eps_mm of label {self.label} is {self.eps_mm:g}, but with pixels of {across_mm:g} x {depth_mm:g} mm "
                 f"it must be at most {LARGEST_EPS_PX * min(across_mm, depth_mm):g}, {LARGEST_EPS_PX:g} pixels"
             )
-        half_widths = disc_half_widths(ROUNDING * float(self.eps_mm), across_mm, depth_mm)
+        half_widths = disc_half_widths(ROUNDING * self.eps_mm, across_mm, depth_mm)
         return Neighbourhood(half_widths, math.ceil(self.density * count_disc_pixels(half_widths)))
 
 

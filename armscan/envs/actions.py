@@ -73,16 +73,12 @@ def free_components(projection: str | Sequence[str]) -> tuple[int, ...]:
         InvalidValueError: if the name or a component is unknown, none is given, or one is given twice.
     """
     if isinstance(projection, str):
-        if projection not in PROJECTIONS:
-            raise InvalidValueError(
-                f"projection is {projection!r}, but it must be {listed(PROJECTIONS)}, or a list of {listed(COMPONENTS)}"
-            )
-        names: tuple[str, ...] = PROJECTIONS[projection]
+        names = PROJECTIONS.get(projection, ())
     else:
         names = tuple(map(str, projection)) if isinstance(projection, Sequence) else ()
     if not names or len(set(names)) != len(names) or not set(names) <= set(COMPONENTS):
         raise InvalidValueError(
-            f"projection is {list(names) or projection!r}, but it must be {listed(PROJECTIONS)}, "
-            f"or a list of different ones of {listed(COMPONENTS)}"
+            f"projection is {projection!r}, but it must be {listed(PROJECTIONS)}, or a list of different ones of "
+            f"{listed(COMPONENTS)}"
         )
     return tuple(index for index, name in enumerate(COMPONENTS) if name in names)

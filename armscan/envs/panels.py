@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from armscan.envs.observations import View
+from armscan.volumes import LANDMARK_LABELS
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
 from armscan.volumes.volume import LabelVolume
 
@@ -36,7 +37,7 @@ Inks = NDArray[np.uint8]
 Pixel = TypeVar("Pixel", bound=np.generic)
 Ink = tuple[int, int, int]
 Size = tuple[int, int]
-# Drawn once a volume, and forgotten with it.
+# From the palm, (along, across, 3), and the side, (along, depth, 3): drawn once a volume, and forgotten with it.
 _SIDES: WeakKeyDictionary[LabelVolume, tuple[Inks, Inks]] = WeakKeyDictionary()
 
 
@@ -63,7 +64,8 @@ def slice_panel(view: View, room: Size) -> Image.Image:
         view: what is seen.
         room: (width, height) that the picture fits into, its proportions kept.
     """
-    numbers = _cluster_numbers(view)
+    # Of each pixel the number of its cluster, 0 where it has none; no pixel is of two tissues.
+    numbers = np.sum([tissue.image for tissue in view.clusters.each()], axis=0)
     (n_across, n_depth), (across_mm, depth_mm) = view.geometry.shape, view.geometry.pixel_mm
     size_mm = n_across * across_mm, n_depth * depth_mm
     size = _size(size_mm, _scale(size_mm, room))
@@ -82,18 +84,11 @@ def slice_panel(view: View, room: Size) -> Image.Image:
     return picture
 
 
-def _cluster_numbers(view: View) -> NDArray[np.int32]:
-    """Return the number of each pixel's cluster among those of its tissue, from 1; 0 where it has none."""
-    # No pixel is of two tissues.
-    return sum((tissue.image for tissue in view.clusters.each()), start=np.zeros(view.slice_xz.shape, np.int32))
-
-
 def _slice_inks(view: View, numbers: NDArray[np.int32]) -> Inks:
     """Return the colours of a slice, shape (across, depth, 3)."""
     inks = TISSUE_INKS[view.slice_xz]
-    shades = np.array(SHADES)[(numbers - 1) % len(SHADES)]
-    shades[numbers == 0] = UNCLUSTERED
-    is_landmark = (view.slice_xz > 0) & (view.slice_xz < 4)
+    shades = np.where(numbers > 0, np.array(SHADES)[(numbers - 1) % len(SHADES)], UNCLUSTERED)
+    is_landmark = np.isin(view.slice_xz, LANDMARK_LABELS)
     inks[is_landmark] = (inks[is_landmark] * shades[is_landmark, None]).astype(np.uint8)
     return inks
 
@@ -122,7 +117,8 @@ def side_panels(
         rooms: (width, height) that either picture fits into, its proportions kept.
     """
     if volume not in _SIDES:
-        _SIDES[volume] = _from_two_sides(volume)
+        from_palm, from_side = _first_seen(volume.labels[:, :, ::-1], 2), _first_seen(volume.labels, 0)
+        _SIDES[volume] = TISSUE_INKS[from_palm.T], TISSUE_INKS[from_side]
     across_mm, along_mm, depth_mm = volume.size_mm
     sizes_mm = (across_mm, along_mm), (depth_mm, along_mm)
     scale = min(_scale(size_mm, room) for size_mm, room in zip(sizes_mm, rooms, strict=True))
@@ -137,13 +133,6 @@ def side_panels(
             outline = [(x, y) for x, y in (*corners, corners[0])]
             ImageDraw.Draw(picture).line(outline, fill=plane.ink, width=plane.width)
     return frontal, sagittal
-
-
-def _from_two_sides(volume: LabelVolume) -> tuple[Inks, Inks]:
-    """Return the volume from the palm, shape (along, across, 3), and from the side, (along, depth, 3)."""
-    from_palm = _first_seen(volume.labels[:, :, ::-1], 2)
-    from_side = _first_seen(volume.labels, 0)
-    return TISSUE_INKS[from_palm.T], TISSUE_INKS[from_side]
 
 
 def _first_seen(labels_xyz: NDArray[np.uint8], axis: int) -> NDArray[np.uint8]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,29 +42,15 @@ TITLE_GAP = 7
 Box = tuple[int, int, int, int]
 
 
-@dataclass(frozen=True)
-class Beside:
-    """Another plane that is drawn beside the current one.
-
-    Args:
-        action: the plane.
-        name: what it is called: `optimal plane`.
-    """
+class Beside(NamedTuple):
+    """Another plane that is drawn beside the current one, and what it is called: `optimal plane`."""
 
     action: ManipulatorAction
     name: str
 
 
-@dataclass(frozen=True)
-class History:
-    """The rewards that led here.
-
-    Args:
-        rewards: from the first to the current one, each in [-1, 0].
-        places: their numbers, and those of the ones that can follow.
-        threshold: above which a plane is good enough, -success_threshold.
-        title: what they are: `reward by step`.
-    """
+class History(NamedTuple):
+    """The rewards that led here, each in [-1, 0], the numbers of all places for them, the goal, and a title."""
 
     rewards: Sequence[float]
     places: range
@@ -73,14 +59,7 @@ class History:
 
 
 def draw_frame(episode: Episode) -> NDArray[np.uint8]:
-    """Draw an episode as it stands.
-
-    Args:
-        episode: one whose first plane has been looked at.
-
-    Returns:
-        The picture, shape (512, 860, 3).
-    """
+    """Draw an episode, whose first plane has been looked at, as it stands: shape (512, 860, 3)."""
     scene, rules = episode.scene, episode.rules
     return draw_plane(
         scene.volume,

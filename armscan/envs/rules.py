@@ -193,24 +193,19 @@ def named_volumes(volumes: Volumes) -> dict[str, LabelVolume]:
         return load_phantoms(DEFAULT_PHANTOMS)
     if isinstance(volumes, str | Path):
         return read_dataset(volumes)
-    if isinstance(volumes, Mapping):
-        listed_volumes = list(volumes.values())
-    elif isinstance(volumes, list | tuple):
-        listed_volumes = list(volumes)
-    else:
+    if not isinstance(volumes, Mapping | list | tuple):
         raise InvalidValueError(f"volumes is {volumes!r}, but it must be volumes by name or in a list, or a folder")
-    if not listed_volumes:
+    given = list(volumes.items()) if isinstance(volumes, Mapping) else [(None, volume) for volume in volumes]
+    if not given:
         raise InvalidValueError("volumes is empty, but an environment needs at least one")
-    for volume in listed_volumes:
+    for key, volume in given:
         if not isinstance(volume, LabelVolume):
             raise InvalidValueError(f"volumes holds {volume!r}, but each must be a LabelVolume")
-    if isinstance(volumes, Mapping):
-        for key, volume in volumes.items():
-            if key != volume.name:
-                raise InvalidValueError(f"volumes holds {volume.name!r} as {key!r}, but it must be under its name")
-    named = {volume.name: volume for volume in listed_volumes}
-    if len(named) < len(listed_volumes):
-        raise InvalidValueError(f"volumes holds two of the same name among {listed(v.name for v in listed_volumes)}")
+        if key not in (None, volume.name):
+            raise InvalidValueError(f"volumes holds {volume.name!r} as {key!r}, but it must be under its name")
+    named = {volume.name: volume for _, volume in given}
+    if len(named) < len(given):
+        raise InvalidValueError(f"volumes holds two of the same name among {listed(v.name for _, v in given)}")
     return named
 
 

@@ -23,7 +23,7 @@ RANKS = np.array([0, 1, 2, 4, 3], dtype=np.uint8)
 LABEL_OF_RANK = np.argsort(RANKS).astype(np.uint8)
 
 
-class SliceFrame:
+class _FramedSlice:
     """Brings slices of different volumes to one shape.
 
     A slice is cropped about its middle to `crop`; for an odd surplus the larger half goes from the low side. Then,
@@ -31,34 +31,26 @@ class SliceFrame:
     to (i + 1) n / m of the n there were, and shows the highest value among them, so that thin structures stay visible.
 
     Args:
-        crop: (across, depth) in pixels; None for the smallest slice of all volumes.
-        shape: (across, depth) of what is observed; None to leave what was cropped as it is.
-
-    Raises:
-        InvalidValueError: if a shape is not two whole numbers from 1 to 4096.
+        crop: (across, depth) in pixels, each from 1 to 4096; None for the smallest slice of all volumes.
+        shape: (across, depth) of what is observed, likewise; None to leave what was cropped as it is.
     """
 
-    def __init__(self, crop: Sequence[int] | None, shape: Sequence[int] | None) -> None:
-        self.crop = None if crop is None else _checked_shape("crop", crop)
-        self.shape = None if shape is None else _checked_shape("shape", shape)
+    def __init__(self, *, crop: Sequence[int] | None = None, shape: Sequence[int] | None = None) -> None:
+        self._crop = None if crop is None else _checked_shape("crop", crop)
+        self._shape = None if shape is None else _checked_shape("shape", shape)
 
-    def observed_shape(self, geometries: Sequence[SliceGeometry]) -> Shape:
-        """Return the shape of what is observed of slices of any of these geometries.
-
-        Raises:
-            InvalidValueError: if the crop is larger than the smallest slice.
-        """
+    def _observed_shape(self, geometries: Sequence[SliceGeometry]) -> Shape:
+        """Return the shape of what is observed; raise `InvalidValueError` if the crop exceeds the smallest slice."""
         smallest = smallest_shape(geometries)
-        if self.crop is not None and (self.crop[0] > smallest[0] or self.crop[1] > smallest[1]):
+        if self._crop is not None and (self._crop[0] > smallest[0] or self._crop[1] > smallest[1]):
             raise InvalidValueError(
-                f"crop is {self.crop}, but it must be at most {smallest}, the smallest slice (across, depth) of the "
+                f"crop is {self._crop}, but it must be at most {smallest}, the smallest slice (across, depth) of the "
                 "volumes"
             )
-        return self.shape or self.crop or smallest
+        return self._shape or self._crop or smallest
 
-    def cropped(self, view: View) -> NDArray[np.uint8]:
-        """Return the middle of a slice."""
-        crop = self.crop or view.smallest_shape
+    def _cropped(self, view: View) -> NDArray[np.uint8]:
+        crop = self._crop or view.smallest_shape
         first = [(n - wanted + 1) // 2 for n, wanted in zip(view.slice_xz.shape, crop, strict=True)]
         return view.slice_xz[first[0] : first[0] + crop[0], first[1] : first[1] + crop[1]]
 
@@ -76,56 +68,59 @@ def _reduce(image: NDArray[np.uint8], reduced: NDArray[np.uint8]) -> None:
             reduced[i, k] = highest
 
 
-class _Framed:
-    def __init__(self, *, crop: Sequence[int] | None = None, shape: Sequence[int] | None = None) -> None:
-        self._frame = SliceFrame(crop, shape)
-
-
-class SliceObservation(_Framed):
+class SliceObservation(_FramedSlice):
     """The slice as one image of labels, uint8: 0 background, 1 bones, 2 tendons, 3 artery, 4 nerve.
 
     Reduced, a pixel shows the rarest tissue of those that meet in it: artery, nerve, tendons, bones, in this order.
 
     Args:
-        crop: as in `SliceFrame`.
-        shape: as in `SliceFrame`.
+        crop: (across, depth) in pixels of the middle that is kept, each from 1 to 4096; None, the default, keeps what
+            the smallest slice of all volumes has.
+        shape: (across, depth) that it is reduced to, likewise; None, the default, leaves it.
+
+    Raises:
+        InvalidValueError: if a shape is not two whole numbers from 1 to 4096.
     """
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
-        return {"slice": spaces.Box(0, max(LABEL_NAMES), self._frame.observed_shape(geometries), np.uint8)}
+        return {"slice": spaces.Box(0, max(LABEL_NAMES), self._observed_shape(geometries), np.uint8)}
 
     def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
-        cropped = self._frame.cropped(view)
-        if self._frame.shape is None:
+        cropped = self._cropped(view)
+        if self._shape is None:
             return {"slice": cropped.copy()}
-        reduced = np.empty(self._frame.shape, dtype=np.uint8)
+        reduced = np.empty(self._shape, dtype=np.uint8)
         _reduce(RANKS[cropped], reduced)
         return {"slice": LABEL_OF_RANK[reduced]}
 
 
-class SliceChannelsObservation(_Framed):
+class SliceChannelsObservation(_FramedSlice):
     """The slice as one channel for each of bones, tendons and artery, uint8: 1 where that tissue is, 0 elsewhere.
 
     Reduced, a pixel is 1 where any of the pixels it stands for is.
 
     Args:
-        crop: as in `SliceFrame`.
-        shape: as in `SliceFrame`.
+        crop: (across, depth) in pixels of the middle that is kept, each from 1 to 4096; None, the default, keeps what
+            the smallest slice of all volumes has.
+        shape: (across, depth) that it is reduced to, likewise; None, the default, leaves it.
+
+    Raises:
+        InvalidValueError: if a shape is not two whole numbers from 1 to 4096.
     """
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
-        shape = (len(LANDMARK_LABELS), *self._frame.observed_shape(geometries))
+        shape = (len(LANDMARK_LABELS), *self._observed_shape(geometries))
         return {"channels": spaces.Box(0, 1, shape, np.uint8)}
 
     def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
-        cropped = self._frame.cropped(view)
-        channels = np.empty((len(LANDMARK_LABELS), *(self._frame.shape or cropped.shape)), dtype=np.uint8)
+        cropped = self._cropped(view)
+        channels = np.empty((len(LANDMARK_LABELS), *(self._shape or cropped.shape)), dtype=np.uint8)
         for channel, label in zip(channels, LANDMARK_LABELS, strict=True):
-            if self._frame.shape is None:
+            if self._shape is None:
                 np.equal(cropped, label, out=channel.view(np.bool_))
             else:
                 _reduce((cropped == label).view(np.uint8), channel)

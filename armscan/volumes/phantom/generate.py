@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,16 +17,8 @@ SPACING_MM = (0.27, 0.27, 0.55)
 N_STRAY_VOXELS = (150, 450)
 
 
-@dataclass(frozen=True)
-class Pose:
-    """How a wrist lies in the field of view.
-
-    Args:
-        rotation: (rz, rx) in degrees of the wrist's frame in the volume's.
-        origin_mm: where the middle of the tunnel lies in the volume, shape (3,).
-        size: scale of the anatomy, 1 for a usual hand.
-        left: whether it is a left hand.
-    """
+class Pose(NamedTuple):
+    """How a wrist lies in the field of view: (rz, rx) in degrees, its tunnel's middle, scale, left or right."""
 
     rotation: tuple[float, float]
     origin_mm: FloatArray
