@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from tianshou.highlevel.logger import LoggerFactory
-from tianshou.utils.logger.logger_base import BaseLogger
+from tianshou.utils import LazyLogger
 
 
-class EpochMetrics(BaseLogger):
-    """Gathers what Tianshou's trainer reports during an epoch, to be taken at its end as means."""
+class EpochMetrics(LazyLogger):
+    """Gathers what Tianshou's trainer reports during an epoch, to be taken at its end as means.
+
+    Tianshou's own loggers write to TensorBoard or elsewhere at every gradient step, while training waits.
+    """
 
     UPDATE_NAMES = (
         ("actor_loss", "update/actor_loss"),
@@ -53,48 +54,3 @@ class EpochMetrics(BaseLogger):
         self._values.clear()
         self._n_updates = 0
         return metrics
-
-    def write(self, step_type: str, step: int, data: dict[str, Any]) -> None:
-        """Unused: nothing is written anywhere from here."""
-
-    def prepare_dict_for_logging(self, log_data: dict[str, Any]) -> dict[str, Any]:
-        """Return the data as it is."""
-        return log_data
-
-    def finalize(self) -> None:
-        """Has nothing open."""
-
-    def save_data(
-        self,
-        epoch: int,
-        env_step: int,
-        update_step: int,
-        save_checkpoint_fn: Callable[[int, int, int], str] | None = None,
-    ) -> None:
-        """Unused: training keeps its own checkpoints."""
-
-    def restore_data(self) -> tuple[int, int, int]:
-        """Begin at the beginning."""
-        return 0, 0, 0
-
-    @staticmethod
-    def restore_logged_data(log_path: str) -> dict[str, Any]:
-        """Has nothing to restore."""
-        return {}
-
-
-class EpochMetricsFactory(LoggerFactory):
-    """Gives a Tianshou experiment the logger whose figures a learner hands on: to training, and so to tracking.
-
-    Tianshou's own loggers write to TensorBoard or elsewhere at every gradient step, while training waits.
-    """
-
-    def create_logger(
-        self, log_dir: str, experiment_name: str, run_id: str | None, config_dict: dict[str, Any] | None = None
-    ) -> EpochMetrics:
-        """Return a logger that has gathered nothing yet; the arguments are for those that write."""
-        return EpochMetrics()
-
-    def get_logger_class(self) -> type[EpochMetrics]:
-        """Return the class of the logger."""
-        return EpochMetrics

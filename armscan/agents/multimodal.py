@@ -8,17 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from tianshou.highlevel.env import Environments
-from tianshou.highlevel.module.actor import ActorFactory
-from tianshou.highlevel.module.core import init_linear_orthogonal
-from tianshou.highlevel.module.critic import CriticFactory
-from tianshou.highlevel.params.dist_fn import DistributionFunctionFactoryIndependentGaussians
 from tianshou.utils.net.common import ModuleWithVectorOutput
-from tianshou.utils.net.continuous import ContinuousActorProbabilistic
+from tianshou.utils.net.continuous import ContinuousActorProbabilistic as Actor
 from tianshou.utils.torch_utils import torch_device
 from torch import nn
 
-from armscan.agents.networks import MOST_UNITS, GaussianStd, check_weights, linear_weights
+from armscan.agents.networks import MOST_UNITS, check_weights, gaussian_actor, init_linear, linear_weights
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_ints
 
@@ -84,13 +79,13 @@ class Multimodal:
             n_features += n_channels * int(np.prod(n_pixels))
         return n_weights + linear_weights([n_features, *self.head_sizes])
 
-    def actor_factory(self, spread: GaussianStd) -> ActorFactory:
-        """See `Network.actor_factory`."""
-        return _MultimodalActorFactory(self, spread)
+    def actor(self, observation_space: spaces.Space[Any], n_free: int, log_std: float | None) -> Actor:
+        """See `Network.actor`."""
+        return gaussian_actor(MultimodalBody(self, observation_space), n_free, log_std)
 
-    def critic_factory(self) -> CriticFactory:
-        """See `Network.critic_factory`."""
-        return _MultimodalCriticFactory(self)
+    def critic(self, observation_space: spaces.Space[Any], n_action: int = 0) -> nn.Module:
+        """See `Network.critic`."""
+        return init_linear(MultimodalCritic(MultimodalBody(self, observation_space, n_action)))
 
 
 def smallest_side_px() -> int:
@@ -120,8 +115,9 @@ class MultimodalBody(ModuleWithVectorOutput):
         n_action: components of the action that a critic judges, 0 for none.
     """
 
-    def __init__(self, network: Multimodal, space: spaces.Dict, n_action: int = 0) -> None:
+    def __init__(self, network: Multimodal, space: spaces.Space[Any], n_action: int = 0) -> None:
         super().__init__(network.head_sizes[-1])
+        assert isinstance(space, spaces.Dict)
         images = images_of(space)
         self._vectors = [name for name in space if name not in images]
         self._scales = {name: 1.0 / float(box.high.max()) for name, box in images.items()}
@@ -168,47 +164,6 @@ class MultimodalCritic(nn.Module):
         """Return the values, shape (n, 1)."""
         features, _ = self.body(obs, act=act)
         return torch.as_tensor(self.last(features))
-
-
-class _MultimodalActorFactory(ActorFactory):
-    def __init__(self, network: Multimodal, spread: GaussianStd) -> None:
-        self._network, self._spread = network, spread
-
-    def create_module(self, envs: Environments, device: str | torch.device) -> nn.Module:
-        actor = ContinuousActorProbabilistic(
-            preprocess_net=MultimodalBody(self._network, _space_of(envs)),
-            action_shape=envs.get_action_shape(),
-            unbounded=True,
-            conditioned_sigma=self._spread.conditioned,
-        )
-        self._init_linear(actor)
-        return self._spread.initialise(actor).to(device)
-
-    def create_dist_fn(self, envs: Environments) -> Any:
-        return DistributionFunctionFactoryIndependentGaussians().create_dist_fn(envs)
-
-
-class _MultimodalCriticFactory(CriticFactory):
-    def __init__(self, network: Multimodal) -> None:
-        self._network = network
-
-    def create_module(
-        self,
-        envs: Environments,
-        device: str | torch.device,
-        use_action: bool,
-        discrete_last_size_use_action_shape: bool = False,
-    ) -> nn.Module:
-        n_action = int(np.prod(envs.get_action_shape())) if use_action else 0
-        critic = MultimodalCritic(MultimodalBody(self._network, _space_of(envs), n_action))
-        init_linear_orthogonal(critic)
-        return critic.to(device)
-
-
-def _space_of(envs: Environments) -> spaces.Dict:
-    space = envs.get_observation_space()
-    assert isinstance(space, spaces.Dict)
-    return space
 
 
 def _convolutions(box: spaces.Box, filters: Sequence[int]) -> nn.Sequential:

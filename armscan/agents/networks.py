@@ -1,17 +1,15 @@
-"""Kinds of networks for actors and critics, as factories that Tianshou's builders take."""
+"""Kinds of networks for actors and critics."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Protocol
 
-import torch
 from gymnasium import spaces
-from tianshou.highlevel.env import Environments
-from tianshou.highlevel.module.actor import ActorFactory, ActorFactoryContinuousGaussianNet
-from tianshou.highlevel.module.critic import CriticFactory, CriticFactoryDefault
+from tianshou.utils.net.common import ModuleWithVectorOutput, Net
+from tianshou.utils.net.continuous import ContinuousActorProbabilistic as Actor
+from tianshou.utils.net.continuous import ContinuousCritic
 from torch import nn
 
 from armscan.errors import InvalidValueError
@@ -21,25 +19,6 @@ from armscan.utils.validation import check_choice, check_ints
 # which is then 4 GB.
 MOST_UNITS, MOST_WEIGHTS = 16_384, 2**26
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "gelu": nn.GELU}
-
-
-@dataclass(frozen=True)
-class GaussianStd:
-    """What the standard deviation of a Gaussian policy is made of.
-
-    Args:
-        conditioned: whether it depends on the observation; otherwise it is the same for all of them.
-        initial_log: its logarithm at first, where it does not depend on the observation.
-    """
-
-    conditioned: bool = True
-    initial_log: float = -0.5
-
-    def initialise(self, actor: nn.Module) -> nn.Module:
-        """Set the actor's standard deviation to what it is at first; returns the actor."""
-        if not self.conditioned:
-            nn.init.constant_(actor.get_parameter("sigma_param"), self.initial_log)
-        return actor
 
 
 class NetworkChoice(Protocol):
@@ -56,11 +35,17 @@ class NetworkChoice(Protocol):
 class Network(NetworkChoice, Protocol):
     """A kind of network that can be an actor's and a critic's."""
 
-    def actor_factory(self, spread: GaussianStd) -> ActorFactory:
-        """Return the factory of a Gaussian actor."""
+    def actor(self, observation_space: spaces.Space[Any], n_free: int, log_std: float | None) -> Actor:
+        """Return a Gaussian actor.
 
-    def critic_factory(self) -> CriticFactory:
-        """Return the factory of a critic, of observations alone or of observations with actions."""
+        Args:
+            observation_space: space of one observation.
+            n_free: components of an action.
+            log_std: initial logarithm of the standard deviation; None: it depends on the observation.
+        """
+
+    def critic(self, observation_space: spaces.Space[Any], n_action: int = 0) -> nn.Module:
+        """Return a critic of observations and actions with `n_action` components; default: of observations alone."""
 
 
 class MLP:
@@ -91,13 +76,17 @@ class MLP:
         check_weights(self, linear_weights([*(observation_space.shape or ()), *self.hidden_sizes]))
         return self
 
-    def actor_factory(self, spread: GaussianStd) -> ActorFactory:
-        """See `Network.actor_factory`."""
-        return _MLPActorFactory(self.hidden_sizes, self.activation, spread)
+    def actor(self, observation_space: spaces.Space[Any], n_free: int, log_std: float | None) -> Actor:
+        """See `Network.actor`."""
+        return gaussian_actor(self._body(observation_space), n_free, log_std)
 
-    def critic_factory(self) -> CriticFactory:
-        """See `Network.critic_factory`."""
-        return CriticFactoryDefault(hidden_sizes=self.hidden_sizes, hidden_activation=self.activation)
+    def critic(self, observation_space: spaces.Space[Any], n_action: int = 0) -> nn.Module:
+        """See `Network.critic`."""
+        body = self._body(observation_space, action_shape=n_action, concat=n_action > 0)
+        return init_linear(ContinuousCritic(preprocess_net=body))
+
+    def _body(self, space: spaces.Space[Any], **action: Any) -> Net:
+        return Net(state_shape=space.shape or (), hidden_sizes=self.hidden_sizes, activation=self.activation, **action)
 
 
 class NetworkByObservation:
@@ -151,17 +140,23 @@ def check_weights(network: Network, n_weights: int) -> None:
         )
 
 
-class _MLPActorFactory(ActorFactory):
-    """Tianshou's, with the standard deviation that is wanted at first."""
+def gaussian_actor(body: ModuleWithVectorOutput, n_free: int, log_std: float | None) -> Actor:
+    """Return a Gaussian actor whose actions are near 0 at first; see `Network.actor`."""
+    actor = Actor(preprocess_net=body, action_shape=(n_free,), unbounded=True, conditioned_sigma=log_std is None)
+    if log_std is not None:
+        nn.init.constant_(actor.get_parameter("sigma_param"), log_std)
+    init_linear(actor)
+    # Andrychowicz et al. 2020 (arXiv:2006.05990), figure 24.
+    for name, weights in actor.mu.named_parameters():
+        if name.endswith("weight"):
+            weights.data.mul_(0.01)
+    return actor
 
-    def __init__(self, hidden_sizes: Sequence[int], activation: type[nn.Module], spread: GaussianStd) -> None:
-        self._factory = ActorFactoryContinuousGaussianNet(
-            hidden_sizes, unbounded=True, conditioned_sigma=spread.conditioned, activation=activation
-        )
-        self._spread = spread
 
-    def create_module(self, envs: Environments, device: str | torch.device) -> nn.Module:
-        return self._spread.initialise(self._factory.create_module(envs, device))
-
-    def create_dist_fn(self, envs: Environments) -> Any:
-        return self._factory.create_dist_fn(envs)
+def init_linear(module: nn.Module) -> nn.Module:
+    """Initialise linear layers with orthogonal weights and no bias; returns the module."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.orthogonal_(layer.weight, gain=2**0.5)
+            nn.init.zeros_(layer.bias)
+    return module

@@ -1,22 +1,20 @@
-"""Proximal policy optimisation, through Tianshou's experiment builder."""
+"""Proximal policy optimisation by Tianshou."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tianshou.highlevel.config import OnPolicyTrainingConfig
-from tianshou.highlevel.experiment import PPOExperimentBuilder
-from tianshou.highlevel.params.algorithm_params import PPOParams
+from tianshou.algorithm.modelfree import ppo
+from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
+from tianshou.algorithm.optim import AdamOptimizerFactory
+from tianshou.trainer import OnPolicyTrainer, OnPolicyTrainerParams
+from torch.distributions import Independent, Normal
 
-from armscan.agents.budget_checks import check_batch, check_collection
-from armscan.agents.epoch_metrics import EpochMetricsFactory
-from armscan.agents.hyperparameters import PolicyParameters, number
+from armscan.agents.hyperparameters import PolicyParameters, check_batch, check_collection, number
 from armscan.agents.image_replay import replay_for
-from armscan.agents.networks import GaussianStd
 from armscan.agents.policy import clip_action
 from armscan.agents.protocols import AgentSetup
-from armscan.agents.tianshou_envs import TianshouEnvFactory
-from armscan.agents.tianshou_learner import TianshouLearner, experiment_config
+from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
 from armscan.errors import InvalidValueError
 
 
@@ -75,44 +73,42 @@ class PPO(PolicyParameters):
         network = self.network.chosen_for(setup.observation_space)
         n_collected = check_collection(self.env_steps_per_collection, self.num_envs, setup)
         check_batch(self.batch_size, n_collected, "the environment steps of a collection")
-        builder = PPOExperimentBuilder(
-            TianshouEnvFactory(setup.make_envs),
-            experiment_config(setup),
-            OnPolicyTrainingConfig(
-                num_training_envs=self.num_envs,
-                num_test_envs=1,
-                # Tianshou's own, which ours takes the place of.
-                buffer_size=self.num_envs,
-                collection_step_num_env_steps=n_collected,
-                update_step_num_repetitions=self.n_epochs,
-                batch_size=self.batch_size,
-            ),
+        envs, device = training_envs(setup, self.num_envs), setup.compute.torch_device
+        actor = network.actor(
+            setup.observation_space,
+            len(setup.action_names),
+            log_std=None if self.conditioned_sigma else self.log_std_init,
         )
-        builder.with_logger_factory(EpochMetricsFactory())
-        builder.with_ppo_params(
-            PPOParams(
-                lr=self.lr,
-                gamma=self.gamma,
-                gae_lambda=self.gae_lambda,
-                eps_clip=self.clip_range,
-                ent_coef=self.ent_coef,
-                vf_coef=self.vf_coef,
-                max_grad_norm=self.max_grad_norm,
-                advantage_normalization=self.normalize_advantage,
-                action_bound_method="clip",
-                # Actions are within [-1, 1] as they are.
-                action_scaling=False,
-                deterministic_eval=self.deterministic_eval,
-            )
+        critic = network.critic(setup.observation_space)
+        policy = ProbabilisticActorPolicy(
+            actor=actor.to(device),
+            dist_fn=lambda loc_scale: Independent(Normal(*loc_scale), 1),
+            deterministic_eval=self.deterministic_eval,
+            action_space=envs.action_space[0],
+            observation_space=setup.observation_space,
+            # Actions are within [-1, 1] as they are.
+            action_scaling=False,
+            action_bound_method="clip",
         )
-        spread = GaussianStd(conditioned=self.conditioned_sigma, initial_log=self.log_std_init)
-        builder.with_actor_factory(network.actor_factory(spread))
-        builder.with_critic_factory(network.critic_factory())
+        algorithm = ppo.PPO(
+            policy=policy,
+            critic=critic.to(device),
+            optim=AdamOptimizerFactory(lr=self.lr),
+            gamma=self.gamma,
+            gae_lambda=self.gae_lambda,
+            eps_clip=self.clip_range,
+            ent_coef=self.ent_coef,
+            vf_coef=self.vf_coef,
+            max_grad_norm=self.max_grad_norm,
+            advantage_normalization=self.normalize_advantage,
+        )
+        replay = replay_for(setup.observation_space, n_collected, self.num_envs)
+        params = OnPolicyTrainerParams(
+            **training_parameters(policy, envs, replay),
+            collection_step_num_env_steps=n_collected,
+            update_step_num_repetitions=self.n_epochs,
+            batch_size=self.batch_size,
+        )
         return TianshouLearner(
-            builder.build(),
-            replay=replay_for(setup.observation_space, n_collected, self.num_envs),
-            learning_starts=0,
-            lr_end_factor=self.lr_end_factor,
-            bounded=clip_action,
-            setup=setup,
+            OnPolicyTrainer(algorithm, params), bounded=clip_action, lr_end_factor=self.lr_end_factor, setup=setup
         )

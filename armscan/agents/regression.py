@@ -11,13 +11,10 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import nn
 
-from armscan.agents.budget_checks import buffer_capacity, check_batch, check_updates
-from armscan.agents.hyperparameters import Parameters, lr_share, number
-from armscan.agents.networks import GaussianStd
+from armscan.agents.hyperparameters import Parameters, buffer_capacity, check_batch, check_updates, lr_share, number
 from armscan.agents.policy import Policy, clip_action
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.supervised_buffer import SupervisedBuffer
-from armscan.agents.tianshou_envs import TianshouEnvFactory
 from armscan.agents.tianshou_learner import load_into
 from armscan.envs.actions import ActionBounds
 from armscan.envs.history import observation_of, parts_of
@@ -76,12 +73,11 @@ class Regression(Parameters):
         check_updates(self.utd_ratio, setup)
         size = buffer_capacity(self.buffer_size, self.num_envs, setup)
         check_batch(self.batch_size, size, "which is all that is kept of the training's slices")
-        envs = setup.make_envs(self.num_envs)
-        shapes = TianshouEnvFactory(lambda _: envs).create_envs(self.num_envs, 1, seed=setup.seed)
+        n_free = len(setup.action_names)
         torch.manual_seed(setup.seed)
-        network = chosen.actor_factory(GaussianStd(conditioned=False)).create_module(shapes, setup.compute.torch_device)
-        examples = SupervisedBuffer(size, setup.observation_space, len(setup.action_names))
-        return RegressionLearner(self, envs, network, examples, setup)
+        network = chosen.actor(setup.observation_space, n_free, log_std=-0.5).to(setup.compute.torch_device)
+        examples = SupervisedBuffer(size, setup.observation_space, n_free)
+        return RegressionLearner(self, setup.make_envs(self.num_envs), network, examples, setup)
 
 
 class RegressionLearner:

@@ -1,24 +1,30 @@
-"""Soft actor-critic, through Tianshou's experiment builder."""
+"""Soft actor-critic by Tianshou, with a fractional update-to-data ratio."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from tianshou.highlevel.config import OffPolicyTrainingConfig
-from tianshou.highlevel.experiment import SACExperimentBuilder
-from tianshou.highlevel.params.algorithm_params import SACParams
-from tianshou.highlevel.params.alpha import AutoAlphaFactoryDefault
+from tianshou.algorithm.algorithm_base import OffPolicyAlgorithm, TrainingStats
+from tianshou.algorithm.modelfree import sac
+from tianshou.algorithm.optim import AdamOptimizerFactory
+from tianshou.data import CollectStatsBase
+from tianshou.trainer import OffPolicyTrainer, OffPolicyTrainerParams
 
-from armscan.agents.budget_checks import buffer_capacity, check_batch, check_collection, check_updates, round_up
-from armscan.agents.epoch_metrics import EpochMetricsFactory
-from armscan.agents.hyperparameters import PolicyParameters, number
+from armscan.agents.hyperparameters import (
+    PolicyParameters,
+    buffer_capacity,
+    check_batch,
+    check_collection,
+    check_updates,
+    number,
+    round_up,
+)
 from armscan.agents.image_replay import replay_for
-from armscan.agents.networks import GaussianStd
 from armscan.agents.protocols import AgentSetup
-from armscan.agents.tianshou_envs import TianshouEnvFactory
-from armscan.agents.tianshou_learner import TianshouLearner, experiment_config
+from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
 from armscan.errors import InvalidValueError
 
 
@@ -78,42 +84,74 @@ class SAC(PolicyParameters):
         check_updates(self.utd_ratio, setup, learning_starts=n_random)
         n_kept = buffer_capacity(self.buffer_size, self.num_envs, setup)
         check_batch(self.batch_size, n_kept, "which is all that training.env_steps leaves to draw from")
-        builder = SACExperimentBuilder(
-            TianshouEnvFactory(setup.make_envs),
-            experiment_config(setup),
-            OffPolicyTrainingConfig(
-                num_training_envs=self.num_envs,
-                num_test_envs=1,
-                # Tianshou's own, which ours takes the place of.
-                buffer_size=self.num_envs,
-                collection_step_num_env_steps=n_collected,
-                update_step_num_gradient_steps_per_sample=self.utd_ratio,
-                batch_size=self.batch_size,
+        envs, device = training_envs(setup, self.num_envs), setup.compute.torch_device
+        space, n_free = setup.observation_space, len(setup.action_names)
+        actor = network.actor(space, n_free, log_std=None)
+        critics = [network.critic(space, n_free).to(device) for _ in range(2)]
+        policy = sac.SACPolicy(
+            actor=actor.to(device),
+            deterministic_eval=self.deterministic_eval,
+            action_space=envs.action_space[0],
+            observation_space=space,
+        )
+        optim = AdamOptimizerFactory(lr=self.lr)
+        algorithm: sac.SAC[Any] = sac.SAC(
+            policy=policy,
+            policy_optim=optim,
+            critic=critics[0],
+            critic_optim=optim,
+            critic2=critics[1],
+            tau=self.tau,
+            gamma=self.gamma,
+            alpha=sac.AutoAlpha(
+                self.target_entropy_per_dim * n_free,
+                math.log(self.ent_coef_init),
+                AdamOptimizerFactory(lr=self.ent_coef_lr),
             ),
         )
-        builder.with_logger_factory(EpochMetricsFactory())
-        builder.with_sac_params(
-            SACParams(
-                deterministic_eval=self.deterministic_eval,
-                gamma=self.gamma,
-                tau=self.tau,
-                actor_lr=self.lr,
-                critic1_lr=self.lr,
-                critic2_lr=self.lr,
-                alpha=AutoAlphaFactoryDefault(
-                    lr=self.ent_coef_lr,
-                    target_entropy_coefficient=self.target_entropy_per_dim,
-                    log_alpha=math.log(self.ent_coef_init),
-                ),
-            )
+        params = OffPolicyTrainerParams(
+            **training_parameters(policy, envs, replay_for(space, n_kept, self.num_envs)),
+            collection_step_num_env_steps=n_collected,
+            update_step_num_gradient_steps_per_sample=self.utd_ratio,
+            batch_size=self.batch_size,
         )
-        builder.with_actor_factory(network.actor_factory(GaussianStd(conditioned=True)))
-        builder.with_common_critic_factory(network.critic_factory())
         return TianshouLearner(
-            builder.build(),
-            replay=replay_for(setup.observation_space, n_kept, self.num_envs),
+            EvenUpdatesTrainer(algorithm, params, n_random),
             learning_starts=n_random,
-            lr_end_factor=self.lr_end_factor,
             bounded=torch.tanh,
+            lr_end_factor=self.lr_end_factor,
             setup=setup,
         )
+
+
+class EvenUpdatesTrainer(OffPolicyTrainer):
+    """Tianshou's trainer, which would round the gradient steps of every collection by itself, and refuse to have none.
+
+    What is due is counted from the first collection on, so that it follows from the environment steps alone: a
+    training that goes on later takes the same gradient steps as one that was never cut off. No progress bar is shown.
+
+    Args:
+        algorithm: that is trained.
+        params: of the trainer.
+        learning_starts: steps before the first collection.
+    """
+
+    def __init__(
+        self, algorithm: OffPolicyAlgorithm[Any], params: OffPolicyTrainerParams, learning_starts: int
+    ) -> None:
+        super().__init__(algorithm, params)
+        self._learning_starts = learning_starts
+
+    def _update_step(self, collect_stats: CollectStatsBase) -> TrainingStats:
+        """Take the gradient steps that are due since the collection before; returns the last one's figures."""
+        collector = self.params.training_collector
+        n_env_steps = collector.collect_step - self._learning_starts
+        n_due = self._n_due(n_env_steps) - self._n_due(n_env_steps - collect_stats.n_collected_steps)
+        stats = TrainingStats()
+        for _ in range(n_due):
+            stats = self._sample_and_update(collector.buffer)
+        return stats
+
+    def _n_due(self, n_env_steps: int) -> int:
+        # Rounded: products that are whole come out as just below it here and there.
+        return round(self.params.update_step_num_gradient_steps_per_sample * n_env_steps)

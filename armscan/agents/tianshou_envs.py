@@ -5,15 +5,12 @@ from __future__ import annotations
 from copy import deepcopy
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from tianshou.data import Batch
 from tianshou.env import BaseVectorEnv
-from tianshou.highlevel.env import ContinuousEnvironments, EnvFactory, EnvMode, VectorEnvType
 
-from armscan.agents.protocols import VectorEnvFactory
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import reset_each
 
@@ -74,15 +71,6 @@ class TianshouVectorEnv(BaseVectorEnv):
                 space.seed(one_seed)
         return [None if seeds is None else [one_seed] for one_seed in seeds or [0] * self.env_num]
 
-    def render(self, **kwargs: Any) -> list[Any]:
-        """Draw nothing."""
-        return []
-
-    def close(self) -> None:
-        """Close the environments."""
-        self._envs.close()
-        self.is_closed = True
-
     @staticmethod
     def _no_info(ids: NDArray[np.int64]) -> NDArray[Any]:
         return np.array([{"env_id": i} for i in ids])
@@ -91,41 +79,3 @@ class TianshouVectorEnv(BaseVectorEnv):
 def _batched(observations: Observed) -> Any:
     """Tianshou indexes a `Batch` as it does an array."""
     return Batch(observations) if isinstance(observations, dict) else observations
-
-
-class TianshouEnvFactory(EnvFactory):
-    """Gives Tianshou the training environments.
-
-    Args:
-        make_envs: makes as many as are asked for.
-    """
-
-    def __init__(self, make_envs: VectorEnvFactory) -> None:
-        super().__init__(VectorEnvType.DUMMY)
-        self._make_envs = make_envs
-
-    def _create_env(self, mode: EnvMode) -> gym.Env[Any, Any]:
-        raise NotImplementedError("environments are made side by side")
-
-    def create_venv(self, num_envs: int, mode: EnvMode, seed: int | None = None) -> BaseVectorEnv:
-        """Make environments with seeds drawn from the one given."""
-        envs = TianshouVectorEnv(self._make_envs(num_envs))
-        rng = self._create_rng(seed)
-        envs.seed([self._next_seed(rng) for _ in range(num_envs)])
-        return envs
-
-    def create_envs(
-        self, num_training_envs: int, num_test_envs: int, create_watch_env: bool = False, seed: int | None = None
-    ) -> ContinuousEnvironments:
-        """Make the training environments; testing is not left to Tianshou."""
-        training = self.create_venv(num_training_envs, EnvMode.TRAINING, seed)
-        spaces = _SpacesOnly(training.get_env_attr("observation_space")[0], training.get_env_attr("action_space")[0])
-        return ContinuousEnvironments(spaces, training, training)
-
-
-class _SpacesOnly(gym.Env[Any, Any]):
-    """What Tianshou reads the shapes of observations and actions from."""
-
-    def __init__(self, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
-        self.observation_space = observation_space
-        self.action_space = action_space

@@ -1,17 +1,16 @@
-"""A Tianshou experiment behind the few methods that training needs of a learner."""
+"""Tianshou's trainer behind the few methods that training needs of a learner."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
-from tianshou.data import Batch
-from tianshou.highlevel.experiment import Experiment, ExperimentConfig
-from tianshou.highlevel.persistence import PolicyPersistence
-from tianshou.trainer import OffPolicyTrainer
+from tianshou.algorithm.algorithm_base import Policy as TianshouPolicy
+from tianshou.data import Batch, Collector
+from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.hyperparameters import lr_share
@@ -19,7 +18,6 @@ from armscan.agents.policy import Policy
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
 from armscan.agents.tianshou_envs import TianshouVectorEnv
-from armscan.agents.tianshou_trainer import EvenUpdatesTrainer
 from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
 from armscan.errors import CheckpointError, DivergedError
@@ -27,60 +25,49 @@ from armscan.volumes.plane import FloatArray
 
 
 class TianshouLearner:
-    """A learner made of a Tianshou experiment.
+    """A learner made of a Tianshou trainer.
 
-    The experiment's own test collector, persistence and progress bars are left out: evaluation, checkpoints and
-    progress are the same for every agent, and belong to training.
+    Its test collector, persistence and progress bars are left out: evaluation, checkpoints and progress are the same
+    for every agent, and belong to training.
 
     Every epoch begins with new episodes, and draws whatever it draws from `seed` and its own number. So nothing of an
     episode has to be kept for a training to go on later exactly as it would have gone on at once.
 
     Args:
-        experiment: as its builder gives it.
-        replay: what the experiment's transitions are kept in.
-        learning_starts: steps with random actions before the first update.
+        trainer: with `training_parameters`.
+        bounded: takes the mean of the policy's actions to [-1, 1], as the trainer's policy does.
         lr_end_factor: what the learning rates of actor and critics have come down to at the training's end, as a share
             of what they were; they fall by as much in each epoch as it has steps.
-        bounded: takes the mean of the policy's actions to [-1, 1], as the experiment's policy does.
         setup: what the agent was given.
+        learning_starts: steps with random actions before the first update; default: none.
     """
 
     def __init__(
         self,
-        experiment: Experiment,
+        trainer: OnPolicyTrainer | OffPolicyTrainer,
         *,
-        replay: Replay,
-        learning_starts: int,
-        lr_end_factor: float,
         bounded: Callable[[torch.Tensor], torch.Tensor],
+        lr_end_factor: float,
         setup: AgentSetup,
+        learning_starts: int = 0,
     ) -> None:
-        world = experiment.create_experiment_world()
-        # Tianshou asks for it by itself only where it keeps a folder of its own.
-        logger = experiment.logger_factory.create_logger(log_dir="", experiment_name=experiment.name, run_id=None)
-        assert isinstance(logger, EpochMetrics)
-        world.logger = self._metrics = logger
-        world.test_collector = None
-        assert world.training_collector is not None
-        self._collector = world.training_collector
-        self._collector.buffer = replay
-        assert isinstance(self._collector.env, TianshouVectorEnv)
-        self._envs = self._collector.env
-        trainer: Any = experiment.algorithm_factory.create_trainer(world, _NoPersistence())
-        trainer.params.show_progress = False
-        if isinstance(trainer, OffPolicyTrainer):
-            trainer = EvenUpdatesTrainer(trainer.algorithm, trainer.params, learning_starts)
         trainer.reset(reset_collectors=False)
-        self._algorithm = world.algorithm
         self._trainer = trainer
-        self._replay = replay
+        self._algorithm: Any = trainer.algorithm
+        collector: Any = trainer.params.training_collector
+        self._collector = collector
+        self._replay: Replay = collector.buffer
+        self._envs: TianshouVectorEnv = collector.env
+        self._metrics = cast(EpochMetrics, trainer.params.logger)
         self._learning_starts = learning_starts
         self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
         self._lr_end_factor = lr_end_factor
         self._bounded, self._compute = bounded, setup.compute
         self._n_epochs = 0
         self._first_lrs = [group["lr"] for group in self._lr_groups()]
-        for network in networks_of(self._algorithm):
+        critics = [module for name, module in self._algorithm.named_children() if name.startswith("critic")]
+        # Lagging copies of the critics included.
+        for network in (self._algorithm.policy.actor, *critics):
             setup.compute.apply_to(network)
 
     @property
@@ -91,7 +78,7 @@ class TianshouLearner:
     @property
     def env_steps_at_once(self) -> int:
         """Those of one collection."""
-        return int(self._trainer.params.collection_step_num_env_steps)
+        return int(self._trainer.params.collection_step_num_env_steps or 0)
 
     def warm_up(self) -> None:
         """Fill the replay buffer with random steps."""
@@ -183,7 +170,7 @@ class TianshouLearner:
         """Return networks, optimisers, replay buffer and counters."""
         self._replay.cut_off()
         return {
-            "algorithm": dict(self._algorithm.state_dict()),  # type: ignore[no-untyped-call]
+            "algorithm": dict(self._algorithm.state_dict()),
             "entropy_optimiser": optimiser.state_dict() if (optimiser := _entropy_optimiser(self._algorithm)) else {},
             "replay": self._replay.state(),
             "n_env_steps": self.n_env_steps,
@@ -204,15 +191,21 @@ class TianshouLearner:
         self._n_epochs = state["n_epochs"]
 
 
-def experiment_config(setup: AgentSetup) -> ExperimentConfig:
-    """Return what Tianshou has to know of a setup."""
-    return ExperimentConfig(seed=setup.seed, device=setup.compute.torch_device, watch=False, persistence_enabled=False)
+def training_envs(setup: AgentSetup, num_envs: int) -> TianshouVectorEnv:
+    """Return the training environments, and seed the weights of the networks that are made next."""
+    envs = TianshouVectorEnv(setup.make_envs(num_envs))
+    torch.manual_seed(setup.seed)
+    return envs
 
 
-def networks_of(algorithm: torch.nn.Module) -> list[torch.nn.Module]:
-    """Return the networks of an algorithm: its actor, its critics, and their lagging copies."""
-    critics = [module for name, module in algorithm.named_children() if name.startswith("critic")]
-    return [algorithm.get_submodule("policy.actor"), *critics]
+def training_parameters(policy: TianshouPolicy, envs: TianshouVectorEnv, replay: Replay) -> dict[str, Any]:
+    """Return the parameters that Tianshou's trainers share."""
+    return {
+        "training_collector": Collector(policy, envs, replay, exploration_noise=True),
+        "logger": EpochMetrics(),
+        "verbose": False,
+        "show_progress": False,
+    }
 
 
 def load_into(module: torch.nn.Module, weights: dict[str, Any]) -> None:
@@ -236,10 +229,3 @@ def _batch_of_one(observation: Observed) -> Any:
     if isinstance(observation, dict):
         return Batch({name: part[None] for name, part in observation.items()})
     return observation[None]
-
-
-class _NoPersistence(PolicyPersistence):
-    """Keeps Tianshou from saving: without test steps there is no best policy for it to save."""
-
-    def get_save_best_fn(self, world: Any) -> None:  # type: ignore[override]
-        return None

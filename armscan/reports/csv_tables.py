@@ -80,7 +80,6 @@ def _volume_rows(groups: Sequence[Group]) -> Iterator[Row]:
 def _pair_rows(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[Row]:
     for figure, of_figure in pairs.items():
         for pair in of_figure:
-            if pair.probability is not None and pair.stratified is not None:
+            if pair.probability is not None:
                 names = {"better": groups[pair.ours].name, "than": groups[pair.theirs].name}
-                ends = {"low_stratified": pair.stratified.low, "high_stratified": pair.stratified.high}
-                yield {"figure": figure, **names, **pair.probability._asdict(), **ends}
+                yield {"figure": figure, **names, **pair.probability._asdict()}

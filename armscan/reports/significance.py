@@ -28,13 +28,11 @@ class Pair:
         theirs: index of the second group.
         probability: probability that a training of the first group is better than one of the second; None if they
             were evaluated on different volumes.
-        stratified: the same with a bootstrap that draws the seeds of each volume separately.
     """
 
     ours: int
     theirs: int
     probability: Estimate | None
-    stratified: Estimate | None
 
 
 def evaluated_trainings(group: Group) -> list[TrackedTraining]:
@@ -44,15 +42,10 @@ def evaluated_trainings(group: Group) -> list[TrackedTraining]:
 
 def final_metrics(group: Group) -> MetricEstimates | None:
     """Return the final metrics of a group, with intervals over seeds, volumes and episodes; None if not evaluated."""
-    played = [
-        (training.run_id, training.evaluation)
-        for training in evaluated_trainings(group)
-        if training.evaluation is not None
-    ]
+    played = [(each.run_id, each.evaluation.episodes) for each in group.trainings if each.evaluation is not None]
     if not played:
         return None
-    episodes = [(run_id, episode) for run_id, evaluation in played for episode in evaluation.episodes]
-    of_runs, of_all = zip(*episodes, strict=True)
+    of_runs, of_all = zip(*((run_id, episode) for run_id, episodes in played for episode in episodes), strict=True)
     return MetricEstimates.of(Evaluation(of_all), of_runs)
 
 
@@ -63,18 +56,13 @@ def compare_groups(groups: Sequence[Group], figure: str) -> Iterator[Pair]:
         groups: groups of trainings, in the order of their indices.
         figure: name of the metric, one of `COMPARED_BY`.
     """
-    is_more_better = COMPARED_BY[figure]
     volumes = [_volumes(group) for group in groups]
-    scores = [_scores(group, figure) * (1.0 if is_more_better else -1.0) for group in groups]
+    scores = [_scores(group, figure) * (1.0 if COMPARED_BY[figure] else -1.0) for group in groups]
     for ours, theirs in combinations(range(len(groups)), 2):
         if not (evaluated_trainings(groups[ours]) and evaluated_trainings(groups[theirs])):
             continue
-        if _are_same(volumes[ours], volumes[theirs]):
-            both = scores[ours], scores[theirs]
-            stratified = probability_of_improvement(*both, is_stratified=True)
-            yield Pair(ours, theirs, probability_of_improvement(*both), stratified)
-        else:
-            yield Pair(ours, theirs, None, None)
+        is_comparable = _are_same(volumes[ours], volumes[theirs])
+        yield Pair(ours, theirs, probability_of_improvement(scores[ours], scores[theirs]) if is_comparable else None)
 
 
 def complement(probability: Estimate) -> Estimate:

@@ -8,7 +8,6 @@ interval, though somewhat too narrow for few.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,12 +35,7 @@ class Band(NamedTuple):
 
 
 def interquartile_mean(values: ArrayLike, axis: int | None = None) -> Any:
-    """Return the mean without the lowest and the highest quarter, by default of all values; of fewer than four of all.
-
-    Args:
-        values: of any shape.
-        axis: over which; None for all of them.
-    """
+    """Return the mean without the lowest and the highest quarter, by default of all values; of fewer than four all."""
     return trim_mean(values, QUARTER, axis=axis)
 
 
@@ -50,14 +44,13 @@ def mean_for(figure: str) -> Mean:
     return np.mean if "success_rate" in figure else interquartile_mean
 
 
-def over_seeds(scores: FloatArray, mean: Mean, *, is_stratified: bool = False, seed: int = 0) -> Estimate:
+def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
     """Return the mean over seeds and volumes, with an interval that draws seeds, each with all its volumes.
 
     Args:
         scores: shape (seeds, volumes).
         mean: see `mean_for`.
-        is_stratified: draw the seeds of each volume by itself; see `probability_of_improvement` for when that is right.
-        seed: of the resamples.
+        seed: seed of the resamples; default: 0.
 
     Returns:
         The estimate, without an interval where there is one seed or a score is NaN.
@@ -65,11 +58,8 @@ def over_seeds(scores: FloatArray, mean: Mean, *, is_stratified: bool = False, s
     value = float(mean(scores))
     if len(scores) < 2 or np.isnan(scores).any():
         return Estimate(value, np.nan, np.nan)
-    if is_stratified:
-        ends = _ends(tuple(scores.T), lambda *of_volumes: mean(np.array(of_volumes)), seed, vectorized=False)
-    else:
-        ends = _ends((np.arange(len(scores)),), lambda drawn: mean(scores[drawn]), seed, vectorized=False)
-    return Estimate(value, float(ends[0]), float(ends[1]))
+    low, high = _ends((np.arange(len(scores)),), lambda drawn: mean(scores[drawn]), seed, vectorized=False)
+    return Estimate(value, float(low), float(high))
 
 
 def band_over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Band:
@@ -91,20 +81,16 @@ def band_over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Band:
     return Band(values, np.asarray(low), np.asarray(high))
 
 
-def probability_of_improvement(
-    ours: FloatArray, theirs: FloatArray, *, is_stratified: bool = False, seed: int = 0
-) -> Estimate:
+def probability_of_improvement(ours: FloatArray, theirs: FloatArray, *, seed: int = 0) -> Estimate:
     """Return how likely a training of ours is better than one of theirs on the same volume, averaged over the volumes.
 
-    The share of pairs of seeds in which ours is greater, where ties count half: the statistic of Mann and Whitney.
+    The share of pairs of seeds in which ours is greater, where ties count half: the statistic of Mann and Whitney. The
+    interval draws each seed with all its volumes, because one training was judged on all of them.
 
     Args:
         ours: shape (seeds, volumes), greater is better, all finite.
         theirs: shape (seeds, the same volumes).
-        is_stratified: draw the seeds of each volume by itself, which is right where each volume has had trainings of
-            its own. Where a training was judged on all volumes such an interval is far too narrow, and a seed is drawn
-            with all of them.
-        seed: of the resamples.
+        seed: seed of the resamples; default: 0.
 
     Returns:
         The estimate, without an interval where either has one seed.
@@ -116,7 +102,9 @@ def probability_of_improvement(
         raise InvalidValueError(
             f"scores are of {ours.shape[1]} and of {theirs.shape[1]} volumes, but they must be of the same ones"
         )
-    wins = _wins(ours.T, theirs.T).mean(axis=0)
+    pairs = ours[:, None], theirs[None, :]
+    # 1 where ours is greater, 0.5 where they are equal, shape (our seeds, their seeds).
+    wins = (np.greater(*pairs) + 0.5 * np.equal(*pairs)).mean(axis=-1)
     value = float(wins.mean())
     if min(wins.shape) < 2:
         return Estimate(value, np.nan, np.nan)
@@ -124,29 +112,13 @@ def probability_of_improvement(
     def of_drawn(our_seeds: NDArray[np.intp], their_seeds: NDArray[np.intp], axis: int) -> Any:
         return wins[our_seeds[..., :, None], their_seeds[..., None, :]].mean(axis=(-2, -1))
 
-    drawn: tuple[NDArray[Any], ...] = tuple(np.arange(n) for n in wins.shape)
-    how: dict[str, Any] = {"vectorized": True, "axis": -1, "batch": max(1, MOST_VALUES // wins.size)}
-    if is_stratified:
-        low, high = _ends((*ours.T, *theirs.T), _improvement, seed, **how)
-    else:
-        low, high = _ends(drawn, of_drawn, seed, **how)
+    drawn = tuple(np.arange(n) for n in wins.shape)
+    at_once = max(1, MOST_VALUES // wins.size)
+    low, high = _ends(drawn, of_drawn, seed, vectorized=True, axis=-1, batch=at_once)
     return Estimate(value, float(low), float(high))
 
 
-def _improvement(*samples: FloatArray, axis: int) -> Any:
-    """Return the probability from the seeds of each volume, ours and then theirs, each of shape (..., seeds)."""
-    n_volumes = len(samples) // 2
-    pairs = zip(samples[:n_volumes], samples[n_volumes:], strict=True)
-    return sum(_wins(ours, theirs).mean(axis=(-2, -1)) for ours, theirs in pairs) / n_volumes
-
-
-def _wins(ours: FloatArray, theirs: FloatArray) -> FloatArray:
-    """Return 1 where ours is greater, 0.5 where they are equal, of shape (..., our seeds, their seeds)."""
-    ours, theirs = ours[..., :, None], theirs[..., None, :]
-    return np.asarray((ours > theirs) + 0.5 * (ours == theirs))
-
-
 def _ends(samples: tuple[NDArray[Any], ...], statistic: Mean, seed: int, **how: Any) -> tuple[Any, Any]:
-    draw = partial(bootstrap, n_resamples=N_RESAMPLES, confidence_level=LEVEL, method="percentile")
-    interval = draw(samples, statistic, rng=np.random.default_rng(seed), **how).confidence_interval
+    how |= {"n_resamples": N_RESAMPLES, "confidence_level": LEVEL, "method": "percentile"}
+    interval = bootstrap(samples, statistic, rng=np.random.default_rng(seed), **how).confidence_interval
     return interval.low, interval.high

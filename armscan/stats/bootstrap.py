@@ -19,14 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binomtest
 
 from armscan.errors import InvalidValueError
 from armscan.volumes.plane import FloatArray
 
 LEVEL = 0.95
 N_RESAMPLES = 2000
-# The standard normal's quantile of (1 + LEVEL) / 2.
-NORMAL_QUANTILE = 1.959963984540054
 # Resampled values that are in memory at once.
 MOST_VALUES = 2_000_000
 
@@ -101,10 +100,8 @@ def wilson(n_successes: int, n_trials: int) -> Estimate:
     """Return a rate with Wilson's interval, as if all trials were independent."""
     if n_trials == 0:
         return Estimate(math.nan, math.nan, math.nan)
-    rate, z2 = n_successes / n_trials, NORMAL_QUANTILE**2
-    middle = (rate + z2 / (2 * n_trials)) / (1 + z2 / n_trials)
-    half = NORMAL_QUANTILE / (1 + z2 / n_trials) * math.sqrt(rate * (1 - rate) / n_trials + z2 / (4 * n_trials**2))
-    return Estimate(rate, max(0.0, middle - half), min(1.0, middle + half))
+    interval = binomtest(n_successes, n_trials).proportion_ci(LEVEL, method="wilson")
+    return Estimate(n_successes / n_trials, float(interval.low), float(interval.high))
 
 
 def _estimate(value: float, resampled: FloatArray) -> Estimate:

@@ -43,14 +43,18 @@ def test_probability_of_improvement_is_that_of_rliable(groups):
     assert probability_of_improvement(ours, others) == estimate
 
 
-@pytest.mark.parametrize(("n_volumes", "is_stratified"), [(1, False), (1, True), (6, True)])
-def test_intervals_of_improvement_are_those_of_rliable(n_volumes, is_stratified):
+def stratified(scores, statistic, reps=300):
+    """The interval of rliable, which draws the seeds of each volume by itself."""
+    _, ends = get_interval_estimates({"it": scores}, lambda *drawn: np.array([statistic(*drawn)]), reps=reps)
+    return ends["it"][:, 0]
+
+
+def test_intervals_of_improvement_are_those_of_rliable_on_one_volume():
     rng = np.random.default_rng(0)
-    ours, others = rng.normal(0.7, size=(8, n_volumes)), rng.normal(size=(6, n_volumes))
-    estimate = probability_of_improvement(ours, others, is_stratified=is_stratified)
-    _, ends = get_interval_estimates({"it": (ours, others)}, lambda *both: np.array([theirs(*both)]), reps=1500)
+    ours, others = rng.normal(0.7, size=(8, 1)), rng.normal(size=(6, 1))
     # But for what is left to chance.
-    assert estimate[1:] == pytest.approx(ends["it"][:, 0], abs=0.05)
+    expected = stratified((ours, others), theirs, reps=1500)
+    assert probability_of_improvement(ours, others)[1:] == pytest.approx(expected, abs=0.05)
 
 
 def test_interval_of_improvement_holds_the_truth_only_if_seeds_are_drawn_with_all_their_volumes():
@@ -59,19 +63,20 @@ def test_interval_of_improvement_holds_the_truth_only_if_seeds_are_drawn_with_al
     for _ in range(60):
         # Each training is good or bad on all of eight volumes; both groups are the same.
         ours, others = (rng.normal(size=(10, 1)) + 0.3 * rng.normal(size=(10, 8)) for _ in range(2))
-        whole, stratified = (probability_of_improvement(ours, others, is_stratified=each) for each in (False, True))
+        whole, (low, high) = probability_of_improvement(ours, others), stratified((ours, others), theirs)
         n_whole += whole.low <= 0.5 <= whole.high
-        n_stratified += stratified.low <= 0.5 <= stratified.high
+        n_stratified += low <= 0.5 <= high
     assert n_whole >= 50
     assert n_stratified <= 45
 
 
-@pytest.mark.parametrize(("n_volumes", "is_stratified"), [(1, False), (1, True), (8, True)])
-def test_intervals_over_seeds_are_those_of_rliable(n_volumes, is_stratified):
+@pytest.mark.parametrize(("mean", "n_volumes"), [(interquartile_mean, 1), (np.mean, 1), (np.mean, 8)])
+def test_intervals_over_seeds_are_those_of_rliable(mean, n_volumes):
     values = np.random.default_rng(0).gamma(2.0, 2.0, (5, n_volumes))
-    estimate = over_seeds(values, interquartile_mean, is_stratified=is_stratified)
-    _, ends = get_interval_estimates({"it": values}, lambda each: np.array([aggregate_iqm(each)]), reps=10_000)
-    assert estimate[1:] == pytest.approx(ends["it"][:, 0], rel=0.05)
+    # A seed that is drawn with all its volumes is a seed of one volume, that of their mean.
+    of_seeds = values.mean(axis=1, keepdims=True)
+    expected = stratified(of_seeds, aggregate_iqm if mean is interquartile_mean else np.mean, reps=10_000)
+    assert over_seeds(values, mean)[1:] == pytest.approx(expected, rel=0.05)
 
 
 def test_interval_over_seeds_holds_the_truth_only_if_they_are_drawn_with_all_their_volumes():
@@ -80,9 +85,9 @@ def test_interval_over_seeds_holds_the_truth_only_if_they_are_drawn_with_all_the
     for _ in range(40):
         # Each training is good or bad on all of eight volumes; the mean of all trainings is 0.
         values = rng.normal(size=(8, 1)) + 0.3 * rng.normal(size=(8, 8))
-        whole, stratified = (over_seeds(values, np.mean, is_stratified=each) for each in (False, True))
+        whole, (low, high) = over_seeds(values, np.mean), stratified(values, np.mean)
         n_whole += whole.low <= 0 <= whole.high
-        n_stratified += stratified.low <= 0 <= stratified.high
+        n_stratified += low <= 0 <= high
     assert n_whole >= 32
     assert n_stratified <= 26
 
