@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from gymnasium import spaces
 
@@ -36,8 +36,11 @@ class MergedObservation:
     ) -> None:
         if isinstance(observations, str) or not isinstance(observations, Sequence) or not observations:
             raise InvalidValueError(f"observations is {observations!r}, but it must be a list of at least one")
-        self.observations = tuple(
-            member for observation in observations for member in members_of(check_observation(observation, targets))
+        checked = [check_observation(observation, targets) for observation in observations]
+        self.observations: tuple[Observation, ...] = tuple(
+            member
+            for each in checked
+            for member in (each.observations if isinstance(each, MergedObservation) else (each,))
         )
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
@@ -63,19 +66,12 @@ class MergedObservation:
         return {key: part for each in self.observations for key, part in observe_all(each, views).items()}
 
 
-def named_observations() -> Mapping[str, type[Observation]]:
-    """Return the observations that have a name."""
-    return {
-        "action_reward": ActionRewardObservation,
-        "cluster": ClusterObservation,
-        "slice": SliceObservation,
-        "slice_channels": SliceChannelsObservation,
-    }
-
-
-def members_of(observation: Observation) -> tuple[Observation, ...]:
-    """Return what an observation is merged of, itself where it is not."""
-    return observation.observations if isinstance(observation, MergedObservation) else (observation,)
+NAMED_OBSERVATIONS: dict[str, type[Observation]] = {
+    "action_reward": ActionRewardObservation,
+    "cluster": ClusterObservation,
+    "slice": SliceObservation,
+    "slice_channels": SliceChannelsObservation,
+}
 
 
 def check_observation(
@@ -90,16 +86,15 @@ def check_observation(
     Raises:
         InvalidValueError: if there is no observation of that name, or it is no observation.
     """
-    names = named_observations()
-    if isinstance(observation, str) and observation in names:
-        return ClusterObservation(targets=targets) if observation == "cluster" else names[observation]()
+    if isinstance(observation, str) and observation in NAMED_OBSERVATIONS:
+        return ClusterObservation(targets=targets) if observation == "cluster" else NAMED_OBSERVATIONS[observation]()
     if isinstance(observation, list | tuple):
         return MergedObservation(observation, targets=targets)
     has_methods = all(callable(getattr(observation, method, None)) for method in ("spaces", "observe"))
     if isinstance(observation, str | type) or not has_methods:
         raise InvalidValueError(
-            f"observation is {observation!r}, but it must be {listed(names)}, a list of them, or an object with the "
-            "methods of Observation"
+            f"observation is {observation!r}, but it must be {listed(NAMED_OBSERVATIONS)}, a list of them, or an "
+            "object with the methods of Observation"
         )
     return observation  # type: ignore[return-value]
 
@@ -108,8 +103,7 @@ def with_action_reward(
     observation: str | Observation | Sequence[str | Observation], targets: Sequence[int] = PUBLISHED_TARGETS
 ) -> Observation:
     """Return the observation, as `check_observation` does, with action and reward, which are part of every one."""
-    checked = check_observation(observation, targets)
-    members = members_of(checked)
-    if any(isinstance(member, ActionRewardObservation) for member in members):
-        return checked
-    return MergedObservation([*members, ActionRewardObservation()])
+    merged = MergedObservation([check_observation(observation, targets)])
+    if any(isinstance(member, ActionRewardObservation) for member in merged.observations):
+        return merged
+    return MergedObservation([*merged.observations, ActionRewardObservation()])

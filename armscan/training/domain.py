@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from gymnasium import spaces
 
-from armscan.envs.observation_registry import named_observations
+from armscan.envs.observation_registry import NAMED_OBSERVATIONS
 from armscan.errors import InvalidValueError
 from armscan.training.rollout import Env
 from armscan.volumes import LabelVolume
@@ -123,7 +123,7 @@ def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> A
 
 def _spelled_out(rules: Any) -> Any:
     """Return the configuration of an observation with images that are named in it written in full."""
-    named = named_observations().get(rules) if isinstance(rules, str) else None
+    named = NAMED_OBSERVATIONS.get(rules) if isinstance(rules, str) else None
     if named and "crop" in inspect.signature(named).parameters:
         return {"_target_": f"armscan.envs.{named.__name__}", "crop": None, "shape": None}
     if isinstance(rules, list):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import reprlib
 import tempfile
 from collections import Counter
 from collections.abc import Mapping
@@ -24,8 +23,6 @@ from armscan.volumes.header_checks import CHECKS
 from armscan.volumes.plane import ManipulatorAction
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel, ValidationError
-
     from armscan.volumes.manifest_schema import Manifest, VolumeEntry
 
 # The last one is of an older form: nothing but the entries of the volumes.
@@ -74,7 +71,10 @@ def read_manifest(path: Path) -> Manifest:
     Raises:
         ManifestError: naming the file, the entry, the key, the value received and what is allowed.
     """
-    return _checked(_load(path), path)
+    # Deferred: who steps through phantoms reads no manifest.
+    from armscan.volumes.manifest_schema import check_manifest
+
+    return check_manifest(_load(path), path)
 
 
 def volume_entries(manifest: Manifest, files: Mapping[str, Path], path: Path | None) -> dict[str, VolumeEntry]:
@@ -124,10 +124,12 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
 
 def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str, Path]) -> Path:
     """Write the keys of each volume's entry into the manifest; return its path."""
+    from armscan.volumes.manifest_schema import check_manifest
+
     found = find_manifest(folder)
     path = found or folder / NEW_MANIFEST
     document = _load(path) if found else {}
-    _checked(document, path)
+    check_manifest(document, path)
     try:
         if found and path.suffix != ".json":
             document = _round_trip().load(path.read_text(encoding="utf-8-sig")) or {}
@@ -234,44 +236,3 @@ def _round_trip() -> YAML:
     # YAML 1.1, which manifests are read as, wants a dot in a number with an exponent.
     editor.representer.add_representer(float, SafeRepresenter.represent_float)
     return editor
-
-
-def _checked(document: Document, path: Path) -> Manifest:
-    # Deferred: who steps through phantoms reads no manifest.
-    from pydantic import ValidationError
-
-    from armscan.volumes.manifest_schema import Manifest
-
-    try:
-        return Manifest.model_validate(document)
-    except ValidationError as error:
-        raise ManifestError(_in_one_line(error, path)) from error
-    # What is nested in itself, or too deeply to be looked at.
-    except RecursionError as error:
-        raise ManifestError(f"{path}: the manifest is nested too deeply") from error
-
-
-def _in_one_line(error: ValidationError, path: Path) -> str:
-    """Name the file, the entry, the key, the value received and what is allowed, of the first mistake."""
-    from armscan.volumes.manifest_schema import Manifest, Splits, VolumeEntry
-
-    mistake = error.errors(include_url=False)[0]
-    kind, received, place = mistake["type"], reprlib.repr(mistake["input"]), list(mistake["loc"])
-    model: type[BaseModel] = Manifest
-    part = ""
-    if place[:1] == ["volumes"] and len(place) > 1:
-        part, model, place = f"entry {place[1]!r}", VolumeEntry, place[2:]
-    elif place[:1] == ["splits"] and (len(place) > 1 or kind == "value_error"):
-        part, model, place = "splits", Splits, place[1:]
-    key = f"{path}: {part}: " if part else f"{path}: "
-    whole = f"{path}: {part} " if part else f"{path}: "
-    known = listed(model.model_fields)
-    if kind == "extra_forbidden":
-        return f"{whole}has the key {place[-1]!r}, but only {known} are known"
-    if kind == "value_error":
-        return f"{key if place else whole}{mistake['ctx']['error']}"
-    if not place:
-        return f"{whole}is {received}, but it must be an object with some of {known}"
-    field = model.model_fields.get(str(place[0]))
-    allowed = (field.description if field else None) or "a text"
-    return f"{key}{place[0]} is {received}, but it must be {allowed}"

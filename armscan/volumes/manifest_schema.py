@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
+import reprlib
+from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, ManifestError, listed
 from armscan.utils.validation import check_float, check_numbers
 from armscan.volumes.labelmap import LabelMap
 from armscan.volumes.orientation import Crop, check_axes, check_crop, check_orientation
 from armscan.volumes.plane import ManipulatorAction
-
-
-def _rotation(value: Any) -> tuple[float, ...]:
-    return check_numbers("rotation", value, 2, "(rz, rx) in degrees")
-
-
-def _translation(value: Any) -> tuple[float, ...]:
-    return check_numbers("translation", value, 2, "(tx, ty) in mm")
-
-
-def _score(value: Any) -> float:
-    return check_float("score", value, at_least=-1.0, at_most=0.0)
 
 
 def _subjects(value: Any) -> tuple[str, ...]:
@@ -31,6 +22,13 @@ def _subjects(value: Any) -> tuple[str, ...]:
     return tuple(value)
 
 
+Rotation = Annotated[
+    tuple[float, ...], BeforeValidator(partial(check_numbers, "rotation", length=2, meaning="(rz, rx) in degrees"))
+]
+Translation = Annotated[
+    tuple[float, ...], BeforeValidator(partial(check_numbers, "translation", length=2, meaning="(tx, ty) in mm"))
+]
+Score = Annotated[float, BeforeValidator(partial(check_float, "score", at_least=-1.0, at_most=0.0))]
 Axes = Annotated[str, BeforeValidator(check_axes)]
 Orientation = Annotated[str | None, BeforeValidator(check_orientation)]
 Labels = Annotated[LabelMap, BeforeValidator(LabelMap.from_mapping)]
@@ -47,9 +45,9 @@ class _Strict(BaseModel):
 class VolumeEntry(_Strict):
     """What a manifest says about one volume; each description is what the key's value must be."""
 
-    rotation: Annotated[tuple[float, ...], BeforeValidator(_rotation)] | None = None
-    translation: Annotated[tuple[float, ...], BeforeValidator(_translation)] | None = None
-    score: Annotated[float, BeforeValidator(_score)] | None = None
+    rotation: Rotation | None = None
+    translation: Translation | None = None
+    score: Score | None = None
     subject: str | None = Field(default=None, min_length=1, description="a text that is not empty (quote numbers)")
     exclude: bool | Annotated[str, Field(min_length=1)] = Field(default=False, description="true, false or the reason")
     labels: Labels | None = None
@@ -105,3 +103,38 @@ class Manifest(_Strict):
     def setting(self, entry: VolumeEntry, key: str) -> Any:
         """Return what holds for a volume: its own value where its entry has the key, else the one for all."""
         return getattr(entry if key in entry.model_fields_set else self, key)
+
+
+def check_manifest(document: dict[str, Any], path: Path) -> Manifest:
+    """Return what a manifest says; raise `ManifestError` if that is nothing that it may say."""
+    try:
+        return Manifest.model_validate(document)
+    except ValidationError as error:
+        raise ManifestError(_in_one_line(error, path)) from error
+    # What is nested in itself, or too deeply to be looked at.
+    except RecursionError as error:
+        raise ManifestError(f"{path}: the manifest is nested too deeply") from error
+
+
+def _in_one_line(error: ValidationError, path: Path) -> str:
+    """Name the file, the entry, the key, the value received and what is allowed, of the first mistake."""
+    mistake = error.errors(include_url=False)[0]
+    kind, received, place = mistake["type"], reprlib.repr(mistake["input"]), list(mistake["loc"])
+    model: type[BaseModel] = Manifest
+    part = ""
+    if place[:1] == ["volumes"] and len(place) > 1:
+        part, model, place = f"entry {place[1]!r}", VolumeEntry, place[2:]
+    elif place[:1] == ["splits"] and (len(place) > 1 or kind == "value_error"):
+        part, model, place = "splits", Splits, place[1:]
+    key = f"{path}: {part}: " if part else f"{path}: "
+    whole = f"{path}: {part} " if part else f"{path}: "
+    known = listed(model.model_fields)
+    if kind == "extra_forbidden":
+        return f"{whole}has the key {place[-1]!r}, but only {known} are known"
+    if kind == "value_error":
+        return f"{key if place else whole}{mistake['ctx']['error']}"
+    if not place:
+        return f"{whole}is {received}, but it must be an object with some of {known}"
+    field = model.model_fields.get(str(place[0]))
+    allowed = (field.description if field else None) or "a text"
+    return f"{key}{place[0]} is {received}, but it must be {allowed}"
