@@ -26,9 +26,7 @@ from armscan.config.defaults import MULTIRUN, PLAN, RESUME
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
 from armscan.errors import is_interruption
-from armscan.experiment.cleanup import remove_if_untracked
-from armscan.experiment.invocation import Invocation
-from armscan.experiment.job import INTERRUPTED
+from armscan.experiment.job import INTERRUPTED, Invocation, remove_if_untracked
 from armscan.launch.job_process import start_job
 from armscan.launch.multirun import Multirun, end_multirun
 from armscan.utils.log import silence_library_warnings

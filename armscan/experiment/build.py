@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
+import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
@@ -13,23 +14,14 @@ from armscan.agents import Agent, AgentSetup, Learner
 from armscan.config.defaults import CLUSTER
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError, listed
-from armscan.training import Budget, Split
+from armscan.training import Budget, CheckpointProvenance, Fingerprints, Split, TrainingDomain
 from armscan.training.domain import smallest_slice, with_crops
+from armscan.training.rollout import Env
+from armscan.utils.log import silence_library_warnings
 from armscan.utils.validation import check_int, check_seed
 from armscan.volumes import LabelVolume
 
-SECTIONS = (
-    "data",
-    "obs",
-    "reward",
-    "agent",
-    "network",
-    "tracking",
-    "env",
-    "training",
-    "evaluation",
-    "compute",
-)
+SECTIONS = ("data", "obs", "reward", "agent", "network", "tracking", "env", "training", "evaluation", "compute")
 SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
 EVALUATION_KEYS = ("episodes",)
 TRACKING_KEYS = ("uri", "experiment", "artifacts", "wait_s", "system_metrics_s", "policy")
@@ -41,11 +33,11 @@ class Experiment:
 
     Args:
         split: the volumes.
-        maker: of environments, its reward fitted to the training volumes.
-        agent: which may be a learner.
-        budget: of the training.
-        n_episodes: of each final evaluation.
-        seed: of everything that is drawn.
+        maker: makes environments, with the reward fitted to the training volumes.
+        agent: the agent, which may be a learner.
+        budget: the training's budget.
+        n_episodes: number of episodes of each final evaluation.
+        seed: seed of everything that is drawn.
         smallest_slice_px: shape (across, depth) that the slices of all volumes have at least; images are cropped to it
             where nothing else is said, whichever the split.
     """
@@ -58,13 +50,65 @@ class Experiment:
     seed: int
     smallest_slice_px: tuple[int, int]
 
+    @cached_property
+    def training_env(self) -> Env:
+        """Of the training volumes, for the final evaluation."""
+        return self.maker.one(self.split.training)
+
+    @cached_property
+    def validation_env(self) -> Env:
+        """Of the validation volumes, for the validation after each epoch."""
+        return self.maker.one(self.split.validation)
+
+    @cached_property
+    def test_env(self) -> Env:
+        """Of the test volumes, for the final evaluation."""
+        return self.maker.one(self.split.test)
+
+    @cached_property
+    def video_env(self) -> Env:
+        """Of the test volumes, for the video of an episode."""
+        return self.maker.one(self.split.test, render_mode="rgb_array")
+
+    @cached_property
+    def fingerprints(self) -> Fingerprints:
+        """Of the volumes; once, because they take a second for a hundred of them."""
+        return self.split.fingerprints()
+
+    def provenance(self, run_id: str) -> CheckpointProvenance:
+        """Return the provenance written into the checkpoints of a run."""
+        return CheckpointProvenance(run_id=run_id, volumes=self.fingerprints)
+
+
+def set_up(config: DictConfig) -> Experiment:
+    """Build an experiment with the environments of its evaluations, and check them, before tracking starts.
+
+    Args:
+        config: the composed configuration.
+
+    Raises:
+        InvalidValueError: if something in it is not allowed, or the agent cannot act in one of the environments.
+    """
+    silence_library_warnings()
+    torch.set_num_threads(1)
+    experiment = build_experiment(config)
+    envs = (experiment.training_env, experiment.validation_env, experiment.test_env, experiment.video_env)
+    trained = TrainingDomain.of(envs[0])
+    for env in envs[1:]:
+        trained.check_observed(TrainingDomain.of(env))
+    if not isinstance(experiment.agent, Learner):
+        # How many planes there are to go through depends on the sizes of the volumes.
+        for bounds in {bounds for env in envs for bounds in env.get_wrapper_attr("rules").bounds.values()}:
+            experiment.agent.begin(seed=0, bounds=bounds)
+    return experiment
+
 
 def build_experiment(config: DictConfig, split: Split | None = None) -> Experiment:
     """Build an experiment from its composed configuration.
 
     Args:
-        config: all of it.
-        split: its volumes, where they have been read already.
+        config: the composed configuration.
+        split: its volumes, if they have been read already. Default: None, they are read.
 
     Raises:
         InvalidValueError: if something in it is not allowed.

@@ -1,9 +1,14 @@
-"""One job of a multirun, as its own process sees it, and its outcome."""
+"""How a run was asked for: its folder, its words, and which job of a multirun it is.
+
+It imports nothing that takes time, because a multirun's launcher needs it for every job.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
+import shutil
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Self
@@ -11,7 +16,9 @@ from typing import Self
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
-from armscan.utils.files import atomic_write
+from armscan.config.command_hints import run_command
+from armscan.errors import FolderInUseError, FolderTakenError
+from armscan.utils.files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID, atomic_write
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
@@ -52,12 +59,12 @@ class Job:
     """One job of a multirun, as its own process sees it.
 
     Args:
-        number: from 0.
+        number: its number, from 0.
         overrides: all of its overrides, as one would write them to run it alone.
-        varied: those among them that tell it from the other jobs.
-        parent_run_id: the run that its run is a child of.
-        folder: of the multirun.
-        is_repeated: whether it need not run where it has finished before.
+        varied: overrides that differ from those of the other jobs.
+        parent_run_id: MLflow run ID of the run that its run is a child of.
+        folder: the multirun's folder.
+        is_repeated: whether it need not run if it has finished before. Default: False.
     """
 
     number: int
@@ -79,14 +86,8 @@ class Job:
         # Hydra hands a truth value on as it writes it, False for false.
         common = {override.lower() for override in word["overrides"]}
         varied = [override for override in overrides if override.lower() not in common]
-        return cls(
-            hydra_config.job.num,
-            shlex.join(overrides),
-            " ".join(varied),
-            word["run_id"],
-            folder,
-            is_repeated=word["is_repeated"],
-        )
+        words = shlex.join(overrides), " ".join(varied)
+        return cls(hydra_config.job.num, *words, word["run_id"], folder, is_repeated=word["is_repeated"])
 
     @property
     def label(self) -> str:
@@ -98,3 +99,62 @@ class Job:
         outcome = JobOutcome(self.overrides, self.varied, failure, metrics or {})
         file = self.folder / OUTCOME_FOLDER / f"{self.number}.json"
         atomic_write(file, lambda opened: opened.write(json.dumps(asdict(outcome)).encode()))
+
+
+@dataclass(frozen=True)
+class Invocation:
+    """How a run was asked for.
+
+    Args:
+        folder: where it leaves its files.
+        overrides: overrides on the command line.
+        command: the command line; of a job, that which repeats it alone.
+        choices: what was chosen of each configuration group.
+        job: which job of a multirun it is; None for a single run.
+    """
+
+    folder: Path
+    overrides: list[str]
+    command: str
+    choices: dict[str, str]
+    job: Job | None
+
+    @classmethod
+    def current(cls) -> Self:
+        """Return how Hydra is running this process."""
+        hydra_config = HydraConfig.get()
+        return cls(
+            folder=Path(hydra_config.runtime.output_dir),
+            overrides=list(hydra_config.overrides.task),
+            command=run_command(hydra_config.overrides.task),
+            choices={str(group): str(choice) for group, choice in hydra_config.runtime.choices.items()},
+            job=Job.current(),
+        )
+
+
+def remove_if_untracked(folder: Path, error: BaseException) -> None:
+    """Remove what a run has left that failed before it was tracked; from then on it can be resumed."""
+    is_tracked = (folder / CONFIG_FILE).exists() and not isinstance(error, FolderTakenError)
+    # Where somebody else is at work in the folder, everything is theirs.
+    if not is_tracked and not isinstance(error, FolderInUseError):
+        remove_run_folder(folder)
+
+
+def remove_run_folder(folder: Path) -> None:
+    """Remove what a run that came to nothing has left in its folder, and the folders that are empty then.
+
+    Nothing else is touched: the folder may be one that somebody named, with other files in it.
+    """
+    for ours in (folder / ".hydra", folder / OUTCOME_FOLDER):
+        shutil.rmtree(ours, ignore_errors=True)
+    outboxes = [file for suffix in OUTBOX_SUFFIXES for file in (folder / OUTBOX_FOLDER).glob(RUN_ID + suffix)]
+    for ours in (folder / PARENT_FILE, folder / "multirun.yaml", folder / LOCK_FILE, *outboxes):
+        ours.unlink(missing_ok=True)
+    # Somebody else's is not empty.
+    with contextlib.suppress(OSError):
+        (folder / OUTBOX_FOLDER).rmdir()
+    here = Path.cwd()
+    for emptied in (folder, folder.parent, folder.parent.parent):
+        if here.is_relative_to(emptied.resolve()) or not emptied.is_dir() or any(emptied.iterdir()):
+            break
+        emptied.rmdir()

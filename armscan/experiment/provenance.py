@@ -14,9 +14,8 @@ from omegaconf import DictConfig
 
 import armscan
 from armscan.config.defaults import to_plain
-from armscan.experiment.invocation import Invocation
-from armscan.experiment.job import JOB_TAG
-from armscan.experiment.setup import RunSetup
+from armscan.experiment.build import Experiment
+from armscan.experiment.job import JOB_TAG, Invocation
 from armscan.tracking import (
     DOMAIN_TAG,
     VERSION_TAG,
@@ -46,7 +45,7 @@ N_PRINT_CHARS = 16
 
 
 def start_tracking(
-    config: DictConfig, invocation: Invocation, setup: RunSetup, *, retry_s: float | None = None
+    config: DictConfig, invocation: Invocation, setup: Experiment, *, retry_s: float | None = None
 ) -> TrackedRun:
     """Write the provenance files, open the tracking store and start a run in it; see `open_store`.
 
@@ -76,7 +75,7 @@ def start_tracking(
             **{f"choice.{group}": choices[group] for group in CHOICES_IN_TAGS},
             **volume_tags(setup.fingerprints),
             # Where it is applied to other volumes, later, the agent must see what it has learned to see.
-            DOMAIN_TAG: TrainingDomain.of(setup.training_env, setup.experiment.smallest_slice_px).to_json(),
+            DOMAIN_TAG: TrainingDomain.of(setup.training_env, setup.smallest_slice_px).to_json(),
             **place_tags(invocation.folder),
             "working_folder": str(Path.cwd()),
             **sha256_tags(files),
@@ -89,7 +88,7 @@ def start_tracking(
     return tracked
 
 
-def provenance_files(config: dict[str, Any], setup: RunSetup) -> dict[str, bytes]:
+def provenance_files(config: dict[str, Any], setup: Experiment) -> dict[str, bytes]:
     """Return the files that say what a run was started with, by their names: configuration, volumes, code."""
     diff = source().diff
     return {

@@ -20,10 +20,10 @@ from armscan.agents import Learner
 from armscan.config.defaults import RESUME, TRACKING_URI, default_tracking
 from armscan.config.legacy import migrate
 from armscan.errors import InvalidValueError, ResumeError
+from armscan.experiment.build import set_up
 from armscan.experiment.job import GRID_TAG
 from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
-from armscan.experiment.setup import RunSetup
 from armscan.tracking import TrackedRun, TrackingStore, check_version, find_run, jobs_of, open_existing_store, sync
 from armscan.training import Fingerprints, check_unchanged, resume_from_checkpoint
 from armscan.utils.files import (
@@ -84,9 +84,9 @@ def resume_run(client: TrackingStore, run_id: str, *, job_label: str | None = No
         remove_unfinished(folder)
         _enter_working_folder(run)
         print(f"resuming {run.info.run_name}, run {run_id}", flush=True)
-        setup = RunSetup.build(OmegaConf.create(migrate(config)))
+        setup = set_up(OmegaConf.create(migrate(config)))
         _check_volumes(run, folder, setup.fingerprints)
-        agent = setup.experiment.agent
+        agent = setup.agent
         earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id)) if isinstance(agent, Learner) else []
         tags = volume_tags(setup.fingerprints) | place_tags(folder)
         tracked = TrackedRun.reopen(client, run_id, folder=folder, config=config, tags=tags)

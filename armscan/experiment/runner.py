@@ -15,11 +15,10 @@ from omegaconf import DictConfig
 
 from armscan.agents import Learner
 from armscan.config.command_hints import evaluate_command, resume_command
-from armscan.experiment.build import check_keys
+from armscan.experiment.build import Experiment, check_keys, set_up
 from armscan.experiment.console import print_results, print_where_to_look
-from armscan.experiment.invocation import Invocation
+from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
-from armscan.experiment.setup import RunSetup
 from armscan.policies.build import save_policy
 from armscan.tracking import TrackedRun
 from armscan.training import (
@@ -55,13 +54,13 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     job = invocation.job
     with folder_lock(invocation.folder):
         check_free(invocation.folder)
-        setup = RunSetup.build(config)
+        setup = set_up(config)
         tracked = start_tracking(config, invocation, setup)
         return run_tracked(setup, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
 
 
 def run_tracked(
-    setup: RunSetup,
+    setup: Experiment,
     tracked: TrackedRun,
     folder: Path,
     tracking_uri: str,
@@ -86,18 +85,16 @@ def run_tracked(
     tell(f"run {tracked.run_id}: {tracked.name}")
     with _resume_hint_on_error(tracked.run_id, tracking_uri, folder, is_told=job_label is None), tracked:
         result = None
-        if isinstance(setup.experiment.agent, Learner):
-            _tell_of_longer_epochs(setup.experiment.agent, setup.experiment.budget, tell)
+        if isinstance(setup.agent, Learner):
+            _tell_of_longer_epochs(setup.agent, setup.budget, tell)
             callbacks = [progress_reporter(job_label), tracked]
             result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, earlier=earlier)
-        tell(f"playing {setup.experiment.n_episodes} episodes on the training volumes, and as many on the test volumes")
+        tell(f"playing {setup.n_episodes} episodes on the training volumes, and as many on the test volumes")
         evaluations = final_evaluations(setup)
-        record_episode(
-            setup.experiment.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.experiment.seed
-        )
+        record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)
         tracked.keep_results(result, evaluations, folder)
-        if isinstance(setup.experiment.agent, Learner):
-            save_policy(setup.experiment.agent, setup.test_env, tracked, folder, tell)
+        if isinstance(setup.agent, Learner):
+            save_policy(setup.agent, setup.test_env, tracked, folder, tell)
     if job_label is None:
         _show(result, evaluations, folder, tracking_uri)
         print(f"evaluate  {evaluate_command(tracked.run_id, tracking_uri)}")
@@ -105,12 +102,12 @@ def run_tracked(
 
 
 def train_agent(
-    setup: RunSetup, folder: Path, callbacks: Sequence[Callback], *, run_id: str, earlier: Sequence[EpochReport] = ()
+    setup: Experiment, folder: Path, callbacks: Sequence[Callback], *, run_id: str, earlier: Sequence[EpochReport] = ()
 ) -> TrainingResult:
     """Train the agent of a setup, which must be a `Learner`; see `train`."""
-    agent, budget = setup.experiment.agent, setup.experiment.budget
+    agent, budget = setup.agent, setup.budget
     assert isinstance(agent, Learner)
-    seed = VALIDATION_SEED + setup.experiment.seed
+    seed = VALIDATION_SEED + setup.seed
     validate = partial(evaluate, agent, setup.validation_env, n_episodes=budget.validation_episodes, seed=seed)
     return train(agent, budget, validate, folder, callbacks, provenance=setup.provenance(run_id), earlier=earlier)
 
@@ -124,9 +121,9 @@ def _tell_of_longer_epochs(learner: Learner, budget: Budget, tell: Callable[[str
         )
 
 
-def final_evaluations(setup: RunSetup) -> dict[str, Evaluation]:
+def final_evaluations(setup: Experiment) -> dict[str, Evaluation]:
     """Return the final evaluations of a setup's agent, on the training and on the test volumes, by their names."""
-    agent, n_episodes, seed = setup.experiment.agent, setup.experiment.n_episodes, setup.experiment.seed
+    agent, n_episodes, seed = setup.agent, setup.n_episodes, setup.seed
     return {
         TRAINING: evaluate(agent, setup.training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),
         TEST: evaluate(agent, setup.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED + seed),

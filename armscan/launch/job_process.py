@@ -13,9 +13,7 @@ from functools import partial
 from omegaconf import DictConfig
 
 from armscan.config.error_messages import one_line_message
-from armscan.experiment.cleanup import remove_if_untracked
-from armscan.experiment.invocation import Invocation
-from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, Job
+from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, Invocation, Job, remove_if_untracked
 from armscan.utils.processes import on_parent_exit
 
 # What a job's process runs; it may be interrupted while it is still importing.

@@ -16,8 +16,16 @@ from armscan.config.credentials import check_address
 from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.errors import InvalidValueError, TrackingError
-from armscan.experiment.cleanup import remove_run_folder
-from armscan.experiment.job import GRID_TAG, INTERRUPTED, JOB_TAG, NO_OUTCOME, OUTCOME_FOLDER, PARENT_FILE, JobOutcome
+from armscan.experiment.job import (
+    GRID_TAG,
+    INTERRUPTED,
+    JOB_TAG,
+    NO_OUTCOME,
+    OUTCOME_FOLDER,
+    PARENT_FILE,
+    JobOutcome,
+    remove_run_folder,
+)
 from armscan.launch.launchers import LAUNCHER, check_launcher
 from armscan.utils.files import LAST_CHECKPOINT
 

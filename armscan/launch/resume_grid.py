@@ -11,13 +11,11 @@ from mlflow.entities import Run
 from omegaconf import DictConfig
 
 from armscan.config.defaults import to_plain
-from armscan.experiment.build import check_keys
-from armscan.experiment.invocation import Invocation
-from armscan.experiment.job import JOB_TAG, Job
+from armscan.experiment.build import Experiment, check_keys, set_up
+from armscan.experiment.job import JOB_TAG, Invocation, Job
 from armscan.experiment.provenance import provenance_files, sha256_tags
 from armscan.experiment.resume import resume_run
 from armscan.experiment.runner import run_experiment
-from armscan.experiment.setup import RunSetup
 from armscan.tracking import TrackingStore, open_store
 from armscan.training import TEST, TRAINING
 from armscan.utils.files import LAST_CHECKPOINT
@@ -34,7 +32,7 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
         job: the job.
     """
     check_keys(config)
-    setup, tracking = RunSetup.build(config), to_plain(config.tracking)
+    setup, tracking = set_up(config), to_plain(config.tracking)
     client, experiment_id = open_store(**tracking)
     earlier = _earlier_runs(client, experiment_id, setup, config)
     for run in earlier:
@@ -49,7 +47,7 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     return run_experiment(config, invocation)
 
 
-def _earlier_runs(client: TrackingStore, experiment_id: str, setup: RunSetup, config: DictConfig) -> list[Run]:
+def _earlier_runs(client: TrackingStore, experiment_id: str, setup: Experiment, config: DictConfig) -> list[Run]:
     """Return the runs of this configuration on these volumes, the latest first."""
     sums = sha256_tags(provenance_files(to_plain(config), setup))
     wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())

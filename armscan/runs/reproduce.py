@@ -14,15 +14,13 @@ from omegaconf import DictConfig, OmegaConf
 from armscan.config.command_hints import reproduce_command
 from armscan.errors import InvalidValueError, TrackingError
 from armscan.evaluation.agent_source import from_its_folder
-from armscan.experiment.cleanup import remove_if_untracked
-from armscan.experiment.invocation import Invocation
+from armscan.experiment.build import Experiment, set_up
+from armscan.experiment.job import Invocation, remove_if_untracked
 from armscan.experiment.provenance import CHOICES_IN_TAGS, start_tracking
 from armscan.experiment.runner import run_tracked
-from armscan.experiment.setup import RunSetup
 from armscan.runs.compare import Comparison, compare_runs
 from armscan.tracking import EVALUATED_TAG, FoundRun, environment_tags, load_run, source_tags
-from armscan.tracking.environment import CONSTRAINTS_SUM, TOLD, environment
-from armscan.tracking.git import COMMIT, DIFF_SUM, DIRTY
+from armscan.tracking.environment import COMMIT, CONSTRAINTS_SUM, DIFF_SUM, DIRTY, TOLD, environment
 from armscan.training import check_unchanged
 from armscan.utils.files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
 
@@ -46,7 +44,7 @@ class Original:
 
     run: FoundRun
     config: DictConfig = field(repr=False)
-    setup: RunSetup = field(repr=False)
+    setup: Experiment = field(repr=False)
     environment: Mapping[str, Any] | None = field(repr=False)
 
 
@@ -68,7 +66,7 @@ def load_original(tracking: str, run_id: str) -> Original:
         text = run.text(ENVIRONMENT_FILE, Path(folder))
     config.tracking.uri = tracking
     config.tracking.experiment = run.client.get_experiment(run.experiment_id).name
-    setup = RunSetup.build(config)
+    setup = set_up(config)
     if volumes is not None:
         check_unchanged(volumes, setup.fingerprints, f"run {run.run_id} was started with")
     return Original(run, config, setup, None if text is None else _environment(text, run))

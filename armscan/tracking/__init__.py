@@ -1,8 +1,7 @@
 """MLflow: the store, its runs, and the pictures that go there."""
 
 from armscan.tracking.client import TrackingStore
-from armscan.tracking.environment import environment_file, environment_tags
-from armscan.tracking.git import source, source_tags
+from armscan.tracking.environment import environment_file, environment_tags, source, source_tags
 from armscan.tracking.lookup import (
     DOMAIN_TAG,
     EVALUATED_TAG,

@@ -1,23 +1,34 @@
-"""What a run was computed with: Python, the machine, and the version of every package."""
+"""What a run was computed with: the state of the code, Python, the machine, and the version of every package."""
 
 from __future__ import annotations
 
 import functools
 import json
+import os
 import platform
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from packaging.utils import canonicalize_name
 
-from armscan.tracking.git import UNKNOWN
 from armscan.utils.files import sha256
 
 # Those that a run's figures may depend on; of the others, the file has the versions.
 TOLD = ("torch", "tianshou", "gymnasium", "numpy", "numba", "scipy", "simpleitk", "optuna", "mlflow", "hydra-core")
 PYTHON, CONSTRAINTS_SUM = "version.python", "constraints.sha256"
+UNKNOWN = "unknown"
+# Files that nobody has added to git are kept up to this size each: code, and not a volume beside it.
+MAX_UNTRACKED_BYTES = 2**20
+COMMIT, DIRTY, DIFF_SUM = "git.commit", "git.dirty", "git.diff.sha256"
+# Whatever a person has configured for their own eyes would be in the way of `git apply`.
+PLAIN = ("--no-ext-diff", "--no-textconv", "--no-color", "--binary", "--src-prefix=a/", "--dst-prefix=b/")
+TIMEOUT_S = 30.0
 
 
 @functools.cache
@@ -48,3 +59,83 @@ def environment_tags() -> dict[str, str]:
         # Beside the code of a clone; a wheel has none.
         CONSTRAINTS_SUM: sha256(constraints.read_bytes()) if constraints.is_file() else UNKNOWN,
     }
+
+
+@dataclass(frozen=True)
+class Source:
+    """The code as it was loaded.
+
+    Args:
+        commit: of git, `unknown` where the code is under no git.
+        diff: what was changed since, as `git apply` takes it, empty where nothing was; None where nobody knows.
+    """
+
+    commit: str
+    diff: bytes | None
+
+    @property
+    def tags(self) -> dict[str, str]:
+        """What is tracked of it."""
+        known = {} if self.commit == UNKNOWN else {"mlflow.source.git.commit": self.commit}
+        dirty = UNKNOWN if self.diff is None else str(bool(self.diff)).lower()
+        summed = {DIFF_SUM: sha256(self.diff)} if self.diff else {}
+        return {COMMIT: self.commit, **known, DIRTY: dirty, **summed}
+
+
+@functools.cache
+def source() -> Source:
+    """Return the state of the code, once for a process, whose code stays what it was when it was loaded."""
+    return source_in(Path(__file__).parent)
+
+
+def source_tags() -> Mapping[str, str]:
+    """Return the git commit of the code and whether its tree was dirty; 'unknown' where the code is under no git."""
+    return source().tags
+
+
+def source_in(folder: Path) -> Source:
+    """Return the state of the working tree that a folder with code is in."""
+    try:
+        # Packages that are installed somewhere in the tree of another project are none of that project's code.
+        if not _git(folder, "ls-files", "--", "."):
+            return Source(UNKNOWN, None)
+        commit = _git(folder, "rev-parse", "HEAD").decode().strip()
+    except (OSError, subprocess.SubprocessError):
+        return Source(UNKNOWN, None)
+    try:
+        return Source(commit, _diff(Path(os.fsdecode(_git(folder, "rev-parse", "--show-toplevel")).rstrip("\n"))))
+    except (OSError, subprocess.SubprocessError):
+        return Source(commit, None)
+
+
+def _diff(tree: Path) -> bytes:
+    """Return all that differs from the commit in a working tree, new files included; change nothing."""
+    new = [name for name in _git(tree, "ls-files", "--others", "--exclude-standard", "-z").split(b"\0") if name]
+    kept = [name for name in new if (tree / os.fsdecode(name)).lstat().st_size <= MAX_UNTRACKED_BYTES]
+    told = "".join(f"# not kept, for its size: {os.fsdecode(name)!r}\n" for name in new if name not in kept).encode()
+    with tempfile.TemporaryDirectory() as beside:
+        # New files are in a diff where they are about to be added: in an index of its own, a copy.
+        index = Path(beside, "index")
+        shutil.copyfile(tree / os.fsdecode(_git(tree, "rev-parse", "--git-path", "index")).rstrip("\n"), index)
+        if kept:
+            words = ("add", "--intent-to-add", "--force", "--pathspec-from-file=-", "--pathspec-file-nul")
+            _git(tree, "--literal-pathspecs", *words, index=index, given=b"\0".join(kept))
+        return told + _git(tree, "diff", *PLAIN, "HEAD", index=index)
+
+
+def _git(folder: Path, *arguments: str, index: Path | None = None, given: bytes = b"") -> bytes:
+    """Return what git answers, given something to read.
+
+    Raises:
+        OSError: if there is no git.
+        SubprocessError: if it fails.
+    """
+    # A hook of another repository would have its say here.
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    if index is not None:
+        variables["GIT_INDEX_FILE"] = str(index)
+    words = ["git", *arguments]
+    answer = subprocess.run(
+        words, cwd=folder, input=given, capture_output=True, timeout=TIMEOUT_S, check=True, env=variables
+    )
+    return answer.stdout

@@ -15,8 +15,7 @@ from armscan.config.command_hints import sync_command
 from armscan.errors import is_interruption
 from armscan.tracking import pending
 from armscan.tracking.client import TrackingStore
-from armscan.tracking.environment import environment_tags
-from armscan.tracking.git import DIFF_SUM, source, source_tags
+from armscan.tracking.environment import DIFF_SUM, environment_tags, source, source_tags
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
 from armscan.tracking.plots import draw_learning_curve
 from armscan.tracking.sanitize import params_of, tags_of

@@ -29,8 +29,8 @@ from typing import Any, NamedTuple
 import psutil
 
 from armscan.config.defaults import to_plain
+from armscan.experiment.build import set_up
 from armscan.experiment.runner import train_agent
-from armscan.experiment.setup import RunSetup
 from armscan.sweeps.tasks.attempt import composed
 from armscan.tracking import TrackedRun, open_store
 from armscan.training import EpochReport
@@ -109,7 +109,7 @@ class ThreadClock(threading.Thread):
 
 def trained(config: Any, tracking: dict[str, Any] | None, before: Callable[[], None] = lambda: None) -> Cost:
     """Return what one training took; `before` is called when the run has begun."""
-    setup = RunSetup.build(config)
+    setup = set_up(config)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         callbacks, clock = [], ThreadClock()
         if tracking is not None:

@@ -7,8 +7,7 @@ import pytest
 from armscan.config.compose import compose
 from armscan.envs import SliceObservation
 from armscan.errors import InvalidValueError
-from armscan.experiment.build import build_experiment
-from armscan.experiment.setup import RunSetup
+from armscan.experiment.build import build_experiment, set_up
 from armscan.training import Split
 
 
@@ -57,7 +56,7 @@ def test_stage_refuses_volumes_that_an_observation_is_of_another_shape_on(phanto
     own = "env.observation={_target_: tests.experiment.test_build.AsLargeAsTheSlice}"
     config = config_of_sizes(phantom, monkeypatch, own)
     with pytest.raises(InvalidValueError, match=r"part 'slice' has the shape \(360, 80\), but .* \(336, 80\)"):
-        RunSetup.build(config)
+        set_up(config)
 
 
 class Unfinished:

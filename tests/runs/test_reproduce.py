@@ -13,8 +13,7 @@ import pytest
 import armscan
 from armscan.cli.main import main
 from armscan.tracking import EVALUATED_TAG
-from armscan.tracking.environment import environment
-from armscan.tracking.git import source
+from armscan.tracking.environment import environment, source
 from tests.test_run import SMALL, armscan_run, runs_in
 
 # They repeat a training.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from armscan.tracking.git import MAX_UNTRACKED_BYTES, source_in
+from armscan.tracking.environment import MAX_UNTRACKED_BYTES, source_in
 from armscan.utils.files import sha256
 
 NAMES = ["code.py", "blob.bin", "gone.py"]

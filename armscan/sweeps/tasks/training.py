@@ -14,12 +14,10 @@ from omegaconf import DictConfig
 from armscan.agents import Learner
 from armscan.config.defaults import to_plain
 from armscan.errors import CheckpointError, InvalidValueError
-from armscan.experiment.build import build_experiment, check_keys
-from armscan.experiment.invocation import Invocation
-from armscan.experiment.job import Job
+from armscan.experiment.build import Experiment, build_experiment, check_keys, set_up
+from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
 from armscan.experiment.runner import VIDEO_SEED, final_evaluations, train_agent
-from armscan.experiment.setup import RunSetup
 from armscan.policies.build import save_policy
 from armscan.stats.aggregation import interquartile_mean
 from armscan.sweeps.scheduling.state import ENV_STEPS
@@ -41,7 +39,7 @@ from armscan.utils.retry import RETRY_S
 
 # Of each training, beside the metrics of its best validation.
 TRAINING_METRICS = (ENV_STEPS, "training_s", "solved")
-Conclude = Callable[[RunSetup, TrackedRun, Path], dict[str, float]]
+Conclude = Callable[[Experiment, TrackedRun, Path], dict[str, float]]
 
 
 @dataclass
@@ -120,11 +118,11 @@ class TrainingTask:
         return trained(attempt, seed, _concluded)
 
 
-def _concluded(setup: RunSetup, tracked: TrackedRun, folder: Path) -> dict[str, float]:
+def _concluded(setup: Experiment, tracked: TrackedRun, folder: Path) -> dict[str, float]:
     evaluations = final_evaluations(setup)
     contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
     (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
-    agent, seed = setup.experiment.agent, VIDEO_SEED + setup.experiment.seed
+    agent, seed = setup.agent, VIDEO_SEED + setup.seed
     record_episode(agent, setup.video_env, folder / VIDEO_FILE, seed=seed)
     assert isinstance(agent, Learner)
     save_policy(agent, setup.test_env, tracked, folder, log)
@@ -149,10 +147,10 @@ def trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> di
         optuna.TrialPruned: if the trial is not worth going on with.
     """
     config, choices = attempt.config(seed)
-    setup = RunSetup.build(config)
+    setup = set_up(config)
     folder = attempt.folder / f"seed_{seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    budget = setup.experiment.budget
+    budget = setup.budget
     reporter = Reporter(attempt, seed, grid=budget.eval_every_env_steps, total=budget.env_steps)
     pruned, concluded = None, {}
     with folder_lock(folder):
@@ -180,11 +178,11 @@ def trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> di
 
 
 def _begun(
-    attempt: Attempt, seed: int, setup: RunSetup, config: DictConfig, choices: dict[str, str], folder: Path
-) -> tuple[RunSetup, TrackedRun, list[EpochReport]]:
+    attempt: Attempt, seed: int, setup: Experiment, config: DictConfig, choices: dict[str, str], folder: Path
+) -> tuple[Experiment, TrackedRun, list[EpochReport]]:
     """Open the tracked run of a training, and takes the agent to where an attempt before has left it."""
     _take_over(attempt, folder)
-    begun, agent = folder / RUN_FILE, setup.experiment.agent
+    begun, agent = folder / RUN_FILE, setup.agent
     assert isinstance(agent, Learner)
     if begun.exists() and (folder / LAST_CHECKPOINT).exists():
         run_id = json.loads(begun.read_text())["run_id"]
@@ -192,7 +190,7 @@ def _begun(
             earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id))
         except CheckpointError:
             # Whatever has happened to it, the trial can be begun again, with an agent that has learned nothing.
-            setup = RunSetup.build(config)
+            setup = set_up(config)
         else:
             client, _ = open_store(**to_plain(config.tracking), retry_s=RETRY_S)
             tags = volume_tags(setup.fingerprints) | place_tags(folder)
