@@ -122,9 +122,5 @@ def run_name(config: dict[str, Any], choices: dict[str, str]) -> str:
     """Return what the UI calls a run: what most runs differ by."""
     projection = config["projection"]
     parts = [choices["agent"], choices["obs"], projection if isinstance(projection, str) else "+".join(projection)]
-    parts += [
-        f"{wrapper}{config[wrapper]}"
-        for wrapper, without in (("stack", 1), ("memory", 0))
-        if config[wrapper] != without
-    ]
+    parts += [f"{name}{config[name]}" for name, without in (("stack", 1), ("memory", 0)) if config[name] != without]
     return "-".join([*parts, choices["data"], f"seed{config['seed']}"])

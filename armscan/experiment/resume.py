@@ -24,7 +24,7 @@ from armscan.experiment.build import set_up
 from armscan.experiment.job import GRID_TAG
 from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
-from armscan.tracking import TrackedRun, TrackingStore, check_version, find_run, jobs_of, open_existing_store, sync
+from armscan.tracking import TrackedRun, TrackingStore, check_version, find_run, open_existing_store, sync
 from armscan.training import Fingerprints, check_unchanged, resume_from_checkpoint
 from armscan.utils.files import (
     CONFIG_FILE,
@@ -58,8 +58,7 @@ def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -
     if GRID_TAG not in run.data.tags:
         resume_run(client, run.info.run_id)
         return
-    if run.info.status == "FINISHED":
-        raise ResumeError(f"all jobs of the grid {run.info.run_id} have finished: there is nothing to resume")
+    _check_unfinished(run)
     _enter_working_folder(run)
     repeat_grid(json.loads(run.data.tags[GRID_TAG]))
 
@@ -72,14 +71,13 @@ def resume_run(client: TrackingStore, run_id: str, *, job_label: str | None = No
         run_id: of the run.
         job_label: what stands before the lines of one job of several, None for a single run.
     """
-    folder = _folder_of(client, client.get_run(run_id))
+    folder = _folder_of(client.get_run(run_id))
     with folder_lock(folder):
         # What it has left because the store was away; it may have ended just before the folder was free.
         sync(folder, lambda _: client)
         run = client.get_run(run_id)
-        if run.info.status == "FINISHED":
-            raise ResumeError(f"run {run_id} has finished: there is nothing to resume")
-        config = _config_of(run, folder)
+        _check_unfinished(run)
+        config: dict[str, Any] = yaml.safe_load(_started_with(run, folder / CONFIG_FILE, "configuration"))
         _check_last_checkpoint(run, folder)
         remove_unfinished(folder)
         _enter_working_folder(run)
@@ -109,21 +107,16 @@ def _read(words: Sequence[str]) -> tuple[str, str]:
     return values[RESUME], values[TRACKING_URI]
 
 
-def _folder_of(client: TrackingStore, run: Run) -> Path:
+def _folder_of(run: Run) -> Path:
     """Return the folder of a run that this version can go on with."""
     run_id, tags = run.info.run_id, run.data.tags
     if "folder" not in tags:
-        if jobs := jobs_of(client, run):
-            cut_off = [job.info.run_id for job in jobs if job.info.status != "FINISHED"]
-            which = ", ".join(cut_off) if cut_off else "all of them have finished"
-            raise ResumeError(f"run {run_id} is the parent of a multirun, whose jobs are resumed one by one: {which}")
         raise ResumeError(
             f"run {run_id} cannot be resumed: it was not started by armscan run, which tags a run with its folder"
         )
     check_version(run)
     # Asked before the folder, which may have been cleared away since.
-    if run.info.status == "FINISHED":
-        raise ResumeError(f"run {run_id} has finished: there is nothing to resume")
+    _check_unfinished(run)
     folder = Path(tags["folder"])
     if not folder.is_dir():
         raise ResumeError(
@@ -132,10 +125,9 @@ def _folder_of(client: TrackingStore, run: Run) -> Path:
     return folder
 
 
-def _config_of(run: Run, folder: Path) -> dict[str, Any]:
-    """Return the configuration that a run was started with, as its version wrote it."""
-    config: dict[str, Any] = yaml.safe_load(_started_with(run, folder / CONFIG_FILE, "configuration"))
-    return config
+def _check_unfinished(run: Run) -> None:
+    if run.info.status == "FINISHED":
+        raise ResumeError(f"run {run.info.run_id} has finished: there is nothing to resume")
 
 
 def _started_with(run: Run, file: Path, what: str) -> bytes:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +24,6 @@ from armscan.tracking import TrackedRun
 from armscan.training import (
     TEST,
     TRAINING,
-    Budget,
     Callback,
     EpochReport,
     Evaluation,
@@ -71,12 +70,12 @@ def run_tracked(
     """Train, evaluate and print results in a tracked run.
 
     Args:
-        setup: what is run.
+        setup: the experiment.
         tracked: its run.
         folder: where it leaves its files.
-        tracking_uri: of the store.
-        job_label: prefix of the printed lines of a multirun's job; None for a single run.
-        earlier: epochs before the interruption of a resumed training.
+        tracking_uri: MLflow tracking URI.
+        job_label: prefix of the printed lines of a multirun's job. Default: None, a single run.
+        earlier: epochs before the interruption of a resumed training. Default: none.
 
     Returns:
         The metrics of the final evaluations, by the name of their volumes.
@@ -86,7 +85,12 @@ def run_tracked(
     with _resume_hint_on_error(tracked.run_id, tracking_uri, folder, is_told=job_label is None), tracked:
         result = None
         if isinstance(setup.agent, Learner):
-            _tell_of_longer_epochs(setup.agent, setup.budget, tell)
+            at_once, every = setup.agent.env_steps_at_once, setup.budget.eval_every_env_steps
+            if at_once > every:
+                tell(
+                    f"validating every {at_once} environment steps, which the agent takes at once "
+                    f"(training.eval_every_env_steps = {every} is less)"
+                )
             callbacks = [progress_reporter(job_label), tracked]
             result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, earlier=earlier)
         tell(f"playing {setup.n_episodes} episodes on the training volumes, and as many on the test volumes")
@@ -96,7 +100,9 @@ def run_tracked(
         if isinstance(setup.agent, Learner):
             save_policy(setup.agent, setup.test_env, tracked, folder, tell)
     if job_label is None:
-        _show(result, evaluations, folder, tracking_uri)
+        how = f"deterministic policy, as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
+        print_results(f"results ({how})", evaluations)
+        print_where_to_look(folder, tracking_uri, files=(LEARNING_CURVE_FILE, VIDEO_FILE) if result else (VIDEO_FILE,))
         print(f"evaluate  {evaluate_command(tracked.run_id, tracking_uri)}")
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
 
@@ -112,15 +118,6 @@ def train_agent(
     return train(agent, budget, validate, folder, callbacks, provenance=setup.provenance(run_id), earlier=earlier)
 
 
-def _tell_of_longer_epochs(learner: Learner, budget: Budget, tell: Callable[[str], None]) -> None:
-    """Say so where an epoch is longer than the configuration has it, because the agent takes more steps at once."""
-    if (n := learner.env_steps_at_once) > budget.eval_every_env_steps:
-        tell(
-            f"validating every {n} environment steps, which the agent takes at once "
-            f"(training.eval_every_env_steps = {budget.eval_every_env_steps} is less)"
-        )
-
-
 def final_evaluations(setup: Experiment) -> dict[str, Evaluation]:
     """Return the final evaluations of a setup's agent, on the training and on the test volumes, by their names."""
     agent, n_episodes, seed = setup.agent, setup.n_episodes, setup.seed
@@ -128,12 +125,6 @@ def final_evaluations(setup: Experiment) -> dict[str, Evaluation]:
         TRAINING: evaluate(agent, setup.training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),
         TEST: evaluate(agent, setup.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED + seed),
     }
-
-
-def _show(result: TrainingResult | None, evaluations: dict[str, Evaluation], folder: Path, tracking_uri: str) -> None:
-    how = f"deterministic policy, as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
-    print_results(f"results ({how})", evaluations)
-    print_where_to_look(folder, tracking_uri, files=(LEARNING_CURVE_FILE, VIDEO_FILE) if result else (VIDEO_FILE,))
 
 
 @contextlib.contextmanager

@@ -18,53 +18,57 @@ N_SHOWN = 10
 
 @dataclass(frozen=True)
 class Difference:
-    """Of one metric in two runs.
+    """How one metric differs between two runs.
 
     Args:
         metric: its name.
-        n_points: that both have, by their steps.
-        n_missing: that only the first has.
-        n_new: that only the second has, which says nothing: the first may have been cut off, or of an older version.
-        largest: absolute difference of two points, 0 where all are the same; NaN where there are none in common.
-        at_step: where it is.
-        then: the value there in the first run.
-        now: in the second.
+        n_points: number of steps at which both runs have it.
+        n_missing: number of steps at which only the first has it.
+        n_new: number of steps at which only the second has it; the first may have been interrupted.
+        largest: largest absolute difference, 0 if all points are equal. Default: None, no points in common.
+        at_step: environment step of the largest difference. Default: None.
+        then: value there in the first run. Default: None.
+        now: value there in the second run. Default: None.
     """
 
     metric: str
     n_points: int
     n_missing: int
     n_new: int
-    largest: float
-    at_step: int | None
-    then: float
-    now: float
+    largest: float | None = None
+    at_step: int | None = None
+    then: float | None = None
+    now: float | None = None
 
     @property
     def is_same(self) -> bool:
         """Whether all points of the first run are there again, the same to the last bit."""
         return self.n_missing == 0 and self.largest == 0.0
 
+    @property
+    def relative(self) -> float:
+        """The largest difference, relative to the first run's value there; infinite if there is nothing to relate."""
+        return abs(self.largest / self.then) if self.largest is not None and self.then else math.inf
+
     def __str__(self) -> str:
         """Say it in a line."""
-        if not self.n_points:
+        if self.largest is None:
             return f"{self.metric}: none of its {self.n_missing} points is there again"
         missing = f"; {self.n_missing} points are not there again" if self.n_missing else ""
         if self.largest == 0.0:
             return f"{self.metric}: the same{missing}"
-        relative = abs(self.largest / self.then) if self.then else math.inf
         return (
-            f"{self.metric}: by {self.largest:.3g} ({relative:.2%}) at step {self.at_step}, where {self.then:.6g} "
+            f"{self.metric}: by {self.largest:.3g} ({self.relative:.2%}) at step {self.at_step}, where {self.then:.6g} "
             f"became {self.now:.6g}{missing}"
         )
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Of two runs.
+    """What two runs have measured, compared.
 
     Args:
-        differences: of each metric that the first has.
+        differences: the difference of each metric that the first run has.
     """
 
     differences: tuple[Difference, ...]
@@ -81,30 +85,25 @@ class Comparison:
             return ["not the same: the first run has no metrics"]
         if self.is_same:
             return [f"the same: {n_points} points of {len(self.differences)} metrics, to the last bit"]
-        unlike = sorted((each for each in self.differences if not each.is_same), key=_size, reverse=True)
+        # Missing points first, then the largest relative differences.
+        unlike = [each for each in self.differences if not each.is_same]
+        unlike.sort(key=lambda each: (each.largest is None, each.n_missing > 0, each.relative), reverse=True)
         more = [f"... and {len(unlike) - N_SHOWN} more"] if len(unlike) > N_SHOWN else []
-        return [
-            f"not the same: {len(unlike)} of {len(self.differences)} metrics differ",
-            *(f"  {each}" for each in unlike[:N_SHOWN]),
-            *more,
-        ]
+        told = f"not the same: {len(unlike)} of {len(self.differences)} metrics differ"
+        return [told, *(f"  {each}" for each in unlike[:N_SHOWN]), *more]
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values, ready for JSON; what was not measured is None."""
-        rows = [
-            {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
-            for row in map(asdict, self.differences)
-        ]
-        return {"is_same": self.is_same, "metrics": rows}
+        return {"is_same": self.is_same, "metrics": [asdict(each) for each in self.differences]}
 
 
 def compare_runs(store: TrackingStore, first_id: str, second_id: str) -> Comparison:
     """Compare the metrics of two runs, but for those of time and machine.
 
     Args:
-        store: that both are in.
-        first_id: of the earlier run.
-        second_id: of the later one.
+        store: the store that both are in.
+        first_id: MLflow run ID of the earlier run.
+        second_id: MLflow run ID of the later run.
     """
     first, second = (_histories(store, run_id) for run_id in (first_id, second_id))
     return Comparison(tuple(difference(name, then, second.get(name, {})) for name, then in sorted(first.items())))
@@ -115,7 +114,7 @@ def difference(metric: str, then: Mapping[int, float], now: Mapping[int, float])
     common = sorted(then.keys() & now.keys())
     n_missing, n_new = len(then.keys() - now.keys()), len(now.keys() - then.keys())
     if not common:
-        return Difference(metric, 0, n_missing, n_new, math.nan, None, math.nan, math.nan)
+        return Difference(metric, 0, n_missing, n_new)
     # Two that are the same differ by nothing, also where they are infinite.
     sizes = {step: 0.0 if then[step] == now[step] else abs(then[step] - now[step]) for step in common}
     at = max(common, key=lambda step: sizes[step])
@@ -126,10 +125,3 @@ def _histories(store: TrackingStore, run_id: str) -> dict[str, dict[int, float]]
     metrics = store.get_run(run_id).data.metrics
     names = [name for name in metrics if not name.startswith(TIMES) and name not in TIME_NAMES]
     return {name: {point.step: point.value for point in store.get_metric_history(run_id, name)} for name in names}
-
-
-def _size(each: Difference) -> tuple[bool, float]:
-    """Return the sort key that puts missing points first, then the largest relative differences."""
-    if not each.n_points or math.isnan(each.largest):
-        return True, math.inf
-    return each.n_missing > 0, abs(each.largest / each.then) if each.then else each.largest

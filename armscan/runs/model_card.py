@@ -26,7 +26,7 @@ class Card:
     """What is told of a policy.
 
     Args:
-        text: in Markdown.
+        text: Markdown.
         tags: figures by their names.
     """
 
@@ -62,7 +62,7 @@ def _reports(run: FoundRun, folder: Path) -> dict[str, EvaluationReport]:
     """Return the evaluations of a run by their titles, its own first."""
     reports = {}
     if EVALUATION_FILE in run.files:
-        reports["at the end of the run"] = _read(run, run.run_id, EVALUATION_FILE, folder, _own)
+        reports["at the end of the run"] = _read(run, run.run_id, EVALUATION_FILE, folder, _by_run)
     if (latest := _latest(run)) is not None:
         run_id, file = latest
         report = _read(run, run_id, file, folder, _by_command)
@@ -95,7 +95,7 @@ def _read(
         raise TrackingError(f"run {run_id}: its {file} is damaged; put it back, or remove it") from error
 
 
-def _own(contents: Any) -> EvaluationReport:
+def _by_run(contents: Any) -> EvaluationReport:
     return _report({label: each["episodes"] for label, each in contents.items()}, has_total=False, facts={})
 
 

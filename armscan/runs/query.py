@@ -20,20 +20,20 @@ PER_PAGE = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Which runs are meant; of what is None or empty, all.
+    """Which runs are meant, in which order. Default: all, the newest first.
 
     Args:
-        experiment: of MLflow, by its name.
-        parent: the run that they are children of, or the beginning of its id.
-        statuses: as MLflow writes them.
-        choices: the values allowed of a tag, by its name.
-        projections: as parameters have them.
-        since: they were started then or later.
-        before: they were started earlier.
-        where: a filter of MLflow.
-        sort: by what, as `Entry.value_of` takes it.
-        is_down: the greatest first.
-        limit: so many.
+        experiment: name of their MLflow experiment.
+        parent: MLflow run ID of the run that they are children of, or its first characters.
+        statuses: statuses as MLflow writes them.
+        choices: allowed values of tags, by the tag's name.
+        projections: projections, as parameters of runs have them.
+        since: earliest start.
+        before: time before which they were started.
+        where: MLflow filter string.
+        sort: what they are sorted by, as `RunRow.value_of` takes it.
+        is_down: whether the greatest come first.
+        limit: number of runs at most.
     """
 
     experiment: str | None = None
@@ -79,7 +79,7 @@ def find(client: TrackingStore, selection: Selection) -> list[Run]:
     """Return the runs of a store that are meant, in no order.
 
     Args:
-        client: of the store.
+        client: the store.
         selection: which are meant.
 
     Raises:
@@ -87,13 +87,11 @@ def find(client: TrackingStore, selection: Selection) -> list[Run]:
         TrackingError: if there is no such parent.
     """
     experiments = experiment_ids(client, selection.experiment)
-    condition = selection.filter
+    conditions = [selection.filter] if selection.filter else []
     if selection.parent is not None:
-        parent = find_run(client, selection.parent)
-        ours = f"tags.mlflow.parentRunId = '{parent.info.run_id}'"
-        condition = f"{ours} and {condition}" if condition else ours
+        conditions.append(f"tags.mlflow.parentRunId = '{find_run(client, selection.parent).info.run_id}'")
     try:
-        runs = search(client, experiments, condition)
+        runs = search(client, experiments, " and ".join(conditions))
     except MlflowException as error:
         if selection.where is None or error.error_code != "INVALID_PARAMETER_VALUE":
             raise

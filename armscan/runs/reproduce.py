@@ -21,6 +21,7 @@ from armscan.experiment.runner import run_tracked
 from armscan.runs.compare import Comparison, compare_runs
 from armscan.tracking import EVALUATED_TAG, FoundRun, environment_tags, load_run, source_tags
 from armscan.tracking.environment import COMMIT, CONSTRAINTS_SUM, DIFF_SUM, DIRTY, TOLD, environment
+from armscan.tracking.sync import ENDED
 from armscan.training import check_unchanged
 from armscan.utils.files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
 
@@ -28,7 +29,6 @@ from armscan.utils.files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, 
 OF_TAG, SAME_TAG = "reproduction.of", "reproduction.is_same"
 # Packages that are named of those whose versions seldom matter.
 N_SHOWN = 8
-ENDED = ("FINISHED", "FAILED", "KILLED")
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Original:
     """A run that is to be made again.
 
     Args:
-        run: as it is tracked.
-        config: it was started with, its files named from anywhere; tracked in the store that it is in.
-        setup: built from it, on the volumes that it was started with.
-        environment: the versions of what it was computed with, None where these were not kept.
+        run: the run, as it is tracked.
+        config: the configuration that it was started with, its files named from anywhere.
+        setup: the experiment that it describes, on the volumes that it was started with.
+        environment: versions of what it was computed with; None if they were not kept.
     """
 
     run: FoundRun
@@ -99,18 +99,13 @@ def differences(original: Original) -> list[str]:
     if original.environment is None:
         return [*lines, "the versions of its packages were not kept"]
     before, here = original.environment, environment()
-    lines += [
-        f"{key} was {before.get(key)}, and is {here[key]}"
-        for key in ("python", "platform", "machine")
-        if before.get(key) != here[key]
-    ]
-    pairs = {name: (before["packages"].get(name), here["packages"].get(name)) for name in _names(before, here)}
-    changed = {
-        name: f"{then or 'not installed'}, and is {now or 'not installed'}"
-        for name, (then, now) in pairs.items()
-        if then != now
-    }
-    lines += [f"{name} was {how}" for name, how in changed.items() if name in TOLD]
+    machine = [key for key in ("python", "platform", "machine") if before.get(key) != here[key]]
+    lines += [f"{key} was {before.get(key)}, and is {here[key]}" for key in machine]
+    # This project's own version says nothing that the commit does not.
+    packages = sorted((before["packages"].keys() | here["packages"].keys()) - {"armscan"})
+    pairs = {name: [each["packages"].get(name, "not installed") for each in (before, here)] for name in packages}
+    changed = {name: f"{name} was {then}, and is {now}" for name, (then, now) in pairs.items() if then != now}
+    lines += [line for name, line in changed.items() if name in TOLD]
     if others := [name for name in changed if name not in TOLD]:
         shown = ", ".join(others[:N_SHOWN]) + (", ..." if len(others) > N_SHOWN else "")
         lines.append(f"{len(others)} other packages have other versions, or are there in one case only: {shown}")
@@ -121,11 +116,6 @@ def _changes(tags: Mapping[str, str]) -> str:
     if DIFF_SUM in tags:
         return f"had the sum {tags[DIFF_SUM][:8]}"
     return {"false": "were none", "true": "were some"}.get(tags.get(DIRTY, ""), "were not kept")
-
-
-def _names(*environments: Mapping[str, Any]) -> Sequence[str]:
-    # This project's own version says nothing that the commit does not.
-    return sorted(set().union(*(each["packages"] for each in environments)) - {"armscan"})
 
 
 def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Comparison:

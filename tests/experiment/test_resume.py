@@ -284,21 +284,11 @@ def test_resume_refuses_a_run_of_a_newer_version(answer, cut_off):
     assert f"was made by armscan 99.1.0, but this is {armscan.__version__}" in refused(answer, f"resume={run_id}")
 
 
-def test_resume_names_the_jobs_of_a_grid_that_was_made_before_grids_could_be_resumed(answer, cut_off):
-    client, run_id, _ = cut_off
-    experiment_id = client.get_run(run_id).info.experiment_id
-    parent_id = client.create_run(experiment_id, name="multirun", tags={}).info.run_id
-    client.set_tag(run_id, "mlflow.parentRunId", parent_id)
-    assert refused(answer, f"resume={parent_id}") == (
-        f"error: run {parent_id} is the parent of a multirun, whose jobs are resumed one by one: {run_id}"
-    )
-
-
 def test_resume_refuses_a_grid_that_has_finished(answer, cut_off):
     client, run_id, _ = cut_off
     client.set_tag(run_id, GRID_TAG, "[]")
     client.set_terminated(run_id, "FINISHED")
-    assert f"all jobs of the grid {run_id} have finished" in refused(answer, f"resume={run_id}")
+    assert f"run {run_id} has finished: there is nothing to resume" in refused(answer, f"resume={run_id}")
 
 
 def test_resume_refuses_a_run_of_something_else(answer, cut_off):
