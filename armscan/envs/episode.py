@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -70,38 +70,26 @@ class Episode:
         return self.n_steps == 0 or not (self.is_solved or self.is_truncated)
 
 
+# What `info` holds under each key, and the type of its array, None where it is a text, a number or a truth value.
+INFO: dict[str, tuple[Callable[[Episode], Any], type[np.generic] | None]] = {
+    "volume": (lambda episode: episode.scene.volume.name, None),
+    "rotation_deg": (lambda episode: episode.plane.rotation, np.float64),
+    "translation_mm": (lambda episode: episode.plane.translation, np.float64),
+    "counts": (lambda episode: episode.view.landmarks[:, 0], np.int64),
+    "is_success": (lambda episode: episode.is_solved, None),
+    "starts_solved": (lambda episode: episode.starts_solved, None),
+    "action": (lambda episode: episode.action, np.float32),
+    "reward": (lambda episode: episode.view.reward, None),
+    "distance_mm": (lambda episode: episode.distance[0], None),
+    "distance_deg": (lambda episode: episode.distance[1], None),
+}
+
+
 def info_of(episode: Episode) -> dict[str, Any]:
     """Return `info`, as `ArmscanEnv` describes it."""
     return {
-        name: field.of(episode) if field.dtype is None else np.array(field.of(episode), dtype=field.dtype)
-        for name, field in INFO.items()
+        name: of(episode) if dtype is None else np.array(of(episode), dtype=dtype) for name, (of, dtype) in INFO.items()
     }
-
-
-class InfoField(NamedTuple):
-    """What `info` holds under one key.
-
-    Args:
-        of: gives it.
-        dtype: of the array that it is, None where it is a text, a number or a truth value.
-    """
-
-    of: Callable[[Episode], Any]
-    dtype: type[np.generic] | None = None
-
-
-INFO = {
-    "volume": InfoField(lambda episode: episode.scene.volume.name),
-    "rotation_deg": InfoField(lambda episode: episode.plane.rotation, np.float64),
-    "translation_mm": InfoField(lambda episode: episode.plane.translation, np.float64),
-    "counts": InfoField(lambda episode: episode.view.landmarks[:, 0], np.int64),
-    "is_success": InfoField(lambda episode: episode.is_solved),
-    "starts_solved": InfoField(lambda episode: episode.starts_solved),
-    "action": InfoField(lambda episode: episode.action, np.float32),
-    "reward": InfoField(lambda episode: episode.view.reward),
-    "distance_mm": InfoField(lambda episode: episode.distance[0]),
-    "distance_deg": InfoField(lambda episode: episode.distance[1]),
-}
 
 
 def begin(rules: Rules, rngs: Sequence[np.random.Generator], volume_name: str | None = None) -> list[Episode]:

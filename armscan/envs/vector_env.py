@@ -140,8 +140,8 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         episodes = [self._episode(i) for i in chosen]
         is_given = np.isin(np.arange(self.num_envs), chosen)
         infos: dict[str, Any] = {}
-        for key, field in INFO.items():
-            values = np.array([field.of(episode) for episode in episodes], dtype=field.dtype)
+        for key, (of, dtype) in INFO.items():
+            values = np.array([of(episode) for episode in episodes], dtype=dtype)
             # Of texts Gymnasium makes arrays of objects.
             values = values.astype(object) if values.dtype.kind == "U" else values
             infos[key] = np.zeros((self.num_envs, *values.shape[1:]), dtype=values.dtype)

@@ -50,9 +50,9 @@ class LabelMap:
             tendons, artery) has none.
     """
 
-    bones: tuple[Source, ...]
-    tendons: tuple[Source, ...]
-    artery: tuple[Source, ...]
+    bones: tuple[Source, ...] = ()
+    tendons: tuple[Source, ...] = ()
+    artery: tuple[Source, ...] = ()
     nerve: tuple[Source, ...] = ()
     background: tuple[Source, ...] = ()
     others: str | None = None
@@ -78,15 +78,13 @@ class LabelMap:
         """Build a label map from what a manifest says, {'bones': [1, 2], ...}.
 
         Raises:
-            InvalidValueError: if it is no mapping, or a key is unknown or missing, and as the class says.
+            InvalidValueError: if it is no mapping, or a key is unknown, and as the class says.
         """
         allowed = [field.name for field in fields(cls)]
         if not isinstance(mapping, Mapping):
             raise InvalidValueError(f"labels is {mapping!r}, but it must be a mapping with {', '.join(allowed)}")
         if unknown := [key for key in mapping if key not in allowed]:
             raise InvalidValueError(f"labels has the key {unknown[0]!r}, but only {listed(allowed)} are known")
-        if missing := [tissue for tissue in ("bones", "tendons", "artery") if tissue not in mapping]:
-            raise InvalidValueError(f"labels has no {missing[0]}, but every landmark must be there")
         return cls(**mapping)
 
     @cached_property

@@ -45,15 +45,6 @@ class ReadingOptions:
         check_choice("overlap", self.overlap, OVERLAPS)
 
 
-def is_text(name: str) -> bool:
-    """Whether a name can be written; the names of files may hold any bytes."""
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
 def volume_suffix(path: Path) -> str | None:
     """Return the ending that says a file is a volume ('.nii.gz', ...), None for any other file."""
     return next((suffix for suffix in CHECKS if path.name.endswith(suffix)), None)
@@ -146,14 +137,15 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
     try:
         if not path.is_file():
             raise VolumeError(f"{path}: there is no such file")
-        if not is_text(str(path)):
-            # SimpleITK would end the process.
-            raise VolumeError(f"{str(path)!a}: the file's name must be a text in UTF-8")
+        # A name may hold any bytes; by one that is no text SimpleITK would end the process.
+        str(path).encode()
         CHECKS[suffix](path)
         if suffix == SEGMENTATION_SUFFIX:
             labels, matrix, found = read_segmentation(path, options.labels, options.overlap)
             return _image(labels, matrix, path), found
         stored = SimpleITK.ReadImage(str(path))
+    except UnicodeEncodeError as error:
+        raise VolumeError(f"{str(path)!a}: the file's name must be a text in UTF-8") from error
     except OSError as error:
         raise VolumeError(f"{path}: the file cannot be read ({error.strerror or error})") from error
     except RuntimeError as error:

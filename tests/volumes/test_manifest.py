@@ -116,7 +116,7 @@ def test_manifest_refuses_impossible_splits(folder, splits, message):
         ("spacing: coarsest", "spacing is 'coarsest', but it must be own or finest"),
         ("overlap: none", "overlap is 'none', but it must be refuse, first or last"),
         ("labels: {bones: [1], tendons: [1], artery: [2]}", "labels: 1 is bones and tendons, but"),
-        ("labels: {bones: [1], tendons: [2]}", "labels has no artery"),
+        ("labels: {bones: [1], tendons: [2]}", "labels: artery is empty"),
         ("labels: {bones: [1], tendons: [2], artery: []}", "labels: artery is empty"),
         ("labels: {bones: 1, tendons: [2], artery: [3]}", "labels: bones is 1, but it must be a list"),
         ("labels: {bones: [1.5], tendons: [2], artery: [3]}", r"labels: bones is \[1\.5\], but it must be a list"),

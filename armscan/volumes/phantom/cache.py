@@ -47,12 +47,18 @@ def load_phantom(seed: int, cache_dir: Path | None = None) -> LabelVolume:
 
 def _read_or_made(path: Path, seed: int) -> LabelVolume:
     try:
-        return _read(path, seed)
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            action = ManipulatorAction.from_array(arrays["optimal_action"])
+            spacing = tuple(arrays["spacing"].tolist())
+            return LabelVolume(arrays["labels"], spacing, f"phantom-{seed}", optimal_action=action)
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
         # Not there, or damaged: a cached phantom can always be made again.
         volume = generate.make_phantom(seed)
+    assert volume.optimal_action is not None
+    arrays = {"labels": volume.labels, "spacing": volume.spacing, "optimal_action": volume.optimal_action.to_array()}
     try:
-        _write(path, volume)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
     except OSError as error:
         raise InvalidValueError(
             f"{path.parent}: phantoms cannot be kept there ({error.strerror}); name another folder by data.cache_dir "
@@ -68,24 +74,3 @@ def _generator_version() -> str:
     for module in (generate, tube, wrist):
         digest.update(Path(str(module.__file__)).read_bytes())
     return digest.hexdigest()[:12]
-
-
-def _read(path: Path, seed: int) -> LabelVolume:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-        return LabelVolume(
-            arrays["labels"],
-            tuple(arrays["spacing"].tolist()),
-            f"phantom-{seed}",
-            optimal_action=ManipulatorAction.from_array(arrays["optimal_action"]),
-        )
-
-
-def _write(path: Path, volume: LabelVolume) -> None:
-    assert volume.optimal_action is not None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {
-        "labels": volume.labels,
-        "spacing": np.array(volume.spacing),
-        "optimal_action": volume.optimal_action.to_array(),
-    }
-    atomic_write(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
