@@ -10,9 +10,9 @@ from armscan.config.credentials import check_address
 from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher
 from armscan.sweeps.results.progress import print_result
-from armscan.sweeps.study.arguments import STORAGE, StudyCommand
-from armscan.sweeps.study.check import check_space
-from armscan.sweeps.study.open import open_for_work, read_settings
+from armscan.sweeps.study.arguments import STORAGE, StudyCommand, words_of_trials
+from armscan.sweeps.study.components import check_space, read_settings
+from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.study import existing_study
 from armscan.sweeps.tasks.attempt import composed
@@ -37,20 +37,21 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     """
     given = StudyCommand.read(words)
     silence_library_warnings()
-    settings, task, config = read_settings(given.of_trials)
+    trial_words = words_of_trials(given.words)
+    settings, task, config = read_settings(trial_words)
     for key, uri in ((STORAGE, settings.storage), (TRACKING_URI, config.tracking.uri)):
         check_address(key, uri)
     launcher = composed(given.launching)[1][LAUNCHER]
     if launcher in ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))
-    check_space(settings, task, given.of_trials, config)
+    check_space(settings, task, trial_words, config)
     # Before anything is made: a study or a storage that would be refused.
     existing = existing_study(settings, to_plain(config))
     if given.is_plan:
         print_plan(settings, existing)
         return 0
     check_launcher(launcher)
-    opened = open_for_work(settings, task, config, given.of_trials)
+    opened = open_for_work(settings, task, config, trial_words)
     for phase in opened.phases:
         if n_failed := phase.scheduler.reset_failures():
             print(f"{phase.name}: {n_failed} failures before this start are ignored")

@@ -25,7 +25,8 @@ from unittest import mock
 import optuna
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.sweeps.scheduling.scheduler import Limits, TrialScheduler
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.phase import Phase
@@ -116,7 +117,6 @@ def phase_of(storage_uri: str, tracking_uri: str | None, folder: Path, n_trials:
         seed=0,
         folder=folder,
         artifacts=folder / "artifacts",
-        storage_uri=storage.uri,
         client=store,
         experiment_id=experiment_id,
         run_id="study",

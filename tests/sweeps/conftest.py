@@ -5,8 +5,8 @@ import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps.scheduling.outcome import PendingWrites, TrialOutcome
-from armscan.sweeps.scheduling.scheduler import Limits, TrialScheduler
-from armscan.sweeps.scheduling.state import FAILURE
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import FAILURE, Limits
 from armscan.sweeps.storage.storage import open_storage
 
 
@@ -37,5 +37,5 @@ def make_scheduler(storage_uri):
 def fail(scheduler, trial, reason):
     """Ends a trial as failed, as its worker does with its next claim."""
     outcome = TrialOutcome(trial, TrialState.FAIL, PendingWrites(), attributes={FAILURE: reason})
-    scheduler._storage.exclusive(lambda: scheduler._tell(outcome, is_repeated=False))
+    scheduler.storage.exclusive(lambda: scheduler._tell(outcome, is_repeated=False))
     assert outcome.is_told

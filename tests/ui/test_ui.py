@@ -18,8 +18,8 @@ import pytest
 from mlflow import MlflowClient
 
 from armscan.cli.main import main
-from armscan.config.credentials import STORAGE_PASSWORD, TRACKING_PASSWORD
-from armscan.sweeps.storage.database import tables_in, url_of
+from armscan.config.credentials import STORAGE_PASSWORD, TRACKING_PASSWORD, database_url
+from armscan.sweeps.storage.database import tables_in
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import LOCAL_UI
 from armscan.ui import servers
@@ -310,7 +310,7 @@ def test_ui_shows_what_is_in_postgresql_and_no_password(postgres, tmp_path, look
     monkeypatch.setenv(TRACKING_PASSWORD, PASSWORD)
     assert main(["ui", f"--tracking={empty}"]) == 2
     assert "there are no runs there" in capsys.readouterr().err
-    assert tables_in(url_of(empty)) == []
+    assert tables_in(database_url(empty, STORAGE_PASSWORD)) == []
 
 
 def test_ui_loads_nothing_that_trains_or_tracks_before_it_has_to():

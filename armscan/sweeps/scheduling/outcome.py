@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -12,50 +11,31 @@ from optuna.trial import Trial, TrialState
 T = TypeVar("T")
 
 
-class PendingWrites:
-    """Writes about a trial, which go with its next report, its outcome or its requeue.
+class PendingWrites(list[Callable[[], object]]):
+    """Short writes about a trial, which go with its next report, its outcome or its requeue.
 
-    Each is repeated if the storage went away before the write was known to be there.
+    Each is repeated if the storage went away before the write was known to be there. One thread appends and flushes; a
+    requeue writes in another.
     """
-
-    def __init__(self) -> None:
-        self._writes: list[Callable[[], object]] = []
-        # A requeue writes them in another thread.
-        self._changing = threading.Lock()
-
-    def add(self, write: Callable[[], object]) -> None:
-        """Add a short write that may be repeated."""
-        with self._changing:
-            self._writes.append(write)
 
     def write(self) -> int:
         """Write all; returns how many."""
-        with self._changing:
-            writes = list(self._writes)
+        writes = self.copy()
         for write in writes:
             write()
         return len(writes)
 
-    def flush_with(self, transaction: Callable[[Callable[[], T]], T], operate: Callable[[], T]) -> T:
-        """Write all in one transaction with an operation, and forget them.
+    def flush_with(self, transaction: Callable[[Callable[[], Any]], Any], operate: Callable[[], T]) -> T:
+        """Write all in one transaction with an operation, forget them, and return what the operation returns.
 
         Args:
             transaction: see `Storage.transaction`.
-            operate: may be called several times.
-
-        Returns:
-            What the operation returns.
+            operate: the operation, which may be called several times.
         """
-        n_written = 0
-
-        def written() -> T:
-            nonlocal n_written
-            n_written = self.write()
-            return operate()
-
-        done = transaction(written)
-        with self._changing:
-            del self._writes[:n_written]
+        n_written: int
+        done: T
+        n_written, done = transaction(lambda: (self.write(), operate()))
+        del self[:n_written]
         return done
 
 
@@ -64,9 +44,9 @@ class TrialOutcome:
     """Outcome of a trial, told to Optuna with the next claim.
 
     Args:
-        trial: that has ended.
+        trial: the trial that has ended.
         state: COMPLETE, PRUNED or FAIL.
-        writes: about the trial, still pending.
+        writes: those about the trial that are still pending.
         values: of the objectives, if it is complete.
         attributes: user attributes of the trial.
     """

@@ -1,13 +1,16 @@
-"""State of a study, from its trials in the storage, and the names of their attributes."""
+"""State of a study, from its trials in the storage, the names of their attributes, and when the study ends."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Self
 
 from optuna.trial import FrozenTrial, TrialState
+from pydantic import Field
+
+from armscan.sweeps.space.section import Section
 
 # User attributes of a trial.
 LEASE, ENV_STEPS, METRICS, FAILURE = "lease", "env_steps", "figures", "failure"
@@ -21,6 +24,8 @@ RESET_FAILURES = "forgiven"
 # In a lease: the worker that holds the trial.
 HOLDER = ("worker", "host", "pid", "started")
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+# So many failures before any trial reported are the fault of the configuration.
+FAILURES_AT_ONCE = 3
 
 
 @dataclass(frozen=True)
@@ -80,3 +85,50 @@ def env_steps_of(trial: FrozenTrial) -> int:
     """Return the environment steps of a trial, up to its last heartbeat."""
     reported = (trial.user_attrs.get(ENV_STEPS, 0), trial.user_attrs.get(LEASE, {}).get(ENV_STEPS, 0))
     return int(max(reported))
+
+
+class Limits(Section):
+    """When a study ends.
+
+    Args:
+        n_trials: number of trials that finish.
+        max_failures: failed trials, retried ones not counted, after which the study ends. Default: 10.
+        max_retries: retries of a trial whose worker died. Default: 1.
+        timeout_hours: wall time in which trials run, for the whole study. Default: None, for no limit.
+        max_env_steps: environment steps of all trials together. Default: None, for no limit.
+    """
+
+    n_trials: int = Field(ge=1, description="a whole number of at least 1")
+    max_failures: int = Field(default=10, ge=0, description="a whole number of at least 0")
+    max_retries: int = Field(default=1, ge=0, description="a whole number of at least 0")
+    timeout_hours: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="a finite number above 0, or null"
+    )
+    max_env_steps: int | None = Field(default=None, ge=1, description="a whole number of at least 1, or null")
+
+    def spent(self, state: StudyState) -> str | None:
+        """Return which of time and environment steps is spent, so that running trials stop; None if neither is."""
+        if self.timeout_hours is not None and state.busy_hours >= self.timeout_hours:
+            return f"the {self.timeout_hours:g} hours of study.timeout_hours are over"
+        if self.max_env_steps is not None and state.env_steps >= self.max_env_steps:
+            return f"the {self.max_env_steps} environment steps of study.max_env_steps are taken"
+        return None
+
+    def broken(self, state: StudyState, reset: Collection[int]) -> str | None:
+        """Return why failures end the study; None if they do not.
+
+        Args:
+            state: the state of the study.
+            reset: the numbers of trials whose failures are ignored.
+        """
+        failed = [trial for trial in state.failed if trial.number not in reset]
+        if len(failed) > self.max_failures:
+            return f"{len(failed)} trials have failed, and at most {self.max_failures} may: {_reason(failed[-1])}"
+        got_nowhere = not state.finished and not any(trial.intermediate_values for trial in state.all)
+        if len(failed) >= FAILURES_AT_ONCE and got_nowhere:
+            return f"the first {len(failed)} trials failed before they reported anything: {_reason(failed[0])}"
+        return None
+
+
+def _reason(trial: FrozenTrial) -> str:
+    return f"trial {trial.number}: {trial.user_attrs.get(FAILURE, 'no reason is known')}"

@@ -6,10 +6,11 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from hydra.core.override_parser.types import Quote, QuotedString
+
 from armscan.config.legacy import renamed
 
 PLAIN_TEXT = re.compile(r"[A-Za-z_][\w./\-]*")
-BEFORE_QUOTE = re.compile(r"(\\+)('|$)")
 OTHER_THAN_TEXTS = ("true", "false", "null", "nan", "inf")
 Value = bool | int | float | str | None
 
@@ -36,9 +37,7 @@ def written(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{key}:{written(each)}" for key, each in value.items()) + "}"
     if isinstance(value, str) and not _is_plain(value):
-        # Hydra takes a backslash for itself, but before a quote.
-        escaped = BEFORE_QUOTE.sub(r"\1\1\2", value).replace("'", "\\'")
-        return f"'{escaped}'"
+        return QuotedString(value, Quote.single).with_quotes()
     return str(value)
 
 

@@ -3,73 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
-from optuna.distributions import (
-    BaseDistribution,
-    CategoricalDistribution,
-    FloatDistribution,
-    IntDistribution,
-    distribution_to_json,
-)
+from optuna.distributions import CategoricalDistribution, distribution_to_json
 from optuna.trial import BaseTrial
 
 from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.space.overrides import Value, as_kept
-from armscan.sweeps.space.parse import by_key, read_description
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One dimension of a search space.
-
-    Args:
-        name: the key or group of the configuration.
-        distribution: its range or its choices.
-        when: the choices of parameters before it that it needs, by their names; it is searched only where all hold.
-    """
-
-    name: str
-    distribution: BaseDistribution
-    when: Mapping[str, tuple[Value, ...]] = field(default_factory=dict)
-
-    @classmethod
-    def read(cls, name: str, described: Any) -> Self:
-        """Return the parameter of a description such as `{low: 1e-4, high: 1e-2, log: true}` or `{choices: [a, b]}`.
-
-        Raises:
-            InvalidValueError: if it describes none.
-        """
-        distribution, when = read_description(name, described)
-        return cls(name, distribution, when)
-
-    def applies(self, chosen: Mapping[str, Value]) -> bool:
-        """Whether it is searched where these values were chosen before."""
-        return all(name in chosen and chosen[name] in values for name, values in self.when.items())
-
-    def suggest(self, trial: BaseTrial) -> Value:
-        """Return the value of a trial."""
-        distribution = self.distribution
-        if isinstance(distribution, CategoricalDistribution):
-            choice: Value = trial.suggest_categorical(self.name, distribution.choices)
-            return choice
-        if isinstance(distribution, IntDistribution):
-            return trial.suggest_int(
-                self.name, distribution.low, distribution.high, log=distribution.log, step=distribution.step
-            )
-        assert isinstance(distribution, FloatDistribution)
-        return trial.suggest_float(
-            self.name, distribution.low, distribution.high, log=distribution.log, step=distribution.step
-        )
-
-    def extremes(self) -> tuple[Value, ...]:
-        """Return the values that have to be allowed for all of them to be."""
-        distribution = self.distribution
-        if isinstance(distribution, CategoricalDistribution):
-            return tuple(distribution.choices)
-        assert isinstance(distribution, FloatDistribution | IntDistribution)
-        return distribution.low, distribution.high
+from armscan.sweeps.space.parameter import Parameter
 
 
 @dataclass(frozen=True)
@@ -84,31 +26,27 @@ class Space:
 
     @classmethod
     def read(cls, described: Any) -> Self:
-        """Return the space of a mapping from keys of the configuration to descriptions.
+        """Return the space of a mapping from keys of the configuration to descriptions; null takes a key out.
 
         Raises:
             InvalidValueError: if it describes none.
         """
         if not isinstance(described, Mapping) or not described:
             raise InvalidValueError(f"study.space is {described!r}, but it must have at least one key to search")
-        parameters = tuple(Parameter.read(name, each) for name, each in by_key(described).items())
-        before: dict[str, tuple[Value, ...]] = {}
-        for parameter in parameters:
+        space = cls(tuple(Parameter.read(name, each) for name, each in described.items() if each is not None))
+        above: dict[str, tuple[Value, ...]] = {}
+        for parameter in space.parameters:
+            where = f"study.space.{parameter.name}.when"
             for name, values in parameter.when.items():
-                if name not in before:
-                    raise InvalidValueError(
-                        f"study.space.{parameter.name}.when names {name!r}, but it must be a key with choices above it"
-                        + (f": {listed(before)}" if before else "")
-                    )
-                if wrong := [value for value in values if value not in before[name]]:
-                    where = f"study.space.{parameter.name}.when.{name}"
-                    raise InvalidValueError(f"{where} is {wrong[0]!r}, but it must be {listed(before[name])}")
+                if name not in above:
+                    keys = f": {listed(above)}" if above else ""
+                    raise InvalidValueError(f"{where} names {name!r}, but it must be a key with choices above it{keys}")
+                if wrong := [value for value in values if value not in above[name]]:
+                    raise InvalidValueError(f"{where}.{name} is {wrong[0]!r}, but it must be {listed(above[name])}")
+            if space._with_needs(parameter.name, None) is None:
+                raise InvalidValueError(f"{where} can never hold, for what its keys need")
             if isinstance(parameter.distribution, CategoricalDistribution):
-                before[parameter.name] = tuple(parameter.distribution.choices)
-        space = cls(parameters)
-        for parameter in parameters:
-            if space._with_needs({parameter.name: parameter.extremes()[0]}) is None:
-                raise InvalidValueError(f"study.space.{parameter.name}.when can never hold, for what its keys need")
+                above[parameter.name] = parameter.extremes
         return space
 
     def suggest(self, trial: BaseTrial) -> dict[str, Value]:
@@ -122,11 +60,11 @@ class Space:
     def extremes(self) -> Iterator[dict[str, Value]]:
         """Yield values by name that between them have every choice and both ends of every range.
 
-        Where a parameter needs choices of others, these stand with it.
+        Each is the last, and before it stand the choices of others that it needs.
         """
         for parameter in self.parameters:
-            for value in parameter.extremes():
-                chosen = self._with_needs({parameter.name: value})
+            for value in parameter.extremes:
+                chosen = self._with_needs(parameter.name, value)
                 assert chosen is not None
                 yield chosen
 
@@ -135,21 +73,18 @@ class Space:
         complete: dict[str, Value] = {}
         for parameter in self.parameters:
             if parameter.name in chosen or parameter.applies(complete):
-                complete[parameter.name] = chosen.get(parameter.name, parameter.extremes()[0])
+                complete[parameter.name] = chosen.get(parameter.name, parameter.extremes[0])
         return complete
 
-    def _with_needs(self, chosen: Mapping[str, Value]) -> dict[str, Value] | None:
-        """Return choices with those that they need beside them, None where no choice is allowed by all."""
-        for parameter in self.parameters:
-            if parameter.name not in chosen:
-                continue
-            for name, values in parameter.when.items():
-                if name not in chosen:
-                    tried = (self._with_needs({name: value, **chosen}) for value in values)
-                    return next((each for each in tried if each is not None), None)
-                if chosen[name] not in values:
-                    return None
-        return dict(chosen)
+    def _with_needs(self, name: str, value: Value) -> dict[str, Value] | None:
+        """Return a value with the choices that it needs before it, None where these exclude each other."""
+        allowed: dict[str, tuple[Value, ...]] = {name: (value,)}
+        for parameter in reversed(self.parameters):
+            for needed, values in parameter.when.items() if parameter.name in allowed else ():
+                allowed[needed] = tuple(each for each in allowed.get(needed, values) if each in values)
+        if not all(allowed.values()):
+            return None
+        return {each: values[0] for each, values in reversed(allowed.items())}
 
     def without(self, fixed: Mapping[str, Any]) -> Space:
         """Return the space without keys that somebody has given values, and without what needs other values."""

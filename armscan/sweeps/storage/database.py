@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Any, TypeVar, cast
+from collections.abc import Callable
+from functools import partial, wraps
+from typing import Any, TypeVar
 
 from optuna.distributions import BaseDistribution
-from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
-from optuna.storages import BaseStorage, RDBStorage, get_storage
-from optuna.trial import TrialState
+from optuna.exceptions import StorageInternalError
+from optuna.storages import BaseStorage, RDBStorage
+from optuna.storages._cached_storage import _CachedStorage
 from sqlalchemy import URL, Connection, create_engine, inspect, text
 from sqlalchemy.exc import DBAPIError, OperationalError, SQLAlchemyError
 
@@ -18,40 +19,9 @@ from armscan.config.credentials import STORAGE_PASSWORD, database_url
 from armscan.errors import StorageAwayError
 from armscan.utils.retry import RetryPolicy
 
+T = TypeVar("T")
 # Of a SQLite file that another process has locked, or that cannot be read for now.
 AWAY_IN_SQLITE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_IOERR")
-
-
-class ConnectionLostError(Exception):
-    """The connection was lost in the middle of a transaction."""
-
-
-def why_away(error: BaseException) -> str | None:
-    """Return why a database cannot be reached for now; None if the error is another."""
-    return _reason(error) if is_away(error) else None
-
-
-def is_away(error: BaseException | None) -> bool:
-    """Whether an error says that a storage cannot be reached for now, not that the request is wrong."""
-    # Optuna wraps errors, and may have asked again on a connection that was lost: the first one says why.
-    while isinstance(error, StorageInternalError | SQLAlchemyError) and not isinstance(error, DBAPIError):
-        error = error.__cause__ or error.__context__
-    if not isinstance(error, DBAPIError):
-        return isinstance(error, ConnectionLostError)
-    in_sqlite = getattr(error.orig, "sqlite_errorname", None)
-    if in_sqlite is not None:
-        return str(in_sqlite).startswith(AWAY_IN_SQLITE)
-    return error.connection_invalidated or isinstance(error, OperationalError)
-
-
-def _reason(error: BaseException) -> str:
-    while not isinstance(error, DBAPIError) and (cause := error.__cause__ or error.__context__) is not None:
-        error = cause
-    message = str(error.orig if isinstance(error, DBAPIError) else error).strip()
-    return message.splitlines()[0] if message else type(error).__name__
-
-
-T = TypeVar("T")
 # One of a PostgreSQL database's advisory locks.
 ADVISORY_LOCK = 0xA235CA
 # A lost machine holds the lock for so long, until its connection is closed.
@@ -66,144 +36,151 @@ TCP = {
 }
 
 
-def url_of(uri: str) -> URL:
-    """Return the address of a database with its driver and password."""
-    return database_url(uri, STORAGE_PASSWORD)
+class ConnectionLostError(Exception):
+    """The connection was lost in the middle of a transaction."""
 
 
-class DatabaseStorage:
+def why_away(error: BaseException) -> str | None:
+    """Return why a database cannot be reached for now; None if the error says that the request is wrong."""
+    is_away = isinstance(error, ConnectionLostError)
+    # Optuna wraps errors, and may have asked again on a connection that was lost: the first one says why.
+    while isinstance(error, ConnectionLostError | StorageInternalError | SQLAlchemyError):
+        cause = error.__cause__ or error.__context__
+        if isinstance(error, DBAPIError) or cause is None:
+            break
+        error = cause
+    if isinstance(error, DBAPIError):
+        in_sqlite = getattr(error.orig, "sqlite_errorname", None)
+        if in_sqlite is None:
+            is_away |= error.connection_invalidated or isinstance(error, OperationalError)
+        else:
+            is_away |= str(in_sqlite).startswith(AWAY_IN_SQLITE)
+    if not is_away:
+        return None
+    message = str(error.orig if isinstance(error, DBAPIError) else error).strip()
+    return message.splitlines()[0] if message else type(error).__name__
+
+
+class DatabaseStorage(_CachedStorage):
     """An Optuna storage in a database; each call is retried while the database is away.
 
     A call may be repeated although it was done and only its answer was lost: a value is set again, and a new trial that
-    no worker knows has no lease and is reclaimed.
+    no worker knows has no lease and is reclaimed. A state is set within a transaction, which looks at it first.
 
     Args:
-        url: of the database.
-        retry_policy: for a database that is away.
-        retry: whether to wait for it while opening it.
-        is_made: whether to create the tables if there are none.
+        database: the storage, as Optuna has it.
+        retry_policy: says when and for how long a call is repeated.
     """
 
-    def __init__(self, url: URL, retry_policy: RetryPolicy, *, retry: bool, is_made: bool) -> None:
+    def __init__(self, database: RDBStorage, retry_policy: RetryPolicy) -> None:
+        super().__init__(database)
         self._retry_policy = retry_policy
-        opened = partial(_opened, url, is_made=is_made)
-        self._rdb = retry_policy.call(opened) if retry else opened()
-        self._cached = get_storage(self._rdb)
         # Of each thread: `inside`, the storage of its current transaction, and `known`, that of the one before.
         self._here = threading.local()
 
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        if (inside := getattr(self._here, "inside", None)) is not None:
-            return getattr(inside, name)
-        return partial(self._call, getattr(self._cached, name))
-
     def set_trial_param(self, trial_id: int, name: str, value: float, distribution: BaseDistribution) -> None:
         """See `BaseStorage`."""
-        # The cache refuses trials that it has not seen, such as one that was claimed a moment ago in a transaction.
-        self._call(self._rdb.set_trial_param, trial_id, name, value, distribution)
+        # A cache refuses trials that it has not seen, such as one that was claimed a moment ago in another.
+        self.transaction(partial(self._backend.set_trial_param, trial_id, name, value, distribution))
 
-    def set_trial_state_values(self, trial_id: int, state: TrialState, values: Sequence[float] | None = None) -> bool:
-        """See `BaseStorage`."""
-        storage, n_calls = getattr(self._here, "inside", None) or self._cached, 0
+    def transaction(self, operate: Callable[[], T], *, is_exclusive: bool = False) -> T:
+        """Run an operation in one transaction, and again where the database went away in the middle.
 
-        def is_set() -> bool:
-            nonlocal n_calls
-            n_calls += 1
-            try:
-                return storage.set_trial_state_values(trial_id, state, values)
-            except UpdateFinishedTrialError:
-                # Others end a worker's trial only as failed: it was this worker, and the answer was lost.
-                if n_calls > 1 and storage.get_trial(trial_id).state == state:
-                    return True
-                raise
+        Args:
+            operate: reads and writes through this storage, in this thread.
+            is_exclusive: whether to hold the lock of a PostgreSQL database. Default: False.
 
-        return bool(self._call(is_set))
-
-    def exclusive(self, decide: Callable[[], T]) -> T:
-        """See `Storage.exclusive`; for a database that has a lock."""
-        return self._retry_policy.call(partial(self._in_transaction, decide, is_alone=True))
-
-    def transaction(self, operate: Callable[[], T]) -> T:
-        """See `Storage.transaction`; for a database that has transactions of several statements."""
-        if getattr(self._here, "inside", None) is not None:
+        Returns:
+            What the operation returns.
+        """
+        if hasattr(self._here, "inside"):
             return operate()
-        return self._retry_policy.call(partial(self._in_transaction, operate, is_alone=False))
+        return self._retry_policy.call(partial(self._in_transaction, operate, is_exclusive))
 
-    def _in_transaction(self, decide: Callable[[], T], *, is_alone: bool) -> T:
+    def _in_transaction(self, operate: Callable[[], T], is_exclusive: bool) -> T:
         # One transaction on one connection holds the lock and all writes: a lost connection loses both, and leaves
         # nothing half done. If it is lost during the commit, all or nothing was written: a repeated operation looks.
-        sessions = self._rdb.scoped_session
+        sessions = self._backend.scoped_session
         # A transaction has a cache of its own, which is kept unless it is rolled back.
-        inside = getattr(self._here, "known", None) or get_storage(self._rdb)
-        self._here.known = None
-        with self._rdb.engine.connect() as connection:
+        inside = self._here.__dict__.pop("known", None) or _CachedStorage(self._backend)
+        with self._backend.engine.connect() as connection:
             try:
                 with connection.begin():
-                    if is_alone:
+                    if is_exclusive:
                         _lock(connection)
                     sessions.remove()
                     # Optuna's commits in this thread are savepoints of the transaction.
                     sessions(bind=connection, join_transaction_mode="create_savepoint")
                     self._here.inside = inside
                     try:
-                        decided = decide()
+                        done = operate()
                     finally:
-                        self._here.inside = None
+                        del self._here.inside
                         sessions.remove()
             except Exception as error:
                 if connection.invalidated:
                     raise ConnectionLostError from error
                 raise
         self._here.known = inside
-        return decided
-
-    def _call(self, operate: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-        if getattr(self._here, "inside", None) is not None:
-            # The lock went with the connection: only the whole transaction may be repeated.
-            return operate(*args, **kwargs)
-        return self._retry_policy.call(partial(operate, *args, **kwargs))
+        return done
 
 
-BaseStorage.register(DatabaseStorage)
+def _retried(name: str, own: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a method of `BaseStorage` that is retried, outside a transaction; inside, that is repeated as a whole."""
+
+    @wraps(own)
+    def call(self: DatabaseStorage, *args: Any, **kwargs: Any) -> Any:
+        if hasattr(self._here, "inside"):
+            return getattr(self._here.inside, name)(*args, **kwargs)
+        return self._retry_policy.call(partial(own, self, *args, **kwargs))
+
+    return call
 
 
-def open_database(url: URL, shown: str, *, retry: bool, is_made: bool = True) -> BaseStorage:
-    """Open a database.
+for _name in BaseStorage.__abstractmethods__ - {"set_trial_param"}:
+    setattr(DatabaseStorage, _name, _retried(_name, getattr(DatabaseStorage, _name)))
+
+
+def open_database(uri: str, *, retry: bool = False) -> DatabaseStorage:
+    """Open a database, and create its tables if there are none.
 
     Args:
-        url: of the database.
-        shown: the same, without a password.
-        retry: whether to wait for it.
-        is_made: whether to create the tables if there are none.
+        uri: address of a SQLite or PostgreSQL database, without a password.
+        retry: whether to wait for a database that is away while opening it. Default: False.
     """
-    retry_policy = RetryPolicy("the storage", f"study.storage is {shown!r}", why_away, StorageAwayError)
-    opened = DatabaseStorage(url, retry_policy, retry=retry, is_made=is_made)
-    return cast(BaseStorage, opened)
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    retry_policy = RetryPolicy("the storage", f"study.storage is {uri!r}", why_away, StorageAwayError)
+    opened = partial(_opened, database_url(uri, STORAGE_PASSWORD))
+    return DatabaseStorage(retry_policy.call(opened) if retry else opened(), retry_policy)
 
 
 def tables_in(url: URL) -> list[str]:
     """Return the names of the tables of a database."""
-    engine = create_engine(url, connect_args=TCP if url.get_backend_name() == "postgresql" else {})
+    engine = create_engine(url, connect_args=_options(url))
     try:
         return inspect(engine).get_table_names()
     finally:
         engine.dispose()
 
 
-def _opened(url: URL, *, is_made: bool) -> RDBStorage:
-    options: dict[str, Any] = {"pool_pre_ping": True}
-    uri = url.render_as_string(hide_password=False)
+def _options(url: URL) -> dict[str, int]:
+    return TCP if url.get_backend_name() == "postgresql" else {}
+
+
+def _opened(url: URL) -> RDBStorage:
+    opened = partial(
+        RDBStorage,
+        url.render_as_string(hide_password=False),
+        engine_kwargs={"pool_pre_ping": True, "connect_args": _options(url)},
+    )
     if url.get_backend_name() != "postgresql":
-        return RDBStorage(uri, engine_kwargs=options, skip_table_creation=not is_made)
-    options["connect_args"] = TCP
+        return opened()
     engine = create_engine(url, connect_args=TCP)
     try:
         # Processes that make the tables of an empty database at once get into each other's way.
         with engine.begin() as connection:
             _lock(connection)
-            return RDBStorage(uri, engine_kwargs=options, skip_table_creation=not is_made)
+            return opened()
     finally:
         engine.dispose()
 

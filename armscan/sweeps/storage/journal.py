@@ -11,64 +11,37 @@ from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from armscan.errors import StudyError
 from armscan.utils.files import truncate_torn_line
 
-BLOCK_BYTES = 4096
+# How every line of a journal begins.
+BEGINNING = b'{"op_code"'
 
 
-def open_journal(path: Path, where: str) -> JournalStorage:
-    """Open a journal to write, create it if there is none, and truncate a torn last line.
+def open_journal(path: Path, *, is_written: bool) -> JournalStorage:
+    """Open a journal.
 
     Args:
         path: of the file.
-        where: key that named it, for messages.
+        is_written: whether to create it if there is none, and to truncate a torn last line.
 
     Raises:
-        StudyError: if no file can be used there, or the one that is there is no journal.
+        OSError: if no file can be used there.
+        StudyError: if the file is no journal, or is damaged before its last line.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-        JournalLock(path).touch()
-    except OSError as error:
-        raise StudyError(f"{where} is {str(path)!r}, but no file can be used there ({error.strerror})") from error
-    # Before the repair, which would damage any other file.
-    _check_beginning(path, where)
     lock = JournalLock(path)
-    lock.acquire()
-    lock.release()
-    return read_journal(path, where)
-
-
-def read_journal(path: Path, where: str) -> JournalStorage:
-    """Open a journal that exists, as it is.
-
-    Args:
-        path: of the file.
-        where: key that named it, for messages.
-
-    Raises:
-        StudyError: if it cannot be read, is no journal, or is damaged before its last line.
-    """
-    _check_beginning(path, where)
+    if is_written:
+        path.touch()
+        lock.touch()
+    # Before the repair, which would damage any other file. A journal may be empty, or torn in its first line.
+    with path.open("rb") as file:
+        if not BEGINNING.startswith(file.read(len(BEGINNING))):
+            raise StudyError("that file is no journal of Optuna")
+    if is_written:
+        lock.acquire()
+        lock.release()
     try:
-        return JournalStorage(JournalFileBackend(str(path), lock_obj=JournalLock(path)))
+        return JournalStorage(JournalFileBackend(str(path), lock_obj=lock))
     # What Optuna raises for a line that it cannot read, whichever way it is damaged.
     except (ValueError, KeyError, TypeError, AssertionError) as error:
-        raise StudyError(f"{where} is {str(path)!r}, but that file is no journal of Optuna: {error}") from error
-
-
-def _check_beginning(path: Path, where: str) -> None:
-    try:
-        with path.open("rb") as file:
-            first_line = file.readline(BLOCK_BYTES)
-    except OSError as error:
-        raise StudyError(f"{where} is {str(path)!r}, but that file cannot be read ({error.strerror})") from error
-    if not _begins_a_journal(first_line):
-        raise StudyError(f"{where} is {str(path)!r}, but that file is no journal of Optuna")
-
-
-def _begins_a_journal(line: bytes) -> bool:
-    """Whether this is the first line of a journal, which may be empty, or torn in its first line."""
-    return not line or (line.startswith(b"{") and (b'"op_code"' in line or not line.endswith(b"\n")))
+        raise StudyError(f"that file is no journal of Optuna: {error}") from error
 
 
 class JournalLock(JournalFileOpenLock):

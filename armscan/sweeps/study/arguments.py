@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, QuotedString
+from hydra.core.override_parser.types import Override
 
 from armscan.config.command_hints import run_command
 from armscan.config.defaults import MULTIRUN, PLAN, RESUME
 from armscan.config.sources import SWEEP
 from armscan.errors import InvalidValueError
 from armscan.launch.launchers import LAUNCHER
-from armscan.sweeps.space.parse import NOT_SEARCHED
+from armscan.sweeps.space.parameter import NOT_SEARCHED
 
 STUDY = "study"
 USUAL_LAUNCHER = "submitit_local"
 WORKER_KEY, SPACE, STORAGE, SEARCH_PATH = "study.worker", "study.space", "study.storage", "hydra.searchpath"
+# Of one key: where the range begins, say, or all of it.
+SPACE_WORD = re.compile(r"\+*study\.space(?:\.(.+?)(?:\.(low|high|log|step|choices|when))?)?=(.*)", re.DOTALL)
+NO_RANGE = ",low:null,high:null,log:null,step:null"
 
 
 @dataclass(frozen=True)
@@ -41,33 +45,27 @@ class StudyCommand:
         Raises:
             InvalidValueError: if they say something that no study can do.
         """
-        options = [word for word in words if word in (*MULTIRUN, PLAN)]
-        own = tuple(_merging(word) for word in words if word not in options)
-        chosen = [word for word in own if word.startswith(f"{SWEEP}=")]
-        if len(chosen) != 1:
-            given = f"is given {len(chosen)} times" if chosen else "is not set"
-            raise InvalidValueError(f"{SWEEP} {given}, but it must be once: give {SWEEP}=NAME")
-        if not {*MULTIRUN} & {*options}:
-            raise InvalidValueError(f"a study has many runs, which needs -m: {run_command(['-m', *own, *options])}")
-        if resumed := [word for word in own if word.startswith(f"{RESUME}=")]:
-            raise InvalidValueError(f"{resumed[0]!r} is not for a study, which goes on where it stands by itself")
+        own = [word for word in words if word not in (*MULTIRUN, PLAN)]
         overrides = _overrides(own)
-        if [whole for whole in overrides if whole.key_or_group == STUDY]:
+        keys = [each.key_or_group for each in overrides]
+        if (n_given := keys.count(SWEEP)) != 1:
+            given = f"is given {n_given} times" if n_given else "is not set"
+            raise InvalidValueError(f"{SWEEP} {given}, but it must be once: give {SWEEP}=NAME")
+        if not {*MULTIRUN} & {*words}:
+            raise InvalidValueError(f"a study has many runs, which needs -m: {run_command(['-m', *words])}")
+        if RESUME in keys:
+            raise InvalidValueError(f"{RESUME} is not for a study, which goes on where it stands by itself")
+        if STUDY in keys:
             raise InvalidValueError("study is a section of the configuration: give its keys, such as study.n_trials=40")
-        _check_single_values(overrides)
-        _check_search_path(overrides)
-        return cls(own, PLAN in options)
+        for override in overrides:
+            _check(override)
+        return cls(tuple(map(_merging, own)), PLAN in words)
 
     @property
     def launching(self) -> list[str]:
         """The words that the workers are launched with."""
         is_chosen = any(word.startswith(f"{LAUNCHER}=") for word in self.words)
         return [*self.words, *([] if is_chosen else [f"{LAUNCHER}={USUAL_LAUNCHER}"])]
-
-    @property
-    def of_trials(self) -> list[str]:
-        """The words that the configuration of a trial is composed of."""
-        return words_of_trials(self.words)
 
 
 def words_of_trials(words: Sequence[str]) -> list[str]:
@@ -81,48 +79,34 @@ def words_of_trials(words: Sequence[str]) -> list[str]:
 
 def fixed_by(words: Sequence[str]) -> dict[str, Any]:
     """Return the values that words give to keys and groups of the configuration."""
-    return {each.key_or_group: _plain(each.value()) for each in _overrides(words)}
+    return {each.key_or_group: each.value() for each in _overrides(words)}
 
 
 def _merging(word: str) -> str:
-    """Return a word so that it can add to the space of the study, which Hydra would refuse."""
-    key = word.partition("=")[0]
-    return f"++{word}" if key == SPACE or key.startswith(f"{SPACE}.") else word
+    """Return a word so that Hydra changes the space of the study key by key, where it is one that does."""
+    given = SPACE_WORD.fullmatch(word)
+    if given is None:
+        return word
+    key, part, value = given.groups()
+    if part:
+        # Choices stand in the place of a range.
+        value = f"{{{part}:{value}{NO_RANGE if part == 'choices' else ''}}}"
+    return f"++{SPACE}={{{key}:{value}}}" if key else f"++{SPACE}={value}"
 
 
 def _overrides(words: Sequence[str]) -> list[Override]:
     return OverridesParser.create().parse_overrides(list(words))
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, QuotedString):
-        return value.text
-    if isinstance(value, list):
-        return [_plain(each) for each in value]
-    if isinstance(value, dict):
-        return {str(_plain(key)): _plain(each) for key, each in value.items()}
-    return value
-
-
-def _check_single_values(overrides: Sequence[Override]) -> None:
-    for override in overrides:
-        if override.is_sweep_override() and override.key_or_group.startswith(NOT_SEARCHED):
-            raise InvalidValueError(
-                f"{override.input_line!r} gives several values, but a study has one: 'KEY=[...]' is a list"
-            )
-        if override.is_sweep_override():
-            raise InvalidValueError(
-                f"{override.input_line!r} gives several values, but those of a study come from its space: give "
-                f"'{SPACE}.{override.key_or_group}.choices=[...]'"
-            )
-
-
-def _check_search_path(overrides: Sequence[Override]) -> None:
-    for override in overrides:
-        if override.key_or_group != SEARCH_PATH:
-            continue
-        folders = _plain(override.value())
-        for folder in folders if isinstance(folders, list) else [folders]:
-            path = str(folder).removeprefix("file://")
+def _check(override: Override) -> None:
+    key, value = override.key_or_group, override.value()
+    if override.is_sweep_override():
+        instead = f"those of a study come from its space: give '{SPACE}.{key}.choices=[...]'"
+        if key.startswith(NOT_SEARCHED):
+            instead = "a study has one: 'KEY=[...]' is a list"
+        raise InvalidValueError(f"{override.input_line!r} gives several values, but {instead}")
+    if key == SEARCH_PATH:
+        for folder in map(str, value if isinstance(value, list) else [value]):
+            path = folder.removeprefix("file://")
             if "://" not in path and not Path(path).is_dir():
                 raise InvalidValueError(f"{SEARCH_PATH} names {path!r}, but there is no such folder")

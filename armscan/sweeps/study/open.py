@@ -12,17 +12,14 @@ import optuna
 from omegaconf import DictConfig
 
 from armscan.config.defaults import to_plain
-from armscan.errors import InvalidValueError, StudyError, listed
-from armscan.sweeps.scheduling.scheduler import Limits, TrialScheduler
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.storage.storage import Storage, open_storage
-from armscan.sweeps.study.arguments import fixed_by
-from armscan.sweeps.study.components import make_pruner, make_sampler, make_task
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.finalists import final_seed_of
 from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import STUDY_RUN, make_study
-from armscan.sweeps.tasks.attempt import composed, study_section
 from armscan.sweeps.tasks.base import Task
 from armscan.tracking import TrackingStore, open_store, source_tags
 from armscan.utils.retry import RETRY_S
@@ -36,7 +33,6 @@ class OpenedStudy:
 
     Args:
         settings: of the study.
-        task: what its trials do.
         config: of its trials, without the searched values.
         storage: that it is kept in.
         client: of the tracking store.
@@ -46,7 +42,6 @@ class OpenedStudy:
     """
 
     settings: StudySettings
-    task: Task
     config: DictConfig
     storage: Storage
     client: TrackingStore
@@ -63,48 +58,6 @@ class OpenedStudy:
     def phases(self) -> tuple[Phase, ...]:
         """The search, and the final evaluation if there is one."""
         return (self.search,) if self.final_eval is None else (self.search, self.final_eval)
-
-
-def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig]:
-    """Return what a command line asks of a study, what a trial does, and its configuration without what it tries.
-
-    Raises:
-        InvalidValueError: if something is not allowed.
-    """
-    section = study_section(words)
-    if not section:
-        raise InvalidValueError("there is no study in the configuration: give sweep=NAME of a file with one")
-    settings = StudySettings.read(section, fixed_by(words))
-    # What cannot be made is refused here, and not by the first trial.
-    make_sampler(settings.sampler, settings.seed)
-    make_pruner(settings.pruner)
-    for name in ("folder", "artifacts"):
-        check_folder(f"study.{name}", getattr(settings, name))
-    task = make_task(settings.task)
-    for name in settings.objectives:
-        if name not in task.metrics:
-            raise InvalidValueError(f"study.objectives names {name!r}, but a trial returns only {listed(task.metrics)}")
-    return settings, task, composed(words)[0]
-
-
-def check_folder(where: str, folder: str) -> None:
-    """Raise `StudyError` where something that is no folder is, or stands in the way."""
-    path = Path(folder).absolute()
-    there = next(each for each in (path, *path.parents) if each.exists())
-    if not there.is_dir():
-        raise StudyError(f"{where} is {folder!r}, but {str(there)!r} is no folder")
-
-
-def make_folder(where: str, folder: str) -> None:
-    """Make a folder where there is none.
-
-    Raises:
-        StudyError: if that cannot be.
-    """
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StudyError(f"{where} is {folder!r}, but no folder can be made there ({error.strerror})") from error
 
 
 def open_for_work(
@@ -125,8 +78,8 @@ def open_for_work(
     """
     retry_s = RETRY_S if retry else None
     client, experiment_id = open_store(**to_plain(config.tracking), retry_s=retry_s)
-    for name in ("folder", "artifacts"):
-        make_folder(f"study.{name}", getattr(settings, name))
+    for folder in (settings.folder, settings.artifacts):
+        Path(folder).mkdir(parents=True, exist_ok=True)
     storage = open_storage(settings.storage, retry=retry)
     study = make_study(storage, settings, to_plain(config))
 
@@ -145,7 +98,7 @@ def open_for_work(
     objectives = tuple(settings.objectives)
     search = Phase(
         name=settings.name,
-        scheduler=TrialScheduler(study, storage, settings.limits),
+        scheduler=TrialScheduler(study, storage, settings),
         space=settings.space,
         objectives=objectives,
         reported=objectives[0] if len(objectives) == 1 else None,
@@ -155,14 +108,12 @@ def open_for_work(
         seed=settings.seed,
         folder=Path(settings.folder),
         artifacts=Path(settings.artifacts),
-        storage_uri=storage.uri,
         client=client,
         experiment_id=experiment_id,
         run_id=run_id,
     )
     return OpenedStudy(
         settings=settings,
-        task=task,
         config=config,
         storage=storage,
         client=client,

@@ -34,7 +34,6 @@ class Phase:
         seed: of the samplers.
         folder: of the trials.
         artifacts: see `StudySettings`.
-        storage_uri: of the storage, without a password.
         client: of the tracking store.
         experiment_id: of the tracked runs.
         run_id: of the study's tracked run.
@@ -51,7 +50,6 @@ class Phase:
     seed: int
     folder: Path
     artifacts: Path
-    storage_uri: str
     client: TrackingStore
     experiment_id: str
     run_id: str

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.sweeps.scheduling.state import StudyState
-from armscan.sweeps.space.space import Parameter
+from armscan.sweeps.space.parameter import Parameter
 from armscan.sweeps.study.settings import StudySettings
 
 BYTES_A_MIB = 2**20

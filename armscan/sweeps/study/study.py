@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import optuna
-from optuna.study import StudyDirection
 
 from armscan.config.defaults import NOT_COMPARED
 from armscan.config.legacy import migrate, renamed
@@ -21,24 +20,12 @@ SPACE, FIXED, STUDY_RUN, DASHBOARD_OBJECTIVES = "space", "fixed_config", "mlflow
 N_SHOWN = 5
 
 
-def open_study(storage: Storage, settings: StudySettings, name: str | None = None) -> optuna.Study:
-    """Open a study that exists.
-
-    Args:
-        storage: that it is in.
-        settings: of it.
-        name: its name; that of the settings where it is None.
-    """
-    pruner = make_pruner(settings.pruner)
-    return optuna.load_study(study_name=name or settings.name, storage=storage.optuna, pruner=pruner)
-
-
 def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study:
-    """Make a study, or finds the one that exists.
+    """Make a study, or find the one that exists.
 
     Args:
-        storage: that it is or will be in.
-        settings: of it.
+        storage: the one that it is or will be in.
+        settings: those of the study.
         fixed: the configuration of its trials, without what they try.
 
     Raises:
@@ -48,10 +35,13 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
     wanted = _wanted(settings, fixed)
 
     def made() -> optuna.Study:
-        if settings.name not in optuna.get_all_study_names(storage.optuna):
-            directions = [StudyDirection[each.upper()] for each in settings.objectives.values()]
-            optuna.create_study(study_name=settings.name, storage=storage.optuna, directions=directions)
-        study = open_study(storage, settings)
+        study = optuna.create_study(
+            study_name=settings.name,
+            storage=storage.optuna,
+            pruner=make_pruner(settings.pruner),
+            directions=[*settings.objectives.values()],
+            load_if_exists=True,
+        )
         # Also where whoever has just made it died before it could say what it is.
         if not study.user_attrs.keys() >= wanted.keys() and not study.get_trials(deepcopy=False):
             for key, value in wanted.items():
@@ -72,7 +62,7 @@ def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.
     storage = existing_storage(settings.storage)
     if storage is None or settings.name not in optuna.get_all_study_names(storage.optuna):
         return None
-    study = open_study(storage, settings)
+    study = optuna.load_study(study_name=settings.name, storage=storage.optuna)
     if not settings.allow_config_changes:
         _check_same(settings, study, _wanted(settings, fixed))
     return study

@@ -101,7 +101,7 @@ class Attempt:
     def keep_seed(self, seed: int, metrics: Mapping[str, float]) -> None:
         """Keep the metrics of a seed that has been run to its end."""
         self._of_seeds = self._of_seeds | {str(seed): dict(metrics)}
-        self.writes.add(partial(self.trial.set_user_attr, SEEDS, self._of_seeds))
+        self.writes.append(partial(self.trial.set_user_attr, SEEDS, self._of_seeds))
         if any(each not in self.seeds_done for each in self.seeds):
             # The next report may be long in coming, and a retry must not train this seed again.
             self.writes.flush_with(self.transaction, lambda: True)

@@ -21,10 +21,10 @@ from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.sweeps.scheduling.outcome import TrialOutcome
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF
 from armscan.sweeps.space.overrides import overrides_of
-from armscan.sweeps.study.components import make_sampler
+from armscan.sweeps.study.components import make_sampler, read_settings
 from armscan.sweeps.study.dashboard import note_run, show_picture
 from armscan.sweeps.study.finalists import enqueue_final_trials
-from armscan.sweeps.study.open import open_for_work, read_settings
+from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.tasks.attempt import CONFIG_SHA256, FOLDER, RUN, Attempt, composed, config_sha256, trial_folder
 from armscan.sweeps.tasks.base import check_metrics
@@ -127,7 +127,7 @@ class Worker:
         self._opened(None)
         for name, value in ((FOLDER, str(folder)), (CONFIG_SHA256, config_sum)):
             if trial.user_attrs.get(name) != value:
-                writes.add(partial(trial.set_user_attr, name, value))
+                writes.append(partial(trial.set_user_attr, name, value))
         attempt = Attempt(
             trial=trial,
             chosen=chosen,
@@ -139,15 +139,15 @@ class Worker:
             objective=phase.reported,
             report_progress=self._heartbeat.report_progress,
             opened=self._opened,
-            show_picture=lambda picture: writes.add(partial(show_picture, trial, picture, phase.artifacts)),
+            show_picture=lambda picture: writes.append(partial(show_picture, trial, picture, phase.artifacts)),
             reported=_steps_of(trial) if is_resumed else set(),
             writes=writes,
-            transaction=phase.scheduler.transaction,
+            transaction=phase.scheduler.storage.transaction,
         )
         try:
             return phase.run(attempt)
         finally:
-            writes.add(partial(trial.set_user_attr, ENV_STEPS, attempt.env_steps))
+            writes.append(partial(trial.set_user_attr, ENV_STEPS, attempt.env_steps))
 
     def _suggest(self, trial: Trial) -> dict[str, Any]:
         """Return the values of a trial, drawn and written in one transaction."""
@@ -156,14 +156,14 @@ class Worker:
             # A new object each time: what the trial believes written may have been lost with the connection.
             return self._phase.space.suggest(Trial(trial.study, trial._trial_id))
 
-        return self._phase.scheduler.transaction(suggest)
+        return self._phase.scheduler.storage.transaction(suggest)
 
     def _begun(self, trial: Trial, chosen: dict[str, Any], folder: Path, config_sum: str) -> TrackedRun:
         """Open the tracked run of a trial, or resume that of a requeued one."""
         phase, attributes = self._phase, trial.user_attrs
         tags = {
             "study": phase.name,
-            "study.storage": phase.storage_uri,
+            "study.storage": phase.scheduler.storage.uri,
             "trial": str(trial.number),
             SHA256_TAGS[CONFIG_FILE]: config_sum,
             "folder": str(folder.resolve()),
@@ -186,7 +186,7 @@ class Worker:
             # Before the trial knows its run: a resumed trial writes no note.
             note = partial(note_run, trial, phase.client, phase.experiment_id, tracked.run_id, folder)
             for write in (note, partial(trial.set_user_attr, RUN, tracked.run_id)):
-                self._heartbeat.writes.add(write)
+                self._heartbeat.writes.append(write)
         return tracked
 
     def _opened(self, training: TrackedRun | None) -> None:

@@ -7,7 +7,8 @@ import optuna
 import pytest
 from PIL import Image
 
-from armscan.sweeps.scheduling.scheduler import Limits, TrialScheduler
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.storage.storage import open_storage
 from tests.sweeps.conftest import fail
 

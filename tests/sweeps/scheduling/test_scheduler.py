@@ -68,14 +68,16 @@ def test_study_whose_first_trials_all_fail_at_once_ends(make_scheduler):
 
 
 def test_limits_of_time_and_environment_steps_end_a_study(make_scheduler):
-    scheduler = make_scheduler(env_steps=100)
+    scheduler = make_scheduler(max_env_steps=100)
     scheduler.claim({"env_steps": 99})
     assert scheduler.end(scheduler.state()) is None
     scheduler.claim({"env_steps": 1})
     assert scheduler.end(scheduler.state()) == "the 100 environment steps of study.max_env_steps are taken"
-    assert make_scheduler(hours=1.0).end(scheduler.state()) is None
+    assert make_scheduler(timeout_hours=1.0).end(scheduler.state()) is None
     time.sleep(0.1)
-    assert make_scheduler(hours=1e-5).end(scheduler.state()) == "the 1e-05 hours of study.timeout_hours are over"
+    assert (
+        make_scheduler(timeout_hours=1e-5).end(scheduler.state()) == "the 1e-05 hours of study.timeout_hours are over"
+    )
 
 
 def test_trial_of_a_dead_worker_is_retried_once_with_its_values(make_scheduler):
@@ -112,7 +114,9 @@ def test_trial_whose_worker_died_while_it_took_it_is_reclaimed_at_once(make_sche
 def test_death_between_a_retry_and_the_failure_makes_no_second_retry(make_scheduler, monkeypatch):
     scheduler, other = make_scheduler(), make_scheduler()
     scheduler.claim({"worker": "a"})
-    monkeypatch.setattr(scheduler, "_fail", lambda *_: (_ for _ in ()).throw(SystemExit))
+    monkeypatch.setattr(
+        scheduler.study._storage, "set_trial_state_values", lambda *_: (_ for _ in ()).throw(SystemExit)
+    )
     with pytest.raises(SystemExit):
         scheduler.reclaim(lambda _: True)
     other.reclaim(lambda _: True)

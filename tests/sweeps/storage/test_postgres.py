@@ -12,9 +12,8 @@ import optuna
 import pytest
 from mlflow import MlflowClient
 
-from armscan.config.credentials import STORAGE_PASSWORD
+from armscan.config.credentials import STORAGE_PASSWORD, database_url
 from armscan.errors import StudyError
-from armscan.sweeps.storage.database import url_of
 from armscan.sweeps.storage.storage import open_storage
 from tests.support.postgres import PASSWORD
 
@@ -130,10 +129,10 @@ def test_address_with_a_password_is_refused_where_it_would_be_shown(answer, tmp_
 
 def test_address_uses_psycopg_and_the_password_of_the_environment(monkeypatch):
     monkeypatch.setenv(STORAGE_PASSWORD, "a:b@c")
-    assert url_of("postgresql://me@host/db").render_as_string(hide_password=False) == (
+    assert database_url("postgresql://me@host/db", STORAGE_PASSWORD).render_as_string(hide_password=False) == (
         "postgresql+psycopg://me:a%3Ab%40c@host/db"
     )
-    assert url_of("sqlite:///a.db").password is None
+    assert database_url("sqlite:///a.db", STORAGE_PASSWORD).password is None
 
 
 def test_study_in_postgresql_without_psycopg_says_what_to_install(monkeypatch):

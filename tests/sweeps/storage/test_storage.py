@@ -74,13 +74,12 @@ def test_journal_that_is_torn_while_others_have_it_open_is_mended_by_the_next_to
 @pytest.mark.parametrize(
     ("uri", "line"),
     [
-        ("", "study.storage is '', but it must be a file, or the URL of a database"),
-        (3, "study.storage is 3, but it must be a file"),
         ("mysql://a@b/c", "study.storage is 'mysql://a@b/c', but it must be a file, sqlite:///FILE or postgres"),
         ("/dev/null/a", "study.storage is '/dev/null/a', but no file can be used there"),
+        ("", "but no file can be used there (what is there is no file)"),
         ("/proc/a", "study.storage is '/proc/a', but no file can be used there"),
-        ("sqlite:////proc/a", "study.storage is 'sqlite:////proc/a', but this storage cannot be used"),
-        ("sqlite:////dev/null/a", "study.storage is 'sqlite:////dev/null/a', but this storage cannot be used"),
+        ("sqlite:////proc/a", "study.storage is 'sqlite:////proc/a', but no file can be used there"),
+        ("sqlite:////dev/null/a", "study.storage is 'sqlite:////dev/null/a', but no file can be used there"),
     ],
 )
 def test_storage_that_cannot_be_used_is_refused_in_one_line(uri, line):

@@ -6,6 +6,8 @@ import pytest
 from armscan.errors import StudyError
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
+from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.finalists import enqueue_final_trials
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.study import make_study
@@ -102,3 +104,24 @@ def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_
     final = optuna.create_study(study_name="a-judged", storage=storage.optuna)
     enqueue_final_trials(storage, now, search, final)
     assert final.ask().suggest_float("agent.utd_ratio", **lr) == ratio
+
+
+def test_space_is_changed_key_by_key_on_the_command_line():
+    words = [
+        *("-m", "sweep=sac_y", "study.space.agent.lr.high=0.5", "study.space.agent.gamma=null"),
+        *("study.space.agent.utd_ratio.choices=[0.1,0.2]", "+study.space.agent.batch_size.choices=[8, 16]"),
+        *("study.space.agent.tau={low: 0.001, high: 0.1}", "study.space.network.choices=[auto,mlp]"),
+        *("study.space.network.vector.hidden_sizes.choices=[[8]]", "agent.target_entropy_per_dim=-1"),
+        "study.space.network.vector.hidden_sizes.when={network: auto}",
+    ]
+    settings, _, _ = read_settings(words_of_trials(StudyCommand.read(words).words))
+    assert settings.space == Space.read(
+        {
+            "agent.lr": {"low": 1e-4, "high": 0.5, "log": True},
+            "agent.utd_ratio": {"choices": [0.1, 0.2]},
+            "agent.batch_size": {"choices": [8, 16]},
+            "agent.tau": {"low": 0.001, "high": 0.1},
+            "network": {"choices": ["auto", "mlp"]},
+            "network.vector.hidden_sizes": {"choices": [[8]], "when": {"network": "auto"}},
+        }
+    )

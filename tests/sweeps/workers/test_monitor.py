@@ -8,8 +8,8 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.scheduling.scheduler import Limits, TrialScheduler
-from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, Limits
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.finalists import missing_final_trials
 from armscan.sweeps.workers import monitor as module

@@ -1,6 +1,5 @@
 """Storages that are away for a while: nothing is lost, nothing is done twice, and nobody waits for ever."""
 
-import contextlib
 import multiprocessing
 import os
 import random
@@ -10,14 +9,16 @@ import time
 
 import optuna
 import pytest
+from optuna.trial import TrialState
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.errors import StorageAwayError
 from armscan.sweeps.results import progress as screen
-from armscan.sweeps.scheduling.scheduler import Limits, TrialScheduler
-from armscan.sweeps.scheduling.state import LEASE, RETRY_OF
-from armscan.sweeps.storage.database import is_away
+from armscan.sweeps.scheduling.outcome import PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import LEASE, RETRY_OF, Limits
+from armscan.sweeps.storage.database import why_away
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.workers import heartbeat as lease
 from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
@@ -45,7 +46,7 @@ def lose_commit(request, monkeypatch):
     def lose(scheduler, meanwhile=lambda: None):
         import psycopg
 
-        dialect = scheduler._storage.optuna._rdb.engine.dialect
+        dialect = scheduler.storage.optuna._backend.engine.dialect
         commit = dialect.do_commit
 
         def lost(connection):
@@ -61,6 +62,11 @@ def lose_commit(request, monkeypatch):
         monkeypatch.setattr(dialect, "do_commit", lost)
 
     return lose
+
+
+def complete(trial, value):
+    """The outcome of a trial, which its worker tells with its next claim."""
+    return TrialOutcome(trial, TrialState.COMPLETE, PendingWrites(), values=[value])
 
 
 def states(scheduler):
@@ -88,22 +94,21 @@ def test_claim_of_a_waiting_trial_whose_answer_is_lost_takes_that(open_scheduler
 
 def test_trial_is_told_once_where_the_answer_is_lost(open_scheduler, lose_commit, capsys):
     scheduler = open_scheduler()
-    trial = scheduler.claim({})
+    outcome = complete(scheduler.claim({}), 3.0)
     lose_commit(scheduler)
-    scheduler.study.tell(trial, 3.0)
+    scheduler.claim({}, outcome)
+    assert outcome.is_told
     assert [each.value for each in open_scheduler().state().finished] == [3.0]
     said = [line.partition("  ")[2] for line in capsys.readouterr().out.splitlines()]
     assert said == ["the storage is away (the connection is lost): waiting", "the storage is back"]
 
 
 def test_trial_that_was_failed_by_another_meanwhile_is_not_told(open_scheduler, lose_commit):
-    scheduler, other = open_scheduler(), open_scheduler()
-    trial, is_told = scheduler.claim({}), False
+    scheduler, other = open_scheduler(n_trials=1), open_scheduler(n_trials=1)
+    outcome = complete(scheduler.claim({}), 1.0)
     lose_commit(scheduler, meanwhile=lambda: other.reclaim(lambda _: True))
-    with contextlib.suppress(optuna.exceptions.UpdateFinishedTrialError):
-        scheduler.study.tell(trial, 1.0)
-        is_told = True
-    assert states(other) == (["COMPLETE"] if is_told else ["FAIL", "WAITING"])
+    scheduler.claim({}, outcome)
+    assert states(other) == (["COMPLETE"] if outcome.is_told else ["FAIL", "RUNNING"])
 
 
 def test_trial_that_is_taken_up_by_another_while_it_is_handed_back_stays_theirs(open_scheduler, lose_commit):
@@ -152,26 +157,28 @@ def test_what_was_decided_where_something_went_wrong_is_not_there(open_scheduler
             scheduler.study.ask()
         raise ValueError("something went wrong")
 
-    assert scheduler._storage.exclusive(scheduler.state).all == ()
+    assert scheduler.storage.exclusive(scheduler.state).all == ()
     with pytest.raises(ValueError, match="something went wrong"):
-        scheduler._storage.exclusive(decide)
+        scheduler.storage.exclusive(decide)
     assert scheduler.state().all == open_scheduler().state().all == ()
-    assert scheduler._storage.exclusive(scheduler.state).all == ()
+    assert scheduler.storage.exclusive(scheduler.state).all == ()
 
 
 def work(open_scheduler, n_trials):
     scheduler, liveness, chance = open_scheduler(n_trials=n_trials), LivenessCheck(), random.Random(os.getpid())
     holder = {"host": os.uname().nodename, "pid": os.getpid(), "started": process_start(os.getpid())}
-    while scheduler.end(scheduler.state()) is None:
+    outcome = None
+    while outcome is not None or scheduler.end(scheduler.state()) is None:
         scheduler.reclaim(liveness.is_dead)
-        trial = scheduler.claim(holder)
+        trial = scheduler.claim(holder, outcome)
+        outcome = None
         if trial is None:
             time.sleep(0.01)
             continue
         trial.suggest_float("x", 0, 1)
         time.sleep(chance.uniform(0.0, 0.1))
         trial.report(1.0, 1)
-        scheduler.study.tell(trial, 1.0)
+        outcome = complete(trial, 1.0)
 
 
 def test_workers_lose_no_trial_and_make_none_too_many_while_the_server_restarts(open_scheduler, postgres):
@@ -290,4 +297,4 @@ def test_only_what_passes_is_waited_for(tmp_path, statement, is_waited_for):
     with pytest.raises(SQLAlchemyError) as raised, engine.begin() as connection:
         connection.execute(text(statement))
     locked.close()
-    assert is_away(raised.value) is is_waited_for
+    assert (why_away(raised.value) is not None) is is_waited_for

@@ -8,7 +8,8 @@ import numpy as np
 import optuna
 import pytest
 
-from armscan.sweeps.scheduling.scheduler import Limits, TrialScheduler
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.finalists import best_trials
@@ -52,7 +53,6 @@ def work(tmp_path, empty_database):
             seed=seed,
             folder=folder,
             artifacts=folder / "artifacts",
-            storage_uri=storage.uri,
             client=client,
             experiment_id=experiment_id,
             run_id=client.create_run(experiment_id, name="study", tags={}).info.run_id,

@@ -1,0 +1,119 @@
+"""A dimension of a search space: what is written of it, and what Optuna draws from it."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Self
+
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.trial import BaseTrial
+from pydantic import AfterValidator, Field
+
+from armscan.errors import InvalidValueError
+from armscan.sweeps.space.overrides import Value, as_kept
+from armscan.sweeps.space.section import Section
+
+# Whatever begins with one of these.
+NOT_SEARCHED = ("study", "sweep", "tracking", "hydra", "seed")
+KEY = re.compile(r"[A-Za-z_][\w/]*(\.\w+)*")
+Number = int | Annotated[float, Field(allow_inf_nan=False)]
+
+
+def _kept(choices: list[Any]) -> list[Any]:
+    kept = [as_kept(each) for each in choices]
+    if len(set(map(repr, kept))) < max(1, len(kept)):
+        raise ValueError
+    return kept
+
+
+class _Searched(Section):
+    when: dict[str, Any] | None = Field(default=None, min_length=1, description="choices of other keys, by their names")
+
+
+class _Range(_Searched):
+    low: Number = Field(description="a finite number")
+    high: Number = Field(description="a finite number")
+    log: bool = Field(default=False, description="true or false")
+    step: Number | None = Field(default=None, description="a finite number")
+
+    def distribution(self) -> BaseDistribution:
+        given = {key: value for key in ("low", "high", "step") if (value := getattr(self, key)) is not None}
+        kind: Any = IntDistribution if all(isinstance(each, int) for each in given.values()) else FloatDistribution
+        with warnings.catch_warnings():
+            # Of steps that do not meet the upper end.
+            warnings.simplefilter("error")
+            made: BaseDistribution = kind(**given, log=self.log)
+        return made
+
+
+class _Choices(_Searched):
+    choices: Annotated[list[Any], AfterValidator(_kept)] = Field(description="a list of values, none of them twice")
+
+    def distribution(self) -> BaseDistribution:
+        return CategoricalDistribution(self.choices)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One dimension of a search space.
+
+    Args:
+        name: the key or group of the configuration.
+        distribution: its range or its choices.
+        when: the choices of parameters before it that it needs, by their names; it is searched only where all hold.
+    """
+
+    name: str
+    distribution: BaseDistribution
+    when: Mapping[str, tuple[Value, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, name: str, described: Any) -> Self:
+        """Return the parameter of a description such as `{low: 1e-4, high: 1e-2, log: true}` or `{choices: [a, b]}`.
+
+        Raises:
+            InvalidValueError: if it describes none.
+        """
+        where = f"study.space.{name}"
+        if isinstance(described, Mapping):
+            # What the command line takes away.
+            described = {key: value for key, value in described.items() if value is not None}
+        if not KEY.fullmatch(name):
+            raise InvalidValueError(f"{where}: {name!r} is no key of the configuration, such as agent.lr")
+        if re.split("[/.]", name)[0] in NOT_SEARCHED:
+            raise InvalidValueError(f"{where}: {name!r} says how a study is run or kept, which no trial can try")
+        if not isinstance(described, Mapping) or ("choices" in described) is bool({"low", "high"} & described.keys()):
+            raise InvalidValueError(
+                f"{where} is {described!r}, but it must have low and high, or choices: {where}.choices=[...] on the "
+                "command line replaces a range"
+            )
+        read = (_Choices if "choices" in described else _Range).read(where, described)
+        try:
+            distribution = read.distribution()
+        except (ValueError, UserWarning) as error:
+            raise InvalidValueError(f"{where}: {error}") from error
+        several = {key: each if isinstance(each, list) else [each] for key, each in (read.when or {}).items()}
+        return cls(name, distribution, {key: tuple(map(as_kept, values)) for key, values in several.items()})
+
+    def applies(self, chosen: Mapping[str, Value]) -> bool:
+        """Whether it is searched where these values were chosen before."""
+        return all(name in chosen and chosen[name] in values for name, values in self.when.items())
+
+    def suggest(self, trial: BaseTrial) -> Value:
+        """Return the value of a trial."""
+        drawn: Any = self.distribution
+        if isinstance(drawn, CategoricalDistribution):
+            choice: Value = trial.suggest_categorical(self.name, drawn.choices)
+            return choice
+        suggest: Any = trial.suggest_int if isinstance(drawn, IntDistribution) else trial.suggest_float
+        number: float = suggest(self.name, drawn.low, drawn.high, log=drawn.log, step=drawn.step)
+        return number
+
+    @property
+    def extremes(self) -> tuple[Value, ...]:
+        """The values that have to be allowed for all of them to be."""
+        drawn: Any = self.distribution
+        return tuple(drawn.choices) if isinstance(drawn, CategoricalDistribution) else (drawn.low, drawn.high)
