@@ -49,24 +49,34 @@ class Containers:
         self.secret.write_text(f"{password}\n")
         for each in IN_THE_IMAGE:
             (folder / "programs" / each).symlink_to(str(shutil.which(each)))
-        self._replaced = self._replacements()
+        self._replaced = self._addresses() | self._paths()
         self._pattern = re.compile("|".join(f"(?P<_{place}>{pattern})" for place, pattern in enumerate(self._replaced)))
 
-    def _replacements(self) -> dict[str, str]:
-        """What stands in the files, as patterns, and what it is here."""
-        replaced = {r"\b0\.0\.0\.0\b": "127.0.0.1", rf"{SECRETS}\b": str(self.secret.parent)}
-        replaced |= {re.escape(path): str(here) for path, here in self._image.copied.items()}
+    def _addresses(self) -> dict[str, str]:
+        """The addresses in the files, as patterns, and what they are here."""
+        replaced = {r"\b0\.0\.0\.0\b": "127.0.0.1"}
         for name, service in self.services.items():
             for port in service.get("ports", []):
                 inside = port.rpartition(":")[2]
                 replaced[rf"(?<=[@/]){name}:{inside}\b"] = f"127.0.0.1:{self.ports[name]}"
                 replaced[rf"\b{inside}\b"] = str(self.ports[name])
-            for volume in service.get("volumes", []):
-                source, target = volume.split(":")[:2]
-                if not source.startswith("."):
-                    (self.folder / source).mkdir(exist_ok=True)
-                    replaced[rf"(?<![\w/.]){target}\b"] = str(self.folder / source)
         return replaced
+
+    def _paths(self) -> dict[str, str]:
+        """The paths in the files, as patterns, and what they are here."""
+        replaced = {rf"{SECRETS}\b": str(self.secret.parent)}
+        replaced |= {re.escape(path): str(here) for path, here in self._image.copied.items()}
+        for name in self.services:
+            replaced |= {rf"(?<![\w/.]){target}\b": str(here) for here, target, _ in self.volumes(name)}
+        return replaced
+
+    def volumes(self, name: str) -> list[tuple[Path, str, list[str]]]:
+        """The volumes of a service, each with its folder here, its place in the container and its options."""
+        split = [volume.split(":") for volume in self.services[name].get("volumes", [])]
+        named = [(self.folder / source, target, options) for source, target, *options in split if source[0] != "."]
+        for folder, _, _ in named:
+            folder.mkdir(exist_ok=True)
+        return named
 
     def here(self, text: str) -> str:
         """Returns a text of the files as it has to be on this machine."""
@@ -87,14 +97,15 @@ class Containers:
         test = self.services[name].get("healthcheck", {}).get("test", ["CMD", *self._image.healthcheck])
         assert test[0] == "CMD"
         with self._log_of(name).open("ab") as log:
-            return subprocess.run(self._words(test[1:]), **self._surroundings(name, log), check=False).returncode == 0
+            command = self._command(name, test[1:])
+            return subprocess.run(command, **self._surroundings(name, log), check=False).returncode == 0
 
     def start(self, name: str) -> subprocess.Popen[bytes]:
         """Starts a service."""
-        words = self._words([*self._image.entrypoint, *shlex.split(self.services[name]["command"])])
+        command = self._command(name, [*self._image.entrypoint, *shlex.split(self.services[name]["command"])])
         with self._log_of(name).open("ab") as log:
             # In a session of its own: a Ctrl-C is meant for who started it.
-            self._processes[name] = subprocess.Popen(words, **self._surroundings(name, log), start_new_session=True)
+            self._processes[name] = subprocess.Popen(command, **self._surroundings(name, log), start_new_session=True)
         return self._processes[name]
 
     def wait_until_healthy(self, name: str) -> None:
@@ -109,7 +120,7 @@ class Containers:
     def stop(self, name: str) -> int:
         """Stops a service as an engine does, which waits for as long as the file says; returns its exit code."""
         process = self._processes.pop(name)
-        process.send_signal(signal.SIGTERM)
+        self._terminate(process)
         grace = self.services[name].get("stop_grace_period", "10s")
         try:
             return process.wait(float(grace.removesuffix("s")))
@@ -119,7 +130,7 @@ class Containers:
     def stop_all(self) -> None:
         """Ends whatever is still there."""
         for process in self._processes.values():
-            process.send_signal(signal.SIGTERM)
+            self._terminate(process)
         for process in self._processes.values():
             try:
                 process.wait(STOP_S)
@@ -135,8 +146,12 @@ class Containers:
     def _log_of(self, name: str) -> Path:
         return self.folder / f"{name}.log"
 
-    def _words(self, words: Sequence[str]) -> list[str]:
+    def _command(self, name: str, words: Sequence[str]) -> list[str]:
+        """What runs a command of a service."""
         return [self.here(word) for word in words]
+
+    def _terminate(self, process: subprocess.Popen[bytes]) -> None:
+        process.send_signal(signal.SIGTERM)
 
     def _surroundings(self, name: str, log: BinaryIO) -> dict[str, Any]:
         folder = self.here(self._image.words["WORKDIR"])

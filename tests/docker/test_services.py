@@ -15,16 +15,23 @@ import pytest
 from mlflow import MlflowClient
 
 from armscan.sweeps.workers.supervisor import LEFT
-from tests.docker.containers import Containers
+from tests.docker.containers import SECRETS, Containers
 from tests.docker.files import FOLDER
+from tests.docker.image import ImageContainers, built_image
 from tests.support.postgres import PASSWORD, postgres_server
 from tests.support.waiting import HANG_S, wait_until
 
+SECRET = f"{SECRETS}/database_password"
 # Trials that only wait, between one and five seconds, and of which only one key is searched.
 TRIALS = (
     "study.task._target_=benchmarks.sweeps.sleeping.Sleeping study/pruner=none "
     "study.n_trials=2 study.final_eval.top_k=0 "
     "agent.gamma=0.5 agent.utd_ratio=0.1 agent.batch_size=64 'study.space.agent.lr={low: 0.001, high: 0.01}'"
+)
+# Trials that train; the benchmarks are not in the image.
+TRAININGS = (
+    "study/pruner=none study.n_trials=2 study.final_eval.top_k=0 training.env_steps=3000 "
+    "training.validation_episodes=2 data.n_training=1 data.n_validation=1 data.n_test=1 evaluation.episodes=2"
 )
 # A worker's database connections, beside which others have a place: see POSTGRES_CONNECTIONS.
 MOST_CONNECTIONS = 6
@@ -37,10 +44,21 @@ def postgres_there(postgres_programs):
         yield server
 
 
-@pytest.fixture
-def containers(postgres_programs, postgres_there, tmp_path):
+@pytest.fixture(scope="module")
+def image():
+    """The built image."""
+    with built_image() as buildah:
+        yield buildah
+
+
+@pytest.fixture(params=["processes", pytest.param("image", marks=pytest.mark.slow)])
+def containers(request, postgres_programs, postgres_there, tmp_path):
     """The services on this machine; of them PostgreSQL is there, as its image leaves it at its first start."""
-    services = Containers(tmp_path, postgres_there.port, postgres_programs, PASSWORD, ARMSCAN_WORDS=TRIALS)
+    given = (tmp_path, postgres_there.port, postgres_programs, PASSWORD)
+    if request.param == "image":
+        services = ImageContainers(request.getfixturevalue("image"), *given, ARMSCAN_WORDS=TRAININGS)
+    else:
+        services = Containers(*given, ARMSCAN_WORDS=TRIALS)
     postgres_there.execute(f"CREATE DATABASE {services.services['postgres']['environment']['POSTGRES_DB']}")
     postgres_there.execute((FOLDER / "databases.sql").read_text())
     try:
@@ -85,6 +103,7 @@ def n_connections(server):
     return n_all - 1
 
 
+@pytest.mark.parametrize("containers", ["processes"], indirect=True)
 def test_postgres_understands_its_words_and_says_when_it_is_away(containers, postgres_there, postgres_programs):
     words = shlex.split(containers.services["postgres"]["command"])
     (data,) = selected(postgres_there, "SHOW data_directory")
@@ -117,7 +136,7 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     wait_until(lambda: "mlflow_run" in selected(postgres_there, "SELECT key FROM trial_user_attributes"))
     assert states(postgres_there) == ["RUNNING"]
     assert n_connections(postgres_there) - n_before <= MOST_CONNECTIONS
-    words = command_lines(f"ARMSCAN_STORAGE_PASSWORD_FILE={containers.secret}")
+    words = command_lines(f"ARMSCAN_STORAGE_PASSWORD_FILE={containers.here(SECRET)}")
     assert len(words) >= 5
     assert [each for each in words if PASSWORD.encode() in each] == []
     assert containers.stop("worker") == LEFT, containers.log("worker")
@@ -131,7 +150,9 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     client = MlflowClient(mlflow)
     (experiment,) = (each for each in client.search_experiments() if each.name == "armscan")
     runs = client.search_runs([experiment.experiment_id])
-    assert [run.info.status for run in runs] == ["FINISHED"] * 3
+    # The study's and its trials'; trainings also have those of the baselines.
+    assert len(runs) >= 3
+    assert {run.info.status for run in runs} == {"FINISHED"}
     client.log_text(runs[0].info.run_id, "kept", "note.txt")
     assert [file.read_text() for file in containers.folder.glob("artifacts/**/note.txt")] == ["kept"]
     assert {each.name for each in containers.folder.glob("work/*")} >= {"studies", "optuna.artifacts"}
