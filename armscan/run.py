@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from armscan.utils.threads import limit_threads
+from armscan.utils.processes import limit_threads
 
 limit_threads()
 # Ray reads it when it is imported, which other libraries do where it is installed: it would abort a study that is told

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from armscan.utils.threads import limit_threads
+from armscan.utils.processes import limit_threads
 from tests.support.requirements import unavailable
 
 # As a run does: tests run on all cores already.

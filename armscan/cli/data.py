@@ -193,7 +193,7 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[Labelled]) -> No
     from rich.text import Text
 
     from armscan.annotation.labelling import SUCCESS_THRESHOLD
-    from armscan.config.command_hints import label_command
+    from armscan.config.command_hints import armscan_command
     from armscan.volumes.markups import MARKUP_SUFFIX
 
     table = Table(title="planes written into the manifest", title_justify="left")
@@ -222,5 +222,6 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[Labelled]) -> No
     )
     if not options.markups:
         print("          (--markups writes the planes as files for 3D Slicer)")
+    words = ("data", "label", str(options.data), "--volume", "NAME", "--markup", f"FILE{MARKUP_SUFFIX}")
     print("correct   move the plane in 3D Slicer, save it, and read it back:")
-    print(f"          {label_command(options.data, f'FILE{MARKUP_SUFFIX}')}")
+    print(f"          {armscan_command(*words)}")

@@ -172,7 +172,7 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str) -> int:
     of the old one, and is tracked beside it. Exit code: 0 if all metrics are equal (with --dry-run: if nothing
     differs), else 1.
     """
-    from armscan.utils.threads import limit_threads
+    from armscan.utils.processes import limit_threads
 
     # As a run is computed.
     limit_threads()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable
-from pathlib import Path
 
 from armscan.config.defaults import RESUME, TRACKING_URI, default_storage, default_tracking
 
@@ -22,48 +21,14 @@ def resume_command(run_id: str, tracking_uri: str) -> str:
     return run_command([f"{RESUME}={run_id}", *where])
 
 
-def evaluate_command(run_id: str, tracking_uri: str) -> str:
-    """Return the command that evaluates the agent of a run."""
-    return _command("evaluate", run_id, tracking=tracking_uri)
+def armscan_command(*words: str, tracking: str | None = None, storage: str | None = None) -> str:
+    """Return a command of the program `armscan`, with the stores that are not the default ones.
 
-
-def video_command(run_id: str, tracking_uri: str) -> str:
-    """Return the command that records the agent of a run."""
-    return _command("evaluate", run_id, "--video", tracking=tracking_uri)
-
-
-def reproduce_command(run_id: str, tracking_uri: str) -> str:
-    """Return the command that reproduces a run."""
-    return _command("runs", "reproduce", run_id, tracking=tracking_uri)
-
-
-def sync_command(folder: Path | str) -> str:
-    """Return the command that delivers what the runs in a folder could not upload."""
-    return _command("runs", "sync", str(folder))
-
-
-def report_command(study: str, storage: str) -> str:
-    """Return the command that reports on a study."""
-    return _command("report", "--study", study, storage=storage)
-
-
-def compare_command(run_id: str, tracking_uri: str) -> str:
-    """Return the command that compares the trainings below a run."""
-    return _command("report", "--runs", run_id, tracking=tracking_uri)
-
-
-def label_command(data: Path, markup: str) -> str:
-    """Return the command that reads a plane from a markups file."""
-    return _command("data", "label", str(data), "--volume", "NAME", "--markup", markup)
-
-
-def ui_command(*, tracking: str | None = None, storage: str | None = None) -> str:
-    """Return the command that opens runs and studies in the browser; None stands for the default store."""
-    return _command("ui", tracking=tracking, storage=storage)
-
-
-def _command(*words: str, tracking: str | None = None, storage: str | None = None) -> str:
-    """Return a command, with stores that are not the default ones."""
+    Args:
+        *words: the command and its arguments, such as `runs`, `sync`, `outputs`.
+        tracking: the tracking store; default: that of the configuration.
+        storage: the storage of studies; default: that of the configuration.
+    """
     stores = ["--storage", storage] if storage is not None and storage != default_storage() else []
     stores += ["--tracking", tracking] if tracking is not None and tracking != default_tracking()["uri"] else []
     return shlex.join(["armscan", *words, *stores])

@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from armscan.config.command_hints import ui_command
+from armscan.config.command_hints import armscan_command
 from armscan.experiment.job import INTERRUPTED, JobOutcome
 from armscan.training import TEST, Evaluation
 
@@ -71,7 +71,7 @@ def print_where_to_look(
     """
     for file in files:
         print(f"look at   {from_here(folder / file)}")
-    print(f"all runs  {ui_command(tracking=tracking_uri, storage=storage)}")
+    print(f"all runs  {armscan_command('ui', tracking=tracking_uri, storage=storage)}")
 
 
 def from_here(path: Path) -> Path:

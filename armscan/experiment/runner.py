@@ -14,7 +14,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from armscan.agents import Learner
-from armscan.config.command_hints import evaluate_command, resume_command
+from armscan.config.command_hints import armscan_command, resume_command
 from armscan.experiment.build import Experiment, check_keys, set_up
 from armscan.experiment.console import print_results, print_where_to_look
 from armscan.experiment.job import Invocation
@@ -103,7 +103,7 @@ def run_tracked(
         how = f"deterministic policy, as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
         print_results(f"results ({how})", evaluations)
         print_where_to_look(folder, tracking_uri, files=(LEARNING_CURVE_FILE, VIDEO_FILE) if result else (VIDEO_FILE,))
-        print(f"evaluate  {evaluate_command(tracked.run_id, tracking_uri)}")
+        print(f"evaluate  {armscan_command('evaluate', tracked.run_id, tracking=tracking_uri)}")
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.config.command_hints import compare_command, resume_command, run_command, sync_command
+from armscan.config.command_hints import armscan_command, resume_command, run_command
 from armscan.config.credentials import check_address
 from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
@@ -120,7 +120,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     try:
         runs, is_known = _close_parent(Multirun.folder, word, status, failed), True
     except TrackingError as error:
-        print(f"{error}; {sync_command(Multirun.folder)} delivers the rest", file=sys.stderr)
+        print(f"{error}; {armscan_command('runs', 'sync', str(Multirun.folder))} delivers the rest", file=sys.stderr)
         runs, is_known = [], False
     if outcomes:
         from armscan.experiment.console import print_jobs, print_where_to_look
@@ -128,7 +128,8 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
         if runs:
             print_where_to_look(Multirun.folder, word["tracking"]["uri"])
-            print(f"compare   {compare_command(word['run_id'], word['tracking']['uri'])}")
+            compare = armscan_command("report", "--runs", word["run_id"], tracking=word["tracking"]["uri"])
+            print(f"compare   {compare}")
     for number, outcome in failed.items():
         print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
         print(f"  again alone: {run_command([])} {outcome.overrides}", file=sys.stderr)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from armscan.config.command_hints import evaluate_command
+from armscan.config.command_hints import armscan_command
 from armscan.errors import InvalidValueError, TrackingError
 from armscan.evaluation import EvaluationReport
 from armscan.evaluation.report import REFUSED_BY_MLFLOW, metrics_in_markdown
@@ -47,7 +47,8 @@ class Card:
         text = f"The policy of run `{run.run_id}`, {run.name}."
         reports = _reports(run, folder)
         if not reports:
-            text += f"\n\nNothing is known of how good it is: `{evaluate_command(run.run_id, run.uri)}` says it."
+            command = armscan_command("evaluate", run.run_id, tracking=run.uri)
+            text += f"\n\nNothing is known of how good it is: `{command}` says it."
         tags: dict[str, str] = {}
         for title, report in reports.items():
             section = f"\n\n### {title}\n\n{metrics_in_markdown(report.by_split)}"

@@ -11,7 +11,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.config.command_hints import reproduce_command
+from armscan.config.command_hints import armscan_command
 from armscan.errors import InvalidValueError, TrackingError
 from armscan.evaluation.agent_source import from_its_folder
 from armscan.experiment.build import Experiment, set_up
@@ -139,7 +139,9 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
     choices = {group: run.tags.get(f"choice.{group}", "unknown") for group in CHOICES_IN_TAGS}
     overrides = run.tags.get("overrides", "").split()
     uri = original.config.tracking.uri
-    invocation = Invocation(folder, overrides, reproduce_command(run.run_id, uri), choices, None)
+    invocation = Invocation(
+        folder, overrides, armscan_command("runs", "reproduce", run.run_id, tracking=uri), choices, None
+    )
     try:
         with folder_lock(folder):
             tracked = start_tracking(original.config, invocation, original.setup)

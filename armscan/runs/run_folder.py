@@ -13,7 +13,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 from mlflow.entities import Run
 
-from armscan.config.command_hints import sync_command
+from armscan.config.command_hints import armscan_command
 from armscan.errors import ArmscanError, TrackingError
 from armscan.tracking.outbox import DELIVERED, LOCK, SUFFIX, OutboxFile, file_and_place, file_of
 from armscan.utils.files import (
@@ -124,7 +124,9 @@ class OwnFolder:
                     f"nobody knows whether another process is at work in its folder {self.path} ({error.strerror})"
                 ) from error
             if not is_delivered:
-                raise RunSkippedError(f"not all of it is delivered: {sync_command(self.path)} does that")
+                raise RunSkippedError(
+                    f"not all of it is delivered: {armscan_command('runs', 'sync', str(self.path))} does that"
+                )
             yield
 
     def remove_emptied(self) -> bool:

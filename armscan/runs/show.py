@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.filesize import decimal
 from rich.text import Text
 
-from armscan.config.command_hints import evaluate_command, resume_command, video_command
+from armscan.config.command_hints import armscan_command, resume_command
 from armscan.experiment.console import ID_CHARS, RESULT_ROWS
 from armscan.runs.query import experiment_ids, search
 from armscan.runs.rows import PARENT_TAG, RunRow, artifacts_of
@@ -145,7 +145,8 @@ def _print_commands(console: Console, uri: str, run: Run, folder: OwnFolder | No
     if folder is not None and (folder.path / LAST_CHECKPOINT).exists() and run.info.status != "FINISHED":
         commands["resume"] = resume_command(run_id, uri)
     if EVALUATED_TAG not in run.data.tags and BEST_CHECKPOINT in artifacts:
-        commands |= {"evaluate": evaluate_command(run_id, uri), "record": video_command(run_id, uri)}
+        commands["evaluate"] = armscan_command("evaluate", run_id, tracking=uri)
+        commands["record"] = armscan_command("evaluate", run_id, "--video", tracking=uri)
     if commands:
         console.print()
     for what, command in commands.items():

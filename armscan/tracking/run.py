@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from mlflow.entities import Run
 
-from armscan.config.command_hints import sync_command
+from armscan.config.command_hints import armscan_command
 from armscan.errors import is_interruption
 from armscan.tracking import pending
 from armscan.tracking.client import TrackingStore
@@ -250,7 +250,7 @@ class TrackedRun:
             pending.forget(self.run_id)
         self._outbox.close()
         if failure is not None:
-            again = sync_command(self._outbox.folder)
+            again = armscan_command("runs", "sync", str(self._outbox.folder))
             how = "delivers the rest" if self._uploader.is_away else "delivers the rest once the store takes it"
             log(f"run {self.run_id}: {self._store.uri} has not got all of it ({failure}): {again} {how}")
         return self._is_delivered

@@ -1,4 +1,4 @@
-"""Processes: whether one is still the same, and the end of the parent of this one."""
+"""Processes: compute threads, whether a process is still the same, and the end of the parent of this one."""
 
 from __future__ import annotations
 
@@ -17,6 +17,16 @@ import psutil
 from armscan.utils.files import atomic_write
 
 POLL_S = 0.5
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def limit_threads() -> None:
+    """Set one compute thread for this process, if nobody has said otherwise, before a library starts its pool.
+
+    Small networks are fastest so, and jobs side by side never claim more threads than there are cores.
+    """
+    for variable in THREAD_VARIABLES:
+        os.environ.setdefault(variable, "1")
 
 
 def process_start(pid: int) -> str:

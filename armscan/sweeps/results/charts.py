@@ -20,10 +20,8 @@ from optuna.visualization import (
 from plotly import graph_objects
 
 from armscan.reports.html import chart
-from armscan.sweeps.study.finalists import best_trials
 
 MIN_TRIALS_FOR_IMPORTANCE = 4
-N_CURVES = 5
 
 
 def importances(study: optuna.Study, objectives: Sequence[str]) -> list[dict[str, Any]]:
@@ -75,7 +73,6 @@ def _charts(
         yield f"Slices of the space{several}", plot_slice(study, **of_this)
     if len(objectives) == 1:
         yield "Reports while training, pruned trials too", plot_intermediate_values(study)
-        yield "Learning curves of the best", _curves(best_trials(study, N_CURVES), objectives[0])
 
 
 def _finished(study: optuna.Study) -> list[FrozenTrial]:
@@ -89,11 +86,3 @@ def _value(number: int, sign: float = 1.0) -> Callable[[FrozenTrial], float]:
 def _bars(rows: Sequence[Mapping[str, Any]]) -> graph_objects.Figure:
     shares, keys = [row["importance"] for row in rows], [row["key"] for row in rows]
     return graph_objects.Figure(graph_objects.Bar(x=shares, y=keys, orientation="h"))
-
-
-def _curves(trials: Sequence[FrozenTrial], objective: str) -> graph_objects.Figure:
-    figure = graph_objects.Figure()
-    for trial in trials:
-        steps, values = list(trial.intermediate_values), list(trial.intermediate_values.values())
-        figure.add_scatter(x=steps, y=values, name=f"trial {trial.number}")
-    return figure.update_layout(xaxis_title="environment steps, seed after seed", yaxis_title=objective)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from statistics import fmean
 
 from optuna.trial import FrozenTrial, TrialState
 from rich.console import Console
@@ -15,10 +15,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from armscan.config.command_hints import report_command
+from armscan.config.command_hints import armscan_command
 from armscan.errors import StorageAwayError
 from armscan.experiment.console import print_where_to_look
-from armscan.sweeps.results.summary import final_results, shown_of
+from armscan.sweeps.results.summary import final_results, shown_of, values_of
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, StudyState
 from armscan.sweeps.space.overrides import overrides_of
@@ -31,107 +31,108 @@ from armscan.utils.retry import no_retry
 REFRESH_S = 2.0
 
 
-class ProgressDisplay:
-    """Shows how a study is going, from what stands in its storage, while it lasts.
+@contextmanager
+def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
+    """Show inside the context how a study is going, from what stands in its storage.
 
     Args:
         opened: the study.
-        folder: of the workers of this start.
+        folder: the folder of the workers of this start.
     """
+    shown, stopped = {key for key, *_ in _ended(opened)}, threading.Event()
 
-    def __init__(self, opened: OpenedStudy, folder: Path) -> None:
-        self._opened, self._scheduler = opened, opened.search.scheduler
-        self._shown = {(phase.name, trial.number) for phase, trial in self._ended()}
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._show, daemon=True)
-        print(f"study {opened.settings.name} in {opened.storage.uri}, run {opened.run_id}", flush=True)
-        print(f"the workers write into {folder}", flush=True)
+    def print_new() -> None:
+        for key, trial, phase in _ended(opened):
+            if key not in shown:
+                shown.add(key)
+                print(_describe(trial, phase.objectives), flush=True)
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stopped.set()
-        self._thread.join()
-
-    def _show(self) -> None:
+    def show() -> None:
         # Nothing that is shown is worth waiting for: who leaves would wait for it, too.
         with no_retry():
             if not sys.stdout.isatty():
-                self._repeat(self._print_new)
+                repeat(print_new, stopped)
                 return
             with Live(refresh_per_second=1) as live:
-                self._repeat(lambda: live.update(self._table()))
+                repeat(lambda: live.update(_table(opened)), stopped)
 
-    def _repeat(self, show: Callable[[], None]) -> None:
-        """Show how the study is going again and again; where its storage is away, that it is, and nothing new."""
-        is_away, is_last = False, False
-        while not is_last:
-            is_last = self._stopped.wait(REFRESH_S)
-            try:
-                show()
-                is_away = False
-            except StorageAwayError as error:
-                if not is_away:
-                    print(error, flush=True)
-                is_away = True
-
-    def _ended(self) -> list[tuple[Phase, FrozenTrial]]:
-        """Return the trials that have ended, with their phases."""
-        return [
-            (phase, trial)
-            for phase in self._opened.phases
-            for trial in phase.scheduler.study.get_trials(deepcopy=False)
-            if trial.state.is_finished()
-        ]
-
-    def _print_new(self) -> None:
-        for phase, trial in self._ended():
-            if (phase.name, trial.number) not in self._shown:
-                self._shown.add((phase.name, trial.number))
-                print(describe_trial(trial, phase.objectives), flush=True)
-
-    def _table(self) -> Table:
-        state, settings = self._scheduler.state(), self._opened.settings
-        final = self._opened.final_eval
-        final_state = final.scheduler.state() if final is not None else StudyState.of(())
-        # As wide as the terminal, whatever the table has.
-        table = Table(title=Text(summary(self._scheduler, state, settings)), title_justify="left", expand=True)
-        if final_state.all:
-            table.caption = f"final evaluation: {len(final_state.finished)} of {len(final_state.all)} done"
-        for heading in ("worker", "trial", "seed", "environment steps", "return"):
-            table.add_column(heading, justify="left" if heading == "worker" else "right")
-        running = [("", trial) for trial in state.running]
-        running += [(f"final evaluation of {trial.user_attrs[FINALIST]}: ", trial) for trial in final_state.running]
-        for what, trial in running:
-            lease = trial.user_attrs.get(LEASE, {})
-            mean_return = f"{lease['return']:.2f}" if "return" in lease else "-"
-            shown = (lease.get("seed", "-"), lease.get(ENV_STEPS, "-"), mean_return)
-            table.add_row(lease.get("worker", "?").rpartition("/")[2], f"{what}{trial.number}", *map(str, shown))
-        return table
+    print(f"study {opened.settings.name} in {opened.storage.uri}, run {opened.run_id}", flush=True)
+    print(f"the workers write into {folder}", flush=True)
+    thread = threading.Thread(target=show, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stopped.set()
+        thread.join()
 
 
-def summary(scheduler: TrialScheduler, state: StudyState, settings: StudySettings) -> str:
+def repeat(show: Callable[[], None], stopped: threading.Event) -> None:
+    """Show how a study is going again and again; where its storage is away, that it is, and nothing new.
+
+    Args:
+        show: shows it once.
+        stopped: ends the repetition, once it is shown for the last time.
+    """
+    is_away, is_last = False, False
+    while not is_last:
+        is_last = stopped.wait(REFRESH_S)
+        try:
+            show()
+            is_away = False
+        except StorageAwayError as error:
+            if not is_away:
+                print(error, flush=True)
+            is_away = True
+
+
+def _ended(opened: OpenedStudy) -> list[tuple[tuple[str, int], FrozenTrial, Phase]]:
+    """Return the trials that have ended, with a key and the phase of each."""
+    return [
+        ((phase.name, trial.number), trial, phase)
+        for phase in opened.phases
+        for trial in phase.scheduler.study.get_trials(deepcopy=False)
+        if trial.state.is_finished()
+    ]
+
+
+def _table(opened: OpenedStudy) -> Table:
+    """Return the running trials, below how the study stands."""
+    scheduler, final = opened.search.scheduler, opened.final_eval
+    state, final_state = scheduler.state(), final.scheduler.state() if final is not None else StudyState.of(())
+    # As wide as the terminal, whatever the table has.
+    table = Table("worker", title=Text(_summary(scheduler, state, opened.settings)), title_justify="left", expand=True)
+    for heading in ("trial", "seed", "environment steps", "return"):
+        table.add_column(heading, justify="right")
+    if final_state.all:
+        table.caption = f"final evaluation: {len(final_state.finished)} of {len(final_state.all)} done"
+    for trial in (*state.running, *final_state.running):
+        lease, finalist = trial.user_attrs.get(LEASE, {}), trial.user_attrs.get(FINALIST)
+        name = str(trial.number) if finalist is None else f"final evaluation of {finalist}: {trial.number}"
+        mean_return = f"{lease['return']:.2f}" if "return" in lease else "-"
+        shown = (lease.get("seed", "-"), lease.get(ENV_STEPS, "-"), mean_return)
+        table.add_row(lease.get("worker", "?").rpartition("/")[2], name, *map(str, shown))
+    return table
+
+
+def _summary(scheduler: TrialScheduler, state: StudyState, settings: StudySettings) -> str:
     """Return how a study stands, in one line."""
     n_pruned = sum(trial.state == TrialState.PRUNED for trial in state.finished)
     parts = [
-        f"study {settings.name}: {len(state.finished)} of {settings.n_trials} trials done, {n_pruned} of them pruned"
+        f"study {settings.name}: {len(state.finished)} of {settings.n_trials} trials done, {n_pruned} of them pruned",
+        f"{len(state.running)} running, {len(state.failed)} failed, {len(state.retried)} retried",
     ]
-    parts += [f"{len(state.running)} running, {len(state.failed)} failed, {len(state.retried)} retried"]
     if best := best_trials(scheduler.study, 1):
-        parts.append(f"best {_values(best[0], tuple(settings.objectives))} (trial {best[0].number})")
+        parts.append(f"best {values_of(best[0], settings.objectives)} (trial {best[0].number})")
     durations = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
     if durations and len(state.finished) < settings.n_trials:
-        left_s = (settings.n_trials - len(state.finished)) * sum(durations) / len(durations) / settings.workers
+        left_s = (settings.n_trials - len(state.finished)) * fmean(durations) / settings.workers
         parts.append(f"{left_s // 60:.0f} min left")
     return "; ".join(parts)
 
 
-def describe_trial(trial: FrozenTrial, objectives: Sequence[str]) -> str:
-    """Return what became of a trial, whose values are those of these objectives, in one line."""
+def _describe(trial: FrozenTrial, objectives: Iterable[str]) -> str:
+    """Return what became of a trial in one line."""
     attributes, tried = trial.user_attrs, " ".join(overrides_of(trial.params))
     name = f"trial {trial.number}"
     if FINALIST in attributes:
@@ -140,20 +141,24 @@ def describe_trial(trial: FrozenTrial, objectives: Sequence[str]) -> str:
         return f"{name} failed{', retried' if RETRIED in attributes else ''}: {attributes.get(FAILURE)} [{tried}]"
     if trial.state == TrialState.PRUNED:
         return f"{name} pruned after {attributes.get(ENV_STEPS)} environment steps [{tried}]"
-    return f"{name} done: {_values(trial, objectives)} [{tried}]"
+    return f"{name} done: {values_of(trial, objectives)} [{tried}]"
 
 
 def print_result(opened: OpenedStudy) -> int:
     """Print what a study has found; returns the exit code."""
     scheduler, settings = opened.search.scheduler, opened.settings
     state = scheduler.state()
-    print(summary(scheduler, state, settings))
-    if wrong := scheduler.broken(state) or _unfinished(opened, scheduler, state):
+    print(_summary(scheduler, state, settings))
+    wrong = scheduler.broken(state)
+    if wrong is None and scheduler.end(state) is None:
+        wrong = (
+            f"all workers have ended, but only {len(state.finished)} of {settings.n_trials} trials have finished: "
+            f"their logs in {opened.folder / 'workers'} say why; the same command resumes the study"
+        )
+    if wrong:
         print(f"error: {wrong}", file=sys.stderr)
         return 1
-    table = Table(title="best while searching", title_justify="left")
-    for heading in ("trial", *settings.objectives, "values"):
-        table.add_column(heading)
+    table = Table("trial", *settings.objectives, "values", title="best while searching", title_justify="left")
     for trial in best_trials(scheduler.study, max(1, settings.final_eval.top_k)):
         table.add_row(
             str(trial.number), *(f"{value:.4g}" for value in trial.values), " ".join(overrides_of(trial.params))
@@ -161,18 +166,8 @@ def print_result(opened: OpenedStudy) -> int:
     Console().print(table)
     is_evaluated = _print_final_results(opened)
     print_where_to_look(opened.folder, opened.config.tracking.uri, storage=settings.storage)
-    print(f"report    {report_command(settings.name, settings.storage)}")
+    print(f"report    {armscan_command('report', '--study', settings.name, storage=settings.storage)}")
     return 0 if is_evaluated else 1
-
-
-def _unfinished(opened: OpenedStudy, scheduler: TrialScheduler, state: StudyState) -> str | None:
-    """Return the message for a study whose workers all exited early; None if it is complete."""
-    if scheduler.end(state) is not None:
-        return None
-    return (
-        f"all workers have ended, but only {len(state.finished)} of {opened.settings.n_trials} trials have finished: "
-        f"their logs in {opened.folder / 'workers'} say why; the same command resumes the study"
-    )
 
 
 def _print_final_results(opened: OpenedStudy) -> bool:
@@ -193,10 +188,8 @@ def _print_final_results(opened: OpenedStudy) -> bool:
         f"result, with {n_seeds} other seed(s) each: interquartile means over seeds and test volumes, of success rates "
         "means; 95 % intervals"
     )
-    table = Table()
     names = shown_of(results[0])
-    for heading in ("trial", *(name.removeprefix("test/").replace("_", " ") for name in names)):
-        table.add_column(heading)
+    table = Table("trial", *(name.removeprefix("test/").replace("_", " ") for name in names))
     trials = opened.search.scheduler.study.get_trials(deepcopy=False)
     for result in results:
         table.add_row(str(result.number), *(result.text(name).replace(" (", "\n(") for name in names))
@@ -204,7 +197,3 @@ def _print_final_results(opened: OpenedStudy) -> bool:
     for result in results:
         print(f"trial {result.number}: {' '.join(overrides_of(trials[result.number].params))}")
     return True
-
-
-def _values(trial: FrozenTrial, objectives: Sequence[str]) -> str:
-    return ", ".join(f"{name} {value:.4g}" for name, value in zip(objectives, trial.values, strict=True))

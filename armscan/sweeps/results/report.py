@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from armscan.reports.html import table, video_address, write_page
 from armscan.sweeps.results.charts import charts, importances
-from armscan.sweeps.results.summary import ConfigResult, final_results, shown_of
+from armscan.sweeps.results.summary import ConfigResult, final_results, shown_of, values_of
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINALIST, METRICS, RETRIED, RETRY_OF, StudyState
 from armscan.sweeps.space.overrides import overrides_of
 from armscan.sweeps.study.finalists import best_trials
@@ -40,8 +40,16 @@ def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folde
             for step, value in trial.intermediate_values.items()
         ],
         "endings": _endings(trials),
-        "failures": [_failure_row(trial) for trial in trials if trial.state == TrialState.FAIL],
-        "result": [row for result in found for row in _metric_rows(result)],
+        "failures": [
+            {"trial": trial.number, "cause": _cause(trial), "values": " ".join(overrides_of(trial.params))}
+            for trial in trials
+            if trial.state == TrialState.FAIL
+        ],
+        "result": [
+            {"trial": result.number, "seeds": result.n_seeds, "figure": name, "mean": mean, "low": low, "high": high}
+            for result in found
+            for name, (mean, low, high) in result.means.items()
+        ],
         "importances": importances(study, objectives),
     }
     parts = [
@@ -60,23 +68,17 @@ def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folde
 
 
 def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
-    state = StudyState.of(trials)
+    state, best = StudyState.of(trials), best_trials(study, 1)
     n_pruned = sum(trial.state == TrialState.PRUNED for trial in state.finished)
-    best = best_trials(study, 1)
-    found = (
-        ", ".join(f"{name} {value:.4g}" for name, value in zip(objectives, best[0].values, strict=True)) if best else ""
-    )
-    return (
-        f"<p>{len(state.finished)} trials finished, {n_pruned} of them pruned; {len(state.failed)} failed, "
+    text = (
+        f"{len(state.finished)} trials finished, {n_pruned} of them pruned; {len(state.failed)} failed, "
         f"{len(state.retried)} retried after their worker died. {state.env_steps:,} environment steps, "
         f"{state.busy_hours:.2f} hours."
-        + (
-            f" Best in the search: trial {best[0].number}, {html.escape(found)} (optimistically biased)."
-            if best
-            else ""
-        )
-        + "</p>"
     )
+    if best:
+        found = html.escape(values_of(best[0], objectives))
+        text += f" Best in the search: trial {best[0].number}, {found} (optimistically biased)."
+    return f"<p>{text}</p>"
 
 
 def _videos(final_trials: Sequence[FrozenTrial]) -> str:
@@ -113,9 +115,7 @@ def _endings(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
     for trial in trials:
         cause = ""
         if trial.state == TrialState.FAIL:
-            cause = str(trial.user_attrs.get(FAILURE, "not known")) + (
-                ", retried" if RETRIED in trial.user_attrs else ""
-            )
+            cause = _cause(trial) + (", retried" if RETRIED in trial.user_attrs else "")
         elif trial.state == TrialState.PRUNED:
             cause = f"behind the others at environment step {trial.last_step}"
         of_ending.setdefault((trial.state.name.lower(), cause), []).append(trial.number)
@@ -125,24 +125,8 @@ def _endings(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
     ]
 
 
-def _failure_row(trial: FrozenTrial) -> dict[str, Any]:
-    return {
-        "trial": trial.number,
-        "cause": trial.user_attrs.get(FAILURE, "not known"),
-        "values": " ".join(overrides_of(trial.params)),
-    }
-
-
-def _metric_rows(result: ConfigResult) -> Iterable[dict[str, Any]]:
-    for name, (mean, low, high) in result.means.items():
-        yield {
-            "trial": result.number,
-            "seeds": result.n_seeds,
-            "figure": name,
-            "mean": mean,
-            "low": low,
-            "high": high,
-        }
+def _cause(trial: FrozenTrial) -> str:
+    return str(trial.user_attrs.get(FAILURE, "not known"))
 
 
 def _result_rows(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,11 @@ class ConfigResult:
         """Return a metric with its interval, such as `1.52 (1.4 to 1.7)`."""
         mean, low, high = (f"{round(number, 3):g}" for number in self.means[name])
         return mean if low == "nan" else f"{mean} ({low} to {high})"
+
+
+def values_of(trial: FrozenTrial, objectives: Iterable[str]) -> str:
+    """Return the values of a trial with the names of the objectives, as a text."""
+    return ", ".join(f"{name} {value:.4g}" for name, value in zip(objectives, trial.values, strict=True))
 
 
 def shown_of(result: ConfigResult) -> list[str]:

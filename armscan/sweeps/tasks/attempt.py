@@ -20,7 +20,6 @@ from armscan.config.sources import SWEEP
 from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.outcome import PendingWrites
 from armscan.sweeps.scheduling.state import ENV_STEPS, RETRY_OF, SEEDS
-from armscan.sweeps.space.overrides import Value, overrides_of
 from armscan.tracking import TrackedRun
 
 # User attributes of a trial.
@@ -33,24 +32,23 @@ class Attempt:
     """One attempt at a trial.
 
     Args:
-        trial: as it stands in the storage.
-        chosen: its values by name.
+        trial: the trial as it stands in the storage.
+        overrides: what tells its configuration from that of other trials.
         composed: its configuration, but for the seed, and what was chosen of each group.
-        command: that started the worker.
-        seeds: it is run with, one after another.
-        study_folder: of the study.
-        run_id: of its tracked run.
-        objective: metric reported to the pruner while it runs; None without pruning.
+        command: the command that started the worker.
+        seeds: the seeds that it is run with, one after another.
+        study_folder: the folder of the study.
+        run_id: the ID of its tracked run.
+        objective: the metric that it reports to the pruner while it runs; None without pruning.
         report_progress: takes what is known of how far it is.
         opened: takes the tracked run of a training while it goes on, and None when it has ended.
         show_picture: takes a file that the dashboard is to show.
-        reported: steps that have been reported, also before the trial was requeued.
-        writes: of the trial.
+        writes: the pending writes about the trial.
         transaction: see `Storage.transaction`.
     """
 
     trial: Trial
-    chosen: Mapping[str, Value]
+    overrides: list[str]
     composed: tuple[DictConfig, dict[str, str]]
     command: str
     seeds: tuple[int, ...]
@@ -60,14 +58,18 @@ class Attempt:
     report_progress: Callable[[dict[str, Any]], None]
     opened: Callable[[TrackedRun | None], None]
     show_picture: Callable[[Path], None]
-    reported: set[int]
     writes: PendingWrites
     transaction: Callable[[Callable[[], bool]], bool]
     env_steps: int = field(default=0, init=False)
     _of_seeds: dict[str, Mapping[str, float]] = field(init=False)
+    # Steps that have been reported, also before the trial was requeued.
+    _reported: set[int] = field(init=False)
 
     def __post_init__(self) -> None:
         self._of_seeds = dict(self.trial.user_attrs.get(SEEDS, {}))
+        is_resumed = RUN in self.trial.user_attrs
+        known = self.trial.storage.get_trial(self.trial._trial_id).intermediate_values if is_resumed else {}
+        self._reported = set(known)
 
     @property
     def folder(self) -> Path:
@@ -79,11 +81,6 @@ class Attempt:
         """That of the attempt whose place it takes; None where it is the first."""
         number = self.trial.user_attrs.get(RETRY_OF)
         return None if number is None else trial_folder(self.study_folder, number)
-
-    @property
-    def overrides(self) -> list[str]:
-        """What tells its configuration from that of other trials."""
-        return overrides_of(self.chosen)
 
     def config(self, seed: int) -> tuple[DictConfig, dict[str, str]]:
         """Return the configuration of one of its trainings, and what was chosen of each group."""
@@ -110,9 +107,9 @@ class Attempt:
         """Report how a training is going.
 
         Args:
-            metrics: of the last validation: the objective, and `mean_return` for the screen, where it is known.
-            seed: of the training.
-            n_env_steps: it has taken.
+            metrics: the metrics of the last validation: the objective, and `mean_return` for the screen, if known.
+            seed: the seed of the training.
+            n_env_steps: the environment steps that it has taken.
             grid: environment steps between two reports: trials are compared at the same step, whatever theirs are.
             total: environment steps of a whole training.
 
@@ -126,9 +123,9 @@ class Attempt:
         if self.objective is None or self.objective not in metrics:
             return
         step = self.seeds.index(seed) * total + n_env_steps // grid * grid
-        if step in self.reported:
+        if step in self._reported:
             return
-        self.reported.add(step)
+        self._reported.add(step)
         values = [one[self.objective] for one in done] + [metrics[self.objective]]
         if self.writes.flush_with(self.transaction, partial(self._is_to_be_pruned, step, sum(values) / len(values))):
             raise optuna.TrialPruned

@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 
-from armscan.config.command_hints import sync_command
+from armscan.config.command_hints import armscan_command
 from armscan.config.defaults import TRACKING_URI
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import working_folder
 from armscan.errors import ArmscanError, AwayError, StorageAwayError, StudyError
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, silence_launcher
-from armscan.sweeps.results.progress import ProgressDisplay
+from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.space.overrides import written
 from armscan.sweeps.study.arguments import STORAGE, USUAL_LAUNCHER, WORKER_KEY, StudyCommand, fixed_by
 from armscan.sweeps.study.open import OpenedStudy
@@ -67,7 +67,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     tracked = TrackedRun.joined(opened.client, opened.run_id, name=opened.settings.name, folder=folder)
     tracked.set_status("RUNNING")
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
-    with _leaving(opened, folder, tracked, leave_s), ProgressDisplay(opened, folder):
+    with _leaving(opened, folder, tracked, leave_s), progress_display(opened, folder):
         if launcher not in ON_THIS_MACHINE:
             _launch_elsewhere(opened, folder, launcher, lambda: launch(words))
         elif launcher == USUAL_LAUNCHER:
@@ -175,7 +175,10 @@ def _deliver(opened: OpenedStudy, tracked: TrackedRun, status: str) -> None:
             for phase in opened.phases:
                 phase.close_orphaned_runs()
     if not is_there or left:
-        print(f"not all is tracked: {sync_command(opened.folder)} delivers the rest", file=sys.stderr)
+        print(
+            f"not all is tracked: {armscan_command('runs', 'sync', str(opened.folder))} delivers the rest",
+            file=sys.stderr,
+        )
 
 
 @contextlib.contextmanager

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -147,17 +148,19 @@ def worker_main() -> None:
     def is_told_to_leave() -> bool:
         return is_asked.is_set() or not launcher.is_alive or (folder / STOP_FILE).exists()
 
+    from armscan.sweeps.workers.heartbeat import Heartbeat
     from armscan.sweeps.workers.worker import work
     from armscan.utils.log import log
 
+    make_heartbeat = partial(
+        Heartbeat,
+        worker=f"{folder.name}/{number}",
+        is_told_to_leave=is_told_to_leave,
+        is_told_to_leave_soon=is_asked_soon.is_set,
+        leave=partial(os._exit, LEFT),
+    )
     try:
-        work(
-            words,
-            f"{folder.name}/{number}",
-            is_told_to_leave,
-            is_told_to_leave_soon=is_asked_soon.is_set,
-            leave=lambda: os._exit(LEFT),
-        )
+        work(words, make_heartbeat)
     except AwayError as error:
         log(str(error))
         raise SystemExit(AWAY) from error

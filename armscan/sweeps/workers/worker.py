@@ -42,9 +42,9 @@ class Worker:
     """Runs trials of one phase of a study, one after another.
 
     Args:
-        phase: of the study.
-        words: overrides of the command line, which each trial adds its values to.
-        heartbeat: of this worker; holds the current trial.
+        phase: the phase of the study.
+        words: the overrides of the command line, which each trial adds its values to.
+        heartbeat: the heartbeat of this worker, which holds the current trial.
     """
 
     def __init__(self, phase: Phase, words: Sequence[str], heartbeat: Heartbeat) -> None:
@@ -82,7 +82,7 @@ class Worker:
 
     def _run(self, trial: Trial) -> TrialOutcome | None:
         """Run a trial; returns its outcome, None if it was requeued or taken over."""
-        log(f"{self._phase.name}: {_beginning(trial)}")
+        log(f"{self._phase.name}: trial {trial.number} {'is resumed' if RUN in trial.user_attrs else 'begins'}")
         writes = self._heartbeat.writes
         try:
             metrics = check_metrics(self._run_task(trial), self._phase.objectives)
@@ -117,12 +117,12 @@ class Worker:
         # By the trial's number: parallel workers draw different points, and a single worker is reproducible.
         seed = np.random.SeedSequence((phase.seed, trial.number)).generate_state(1)[0]
         trial.study.sampler = make_sampler(phase.sampler, int(seed))
-        chosen = self._suggest(trial)
+        # Of a new object each time: what the trial believes written may have been lost with the connection.
+        chosen = phase.scheduler.storage.transaction(lambda: phase.space.suggest(Trial(trial.study, trial._trial_id)))
         config, choices = composed([*self._words, *overrides_of(chosen)])
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)
         config_sum = config_sha256(to_plain(config))
-        is_resumed = RUN in trial.user_attrs
         self._tracked = self._begun(trial, chosen, folder, config_sum)
         self._opened(None)
         for name, value in ((FOLDER, str(folder)), (CONFIG_SHA256, config_sum)):
@@ -130,7 +130,7 @@ class Worker:
                 writes.append(partial(trial.set_user_attr, name, value))
         attempt = Attempt(
             trial=trial,
-            chosen=chosen,
+            overrides=overrides_of(chosen),
             composed=(config, choices),
             command=run_command([MULTIRUN[0], *self._words]),
             seeds=phase.seeds_of(trial),
@@ -140,7 +140,6 @@ class Worker:
             report_progress=self._heartbeat.report_progress,
             opened=self._opened,
             show_picture=lambda picture: writes.append(partial(show_picture, trial, picture, phase.artifacts)),
-            reported=_steps_of(trial) if is_resumed else set(),
             writes=writes,
             transaction=phase.scheduler.storage.transaction,
         )
@@ -148,15 +147,6 @@ class Worker:
             return phase.run(attempt)
         finally:
             writes.append(partial(trial.set_user_attr, ENV_STEPS, attempt.env_steps))
-
-    def _suggest(self, trial: Trial) -> dict[str, Any]:
-        """Return the values of a trial, drawn and written in one transaction."""
-
-        def suggest() -> dict[str, Any]:
-            # A new object each time: what the trial believes written may have been lost with the connection.
-            return self._phase.space.suggest(Trial(trial.study, trial._trial_id))
-
-        return self._phase.scheduler.storage.transaction(suggest)
 
     def _begun(self, trial: Trial, chosen: dict[str, Any], folder: Path, config_sum: str) -> TrackedRun:
         """Open the tracked run of a trial, or resume that of a requeued one."""
@@ -216,39 +206,17 @@ class Worker:
             tracked.end("FAILED", reason="taken over by another worker")
 
 
-def _steps_of(trial: Trial) -> set[int]:
-    return set(trial.storage.get_trial(trial._trial_id).intermediate_values)
-
-
-def _beginning(trial: Trial) -> str:
-    attributes = trial.user_attrs
-    if RUN in attributes:
-        return f"trial {trial.number} is resumed"
-    again = f", a retry of trial {attributes[RETRY_OF]}" if RETRY_OF in attributes else ""
-    return f"trial {trial.number} begins{again}"
-
-
 def _close(runs: Sequence[TrackedRun]) -> None:
     for run in runs:
         run.end("KILLED", reason="requeued", wait_s=SHORT_WAIT_S)
 
 
-def work(
-    words: Sequence[str],
-    name: str,
-    is_told_to_leave: Callable[[], bool],
-    *,
-    is_told_to_leave_soon: Callable[[], bool],
-    leave: Callable[[], None],
-) -> None:
-    """Works at a study until it is over.
+def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None:
+    """Work at a study until it is over.
 
     Args:
-        words: of the study.
-        name: of the worker.
-        is_told_to_leave: see `Heartbeat`.
-        is_told_to_leave_soon: likewise.
-        leave: likewise.
+        words: the words of the study.
+        make_heartbeat: makes the heartbeat of this worker in a phase, from what depends on the phase.
 
     Raises:
         AwayError: if the storage or the tracking store is away for longer than a worker waits.
@@ -257,14 +225,7 @@ def work(
     opened = open_for_work(*read_settings(words), words, retry=True)
 
     def run_phase(phase: Phase) -> None:
-        heartbeat = Heartbeat(
-            phase.scheduler,
-            name,
-            is_told_to_leave=is_told_to_leave,
-            is_told_to_leave_soon=is_told_to_leave_soon,
-            leave=leave,
-            on_death=phase.close_runs_of,
-        )
+        heartbeat = make_heartbeat(phase.scheduler, on_death=phase.close_runs_of)
         with heartbeat.running():
             reason = Worker(phase, words, heartbeat).work()
         log(f"{phase.name}: {reason}")

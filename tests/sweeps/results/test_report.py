@@ -72,7 +72,6 @@ def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
         "Parallel",
         "Slices",
         "Reports while",
-        "Learning curves",
         "Failures",
     ):
         assert f"<h2>{heading}" in page

@@ -272,18 +272,16 @@ def test_worker_that_is_told_to_leave_while_the_storage_is_away_leaves_soon(open
 
 def test_screen_says_once_that_the_storage_is_away_and_shows_what_is_new_when_it_is_back(monkeypatch, capsys):
     monkeypatch.setattr(screen, "REFRESH_S", 0.0)
-    # Of a screen, what shows again and again.
-    shown = screen.ProgressDisplay.__new__(screen.ProgressDisplay)
-    shown._stopped, is_away = threading.Event(), [True, True, False, False]
+    stopped, is_away = threading.Event(), [True, True, False, False]
 
     def show():
         if len(is_away) == 2:
-            shown._stopped.set()
+            stopped.set()
         if is_away.pop(0):
             raise StorageAwayError("it is away")
         print("trial 3 done")
 
-    shown._repeat(show)
+    screen.repeat(show, stopped)
     assert capsys.readouterr().out.splitlines() == ["it is away", "trial 3 done", "trial 3 done"]
 
 
