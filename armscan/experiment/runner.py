@@ -6,8 +6,9 @@ The configuration is read only here, in `setup` and in `build`.
 from __future__ import annotations
 
 import contextlib
+import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from armscan.experiment.console import print_results, print_where_to_look
 from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
 from armscan.policies.build import save_policy
-from armscan.tracking import TrackedRun
+from armscan.tracking import TrackedRun, draw_learning_curve
 from armscan.training import (
     TEST,
     TRAINING,
@@ -33,7 +34,14 @@ from armscan.training import (
     train,
 )
 from armscan.training.progress import progress_reporter
-from armscan.utils.files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, VIDEO_FILE, check_free, folder_lock
+from armscan.utils.files import (
+    EVALUATION_FILE,
+    LAST_CHECKPOINT,
+    LEARNING_CURVE_FILE,
+    VIDEO_FILE,
+    check_free,
+    folder_lock,
+)
 
 # First seeds of the episodes that are played for each purpose, so that none is played for two.
 VALIDATION_SEED, TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED, VIDEO_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
@@ -96,7 +104,7 @@ def run_tracked(
         tell(f"playing {setup.n_episodes} episodes on the training volumes, and as many on the test volumes")
         evaluations = final_evaluations(setup)
         record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)
-        tracked.keep_results(result, evaluations, folder)
+        keep_results(tracked, result, evaluations, folder)
         if isinstance(setup.agent, Learner):
             save_policy(setup.agent, setup.test_env, tracked, folder, tell)
     if job_label is None:
@@ -125,6 +133,35 @@ def final_evaluations(setup: Experiment) -> dict[str, Evaluation]:
         TRAINING: evaluate(agent, setup.training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),
         TEST: evaluate(agent, setup.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED + seed),
     }
+
+
+def keep_results(
+    tracked: TrackedRun, result: TrainingResult | None, evaluations: Mapping[str, Evaluation], folder: Path
+) -> None:
+    """Log the final evaluations, and keep what the run has made in its folder.
+
+    Args:
+        tracked: the run.
+        result: the training's; evaluations are logged at its best epoch, whose weights they judge. None where there was
+            nothing to learn.
+        evaluations: evaluations by the name of their volumes.
+        folder: the run's folder; the learning curve's picture and the evaluations' figures are added to it.
+    """
+    for name, evaluation in evaluations.items():
+        prefix = name.replace(" ", "_").replace("-", "_")
+        figures = {f"{prefix}/{figure}": value for figure, value in evaluation.metrics().items()}
+        tracked.log_figures(figures, n_env_steps=result.best.n_env_steps if result else 0)
+    if result:
+        tracked.log_figures({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
+        draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
+    write_evaluations(evaluations, folder)
+    tracked.log_results(folder)
+
+
+def write_evaluations(evaluations: Mapping[str, Evaluation], folder: Path) -> None:
+    """Write evaluations with all their episodes into a run's folder, by the name of their volumes."""
+    contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
+    (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
 
 
 @contextlib.contextmanager

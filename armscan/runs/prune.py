@@ -13,7 +13,8 @@ from armscan.errors import TrackingError
 from armscan.runs.query import experiment_ids, search
 from armscan.runs.rows import PARENT_TAG
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
-from armscan.tracking import TrackingStore, check_version, pending
+from armscan.tracking import TrackingStore, check_version
+from armscan.tracking.outbox import forget
 from armscan.tracking.sync import ENDED
 from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
@@ -85,7 +86,7 @@ def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
             file.unlink(missing_ok=True)
         if what == CHECKPOINTS:
             return None
-        pending.forget(run_id)
+        forget(run_id)
         return None if folder.remove_emptied() else f"{folder.path} stays, with what is not the run's"
 
 

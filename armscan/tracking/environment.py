@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import os
@@ -95,17 +96,14 @@ def source_tags() -> Mapping[str, str]:
 
 def source_in(folder: Path) -> Source:
     """Return the state of the working tree that a folder with code is in."""
-    try:
+    commit = UNKNOWN
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
         # Packages that are installed somewhere in the tree of another project are none of that project's code.
-        if not _git(folder, "ls-files", "--", "."):
-            return Source(UNKNOWN, None)
-        commit = _git(folder, "rev-parse", "HEAD").decode().strip()
-    except (OSError, subprocess.SubprocessError):
-        return Source(UNKNOWN, None)
-    try:
-        return Source(commit, _diff(Path(os.fsdecode(_git(folder, "rev-parse", "--show-toplevel")).rstrip("\n"))))
-    except (OSError, subprocess.SubprocessError):
-        return Source(commit, None)
+        if _git(folder, "ls-files", "--", "."):
+            commit = _git(folder, "rev-parse", "HEAD").decode().strip()
+            tree = os.fsdecode(_git(folder, "rev-parse", "--show-toplevel")).rstrip("\n")
+            return Source(commit, _diff(Path(tree)))
+    return Source(commit, None)
 
 
 def _diff(tree: Path) -> bytes:

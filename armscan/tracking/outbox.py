@@ -7,7 +7,7 @@ uploaded twice, because only the answer was lost, changes nothing in the store.
 
 from __future__ import annotations
 
-import errno
+import contextlib
 import json
 import os
 import threading
@@ -20,13 +20,15 @@ from typing import Any, Literal, Self
 from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, TrackingError
-from armscan.utils.files import OUTBOX_FOLDER, OUTBOX_SUFFIXES, atomic_write, truncate_torn_line
+from armscan.utils.files import OUTBOX_FOLDER, OUTBOX_SUFFIXES, atomic_write, cache_folder, truncate_torn_line
 
 Entry = dict[str, Any]
 # Uploaded independently: metrics arrive although the disk of the artifacts is full.
 Channel = Literal["figures", "files"]
 CHANNELS: tuple[Channel, ...] = ("files", "figures")
 DELIVERED, LOCK, SUFFIX = OUTBOX_SUFFIXES
+# Of a machine: links to the outboxes of runs that may have something to upload.
+NOTES_FOLDER = "undelivered"
 # The process that had the run before may still be ending.
 LOCK_TIMEOUT_S = 20.0
 
@@ -150,8 +152,7 @@ class Outbox(OutboxFile):
 
     def __init__(self, file: Path, *, timeout_s: float = LOCK_TIMEOUT_S) -> None:
         # The lock would make the folder of a run again that was removed.
-        if not file.exists():
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(file))
+        file.stat()
         # Also who is told to leave closes it, in another thread.
         self._lock = FileLock(file.with_suffix(LOCK), timeout=timeout_s, thread_local=False)
         try:
@@ -192,10 +193,30 @@ class Outbox(OutboxFile):
         text = json.dumps(self._delivered)
         atomic_write(self._delivered_file, lambda opened: opened.write(text.encode()))
 
+    def note(self) -> None:
+        """Note on this machine that the run has something to upload, so that the next start finds it."""
+        # Nothing is lost without the note: `armscan runs sync` finds the outbox.
+        with contextlib.suppress(OSError):
+            folder = cache_folder() / NOTES_FOLDER
+            folder.mkdir(parents=True, exist_ok=True)
+            forget(self.address.run_id)
+            (folder / self.address.run_id).symlink_to(self.file.absolute())
+
     def close(self) -> None:
         """Close and unlock the outbox."""
         self._appending.close()
         self._lock.release()
+
+
+def forget(run_id: str) -> None:
+    """Remove the note of a run: everything is uploaded, or the run is removed."""
+    with contextlib.suppress(OSError):
+        (cache_folder() / NOTES_FOLDER / run_id).unlink(missing_ok=True)
+
+
+def notes() -> list[Path]:
+    """Return the notes of this machine, named after their runs, links to the outboxes."""
+    return sorted(file for file in (cache_folder() / NOTES_FOLDER).glob("*") if file.is_symlink())
 
 
 def now_ms() -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -13,16 +12,14 @@ from mlflow.entities import Run
 
 from armscan.config.command_hints import armscan_command
 from armscan.errors import is_interruption
-from armscan.tracking import pending
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import DIFF_SUM, environment_tags, source, source_tags
-from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
-from armscan.tracking.plots import draw_learning_curve
+from armscan.tracking.outbox import Address, Outbox, file_of, forget, now_ms
 from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.uploader import Uploader
-from armscan.training import EpochReport, Evaluation, TrainingResult
-from armscan.utils.files import EVALUATION_FILE, LEARNING_CURVE_FILE, RESULTS, RESUMED_DIFF_FILE, atomic_write
+from armscan.training import EpochReport
+from armscan.utils.files import RESULTS, RESUMED_DIFF_FILE, atomic_write
 from armscan.utils.log import log
 
 MODEL_FILE = "MLmodel"
@@ -50,7 +47,7 @@ class TrackedRun:
         self, store: TrackingStore, outbox: Outbox, *, name: str, logged: Collection[tuple[str, int]] = ()
     ) -> None:
         self._store, self._outbox = store, outbox
-        pending.note(outbox)
+        outbox.note()
         self._uploader = Uploader(outbox, store)
         self._logged = frozenset(logged)
         self._is_closed, self._is_delivered, self._is_resumed = False, False, False
@@ -182,26 +179,6 @@ class TrackedRun:
             name, place = os.path.relpath(file, self._outbox.folder), file.parent.relative_to(folder.parent)
             self._add(file=[name, place.as_posix()])
 
-    def keep_results(self, result: TrainingResult | None, evaluations: Mapping[str, Evaluation], folder: Path) -> None:
-        """Log the final evaluations, and keep what the run has made in its folder.
-
-        Args:
-            result: the training's; evaluations are logged at its best epoch, whose weights they judge. None where there
-                was nothing to learn.
-            evaluations: evaluations by the name of their volumes.
-            folder: the run's folder; the learning curve's picture and the evaluations' figures are added to it.
-        """
-        for name, evaluation in evaluations.items():
-            prefix = name.replace(" ", "_").replace("-", "_")
-            figures = {f"{prefix}/{figure}": value for figure, value in evaluation.metrics().items()}
-            self.log_figures(figures, n_env_steps=result.best.n_env_steps if result else 0)
-        if result:
-            self.log_figures({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
-            draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=self.name)
-        contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
-        (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
-        self.log_results(folder)
-
     def log_results(self, folder: Path) -> None:
         """Keep what the run has made in its folder; nothing else that is there."""
         self.log_files(*(folder / name for name in RESULTS if (folder / name).is_file()))
@@ -247,7 +224,7 @@ class TrackedRun:
         failure = self._uploader.finish(self._store.wait_s if wait_s is None else wait_s)
         self._is_delivered = failure is None
         if self._is_delivered:
-            pending.forget(self.run_id)
+            forget(self.run_id)
         self._outbox.close()
         if failure is not None:
             again = armscan_command("runs", "sync", str(self._outbox.folder))

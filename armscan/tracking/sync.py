@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from armscan.errors import FolderInUseError, TrackingError
-from armscan.tracking import pending
 from armscan.tracking.client import TrackingStore, reason_in
-from armscan.tracking.outbox import CHANNELS, Address, Outbox, now_ms, outbox_files
+from armscan.tracking.outbox import CHANNELS, Address, Outbox, notes, now_ms, outbox_files
 from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.store import absolute
@@ -52,9 +51,13 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore]) -> list[Delivery]
     Returns:
         What became of each run that had something left.
     """
+    return _synced(outbox_files(folder), opened)
+
+
+def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore]) -> list[Delivery]:
     deliveries: list[Delivery] = []
     stores: dict[str, TrackingStore | TrackingError] = {}
-    for file in outbox_files(folder):
+    for file in files:
         run_id = None
         try:
             with contextlib.closing(Outbox(file, timeout_s=0.0)) as outbox:
@@ -103,24 +106,19 @@ def deliver_pending(store: TrackingStore) -> None:
 
 
 def _deliver_pending(store: TrackingStore) -> None:
-    for note, file in pending.noted():
-        try:
-            outbox = Outbox(file, timeout_s=0.0)
-        except FolderInUseError:
-            # Its run goes on, and delivers for itself.
-            continue
-        except (OSError, ValueError, TrackingError):
-            # Removed with its folder, or the note or the outbox is damaged, which `armscan runs sync` says.
-            note.unlink(missing_ok=True)
-            continue
-        with contextlib.closing(outbox):
-            if outbox.address.uri != store.uri:
-                continue
-            delivery = _delivered(outbox, store)
-            if delivery.left is None:
-                note.unlink(missing_ok=True)
+    def opened(uri: str) -> TrackingStore:
+        if uri != store.uri:
+            raise TrackingError(f"{uri} is another store")
+        return store
+
+    for note in notes():
+        deliveries = _synced([note.resolve()], opened)
+        for delivery in deliveries:
             if delivery.n_entries:
                 log(f"run {delivery.run_id}: {delivery.n_entries} entries that it had left are delivered now")
+        # Those of a run that was removed, too; one that is still going on delivers for itself.
+        if all(delivery.left is None for delivery in deliveries):
+            note.unlink(missing_ok=True)
 
 
 def abandon(folder: Path, store: TrackingStore, reason: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Iterable, Sequence
 from typing import Any
 
 from mlflow import MlflowClient
@@ -19,7 +18,7 @@ from armscan.utils.log import log
 from armscan.utils.retry import FIRST_PAUSE_S
 
 # MLflow takes no more of each in one request.
-AT_ONCE = {"metrics": 1000, "params": 100, "tags": 100}
+AT_ONCE: dict[str, tuple[int, type[Any]]] = {"metrics": (1000, Metric), "params": (100, Param), "tags": (100, RunTag)}
 ENTRIES_AT_ONCE = 200
 LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
 
@@ -145,15 +144,12 @@ def deliver(outbox: Outbox, client: MlflowClient, channel: Channel, *, is_whole:
 def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any]) -> None:
     run_id = outbox.address.run_id
     match kind:
-        case "metrics":
-            for batch in _batches(itertools.chain(*values), AT_ONCE[kind]):
-                client.log_batch(run_id, metrics=[Metric(*point) for point in batch])
-        case "params":
-            for batch in _batches(itertools.chain(*(each.items() for each in values)), AT_ONCE[kind]):
-                client.log_batch(run_id, params=[Param(*pair) for pair in batch])
-        case "tags":
-            for batch in _batches(itertools.chain(*(each.items() for each in values)), AT_ONCE[kind]):
-                client.log_batch(run_id, tags=[RunTag(*pair) for pair in batch])
+        case "metrics" | "params" | "tags":
+            at_once, entity = AT_ONCE[kind]
+            rest = itertools.chain(*(each.items() if isinstance(each, dict) else each for each in values))
+            while batch := [entity(*each) for each in itertools.islice(rest, at_once)]:
+                request: dict[str, Any] = {kind: batch}
+                client.log_batch(run_id, **request)
         case "untagged":
             for tag in values:
                 try:
@@ -177,9 +173,3 @@ def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any])
             return
         case _:
             raise TrackingError(f"{outbox.file}: holds {kind!r}, which this version of armscan does not know")
-
-
-def _batches(values: Iterable[Any], size: int) -> Iterable[Sequence[Any]]:
-    rest = iter(values)
-    while batch := list(itertools.islice(rest, size)):
-        yield batch

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from armscan.tracking import pending
-from armscan.tracking.outbox import file_of
+from armscan.tracking.outbox import NOTES_FOLDER, file_of
 from armscan.utils.files import LOCK_FILE
 
 
@@ -297,7 +296,7 @@ def test_note_of_a_run_goes_with_its_folder(answer, make_run, monkeypatch, tmp_p
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
     run_id = make_run()
     # As a run leaves it whose rest was delivered by `armscan runs sync`.
-    note = tmp_path / "cache" / pending.FOLDER / run_id
-    note.write_text(str(file_of(tmp_path / "outputs" / "tiny", run_id)))
+    note = tmp_path / "cache" / NOTES_FOLDER / run_id
+    note.symlink_to(file_of(tmp_path / "outputs" / "tiny", run_id))
     assert answer("prune", "folders", "--apply")[0] == 0
     assert not note.exists()

@@ -11,6 +11,7 @@ import pytest
 
 import armscan
 from armscan.errors import InvalidValueError, TrackingError
+from armscan.experiment.runner import keep_results
 from armscan.tracking import (
     VERSION_TAG,
     TrackedRun,
@@ -65,7 +66,8 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
         for report in REPORTS:
             tracked.on_epoch(report)
         tracked.on_end()
-        tracked.keep_results(
+        keep_results(
+            tracked,
             TrainingResult(tuple(REPORTS), is_solved=False, wall_s=3.0),
             {"test volumes": evaluation_of(2, 4)},
             folder,

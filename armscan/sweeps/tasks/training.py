@@ -17,7 +17,7 @@ from armscan.errors import CheckpointError, InvalidValueError
 from armscan.experiment.build import Experiment, build_experiment, check_keys, set_up
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
-from armscan.experiment.runner import VIDEO_SEED, final_evaluations, train_agent
+from armscan.experiment.runner import VIDEO_SEED, final_evaluations, train_agent, write_evaluations
 from armscan.policies.build import save_policy
 from armscan.stats.aggregation import interquartile_mean
 from armscan.sweeps.scheduling.state import ENV_STEPS
@@ -26,7 +26,6 @@ from armscan.sweeps.tasks.base import VolumesInMemory
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
 from armscan.training import TEST, EpochReport, Evaluation, record_episode, resume_from_checkpoint
 from armscan.utils.files import (
-    EVALUATION_FILE,
     LAST_CHECKPOINT,
     LEARNING_CURVE_FILE,
     RUN_FILE,
@@ -120,8 +119,7 @@ class TrainingTask:
 
 def _concluded(setup: Experiment, tracked: TrackedRun, folder: Path) -> dict[str, float]:
     evaluations = final_evaluations(setup)
-    contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
-    (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
+    write_evaluations(evaluations, folder)
     agent, seed = setup.agent, VIDEO_SEED + setup.seed
     record_episode(agent, setup.video_env, folder / VIDEO_FILE, seed=seed)
     assert isinstance(agent, Learner)
