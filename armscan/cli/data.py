@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from rich.console import Console
+from rich.table import Column, Table
+from rich.text import Text
 
 from armscan.cli.options import FILE_PATH, CommaSeparated, clustering_option, examples
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from armscan.annotation.labelling import Labelled, LabellingOptions
     from armscan.volumes import Dataset
     from armscan.volumes.summary import VolumeReport
@@ -125,9 +126,6 @@ def explore(folder: str | None, volume: str | None, clustering: str | None) -> N
 
 def _print_dataset(dataset: Dataset) -> None:
     """Print a table for each volume, and the excluded volumes."""
-    from rich.console import Console
-    from rich.text import Text
-
     console = Console()
     for name, report in dataset.reports.items():
         plane = "a labelled plane" if dataset.volumes[name].optimal_action else "no labelled plane"
@@ -141,39 +139,25 @@ def _print_dataset(dataset: Dataset) -> None:
 
 def _tissue_table(report: VolumeReport) -> Table:
     """Return a row for each tissue: its values in the file, and how much of it the volume holds."""
-    from rich.table import Table
-    from rich.text import Text
-
     from armscan.volumes import LABEL_NAMES
     from armscan.volumes.labelmap import shown
 
-    table = Table()
-    for heading in ("tissue", "in the file (voxels)"):
-        table.add_column(heading)
-    for heading in ("voxels", "mm3"):
-        table.add_column(heading, justify="right")
+    table = Table("tissue", "in the file (voxels)", Column("voxels", justify="right"), Column("mm3", justify="right"))
     for value, tissue in LABEL_NAMES.items():
         sources = ", ".join(f"{each.source} ({each.n_voxels})" for each in report.stored.found if each.label == value)
-        amounts = (
-            (str(report.n_voxels[tissue]), f"{report.tissue_mm3[tissue]:.0f}")
-            if tissue in report.n_voxels
-            else ("", "")
-        )
+        is_there = tissue in report.n_voxels
+        amounts = (str(report.n_voxels[tissue]), f"{report.tissue_mm3[tissue]:.0f}") if is_there else ()
         table.add_row(tissue, Text(sources or "-"), *amounts)
     if report.stored.missing:
-        table.add_row("not there", Text(shown(report.stored.missing)), "", "")
+        table.add_row("not there", Text(shown(report.stored.missing)))
     return table
 
 
 def _geometry(report: VolumeReport) -> str:
     stored = report.stored
     parts = [f"{_grid(report.shape, report.spacing)}, axes towards {report.orientation}"]
-    is_as_stored = (report.shape, report.spacing, report.orientation) == (
-        stored.shape,
-        stored.spacing,
-        stored.orientation,
-    )
-    if not is_as_stored:
+    before = (stored.shape, stored.spacing, stored.orientation)
+    if before != (report.shape, report.spacing, report.orientation):
         parts.append(f"read from {_grid(stored.shape, stored.spacing)}, axes towards {stored.orientation}")
     if stored.crop_mm:
         kept = ", ".join(f"{axis} from {low:g} to {high:g} mm" for axis, (low, high) in stored.crop_mm.items())
@@ -189,17 +173,14 @@ def _grid(shape: Sequence[int], spacing: Sequence[float]) -> str:
 def _print_planes(options: LabellingOptions, labelled: Sequence[Labelled]) -> None:
     """Print a table of the planes, and what the person who checks them can do next."""
     from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
     from armscan.annotation.labelling import SUCCESS_THRESHOLD
     from armscan.config.command_hints import armscan_command
     from armscan.volumes.markups import MARKUP_SUFFIX
 
-    table = Table(title="planes written into the manifest", title_justify="left")
-    table.add_column("volume", overflow="fold")
-    for heading in ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "as good over\n°, °, mm"):
-        table.add_column(heading, justify="right")
+    headings = ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "as good over\n°, °, mm")
+    columns = (Column("volume", overflow="fold"), *(Column(heading, justify="right") for heading in headings))
+    table = Table(*columns, title="planes written into the manifest", title_justify="left")
     for plane in labelled:
         rz, rx, tx, ty = plane.action.to_array()
         table.add_row(

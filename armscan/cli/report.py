@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -37,7 +36,10 @@ def report(study: str | None, runs: str | None, out: Path | None, storage: str, 
     of, other = ("study", "runs") if runs is None else ("runs", "study")
     if is_given(PLACES[other]):
         raise click.UsageError(f"--{PLACES[other]} is given, but it is for --{other}, and this report is of --{of}")
-    _check_folder(out)
+    if out is not None:
+        nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
+        if not nearest.is_dir():
+            raise InvalidValueError(f"--out is {str(out)!r}, but {nearest} is no folder: name one, or a new one")
     # Deferred: a mistake on the command line is answered before these are loaded.
     from armscan.reports.runs import compare_runs
 
@@ -63,7 +65,8 @@ def _report_on_study(name: str, uri: str, out: Path | None) -> Path:
     names = optuna.get_all_study_names(storage.optuna)
     if name not in names:
         others = [each for each in names if not each.endswith(FINAL_EVAL_SUFFIX)]
-        raise StudyError(f"--study is {name!r}, but {_there_are(others)} in {storage.uri!r}")
+        there = f"there is only {listed(others)}" if others else "there is no study"
+        raise StudyError(f"--study is {name!r}, but {there} in {storage.uri!r}")
     study = optuna.load_study(study_name=name, storage=storage.optuna)
     if not is_ours(study):
         raise StudyError(f"--study is {name!r}, but that one in {storage.uri!r} was not made by armscan")
@@ -72,15 +75,3 @@ def _report_on_study(name: str, uri: str, out: Path | None) -> Path:
         final = optuna.load_study(study_name=name + FINAL_EVAL_SUFFIX, storage=storage.optuna)
         evaluated = final.get_trials(deepcopy=False)
     return write_report(study, evaluated, out or Path("reports", name))
-
-
-def _check_folder(out: Path | None) -> None:
-    """Raise an error where the report's folder cannot be made, before the report is."""
-    if out is not None:
-        nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
-        if not nearest.is_dir():
-            raise InvalidValueError(f"--out is {str(out)!r}, but {nearest} is no folder: name one, or a new one")
-
-
-def _there_are(names: Sequence[str]) -> str:
-    return f"there is only {listed(names)}" if names else "there is no study"

@@ -14,16 +14,7 @@ from omegaconf import DictConfig
 
 from armscan.config.error_messages import one_line_message
 from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, Invocation, Job, remove_if_untracked
-from armscan.utils.processes import on_parent_exit
-
-# What a job's process runs; it may be interrupted while it is still importing.
-JOB_PROGRAM = """
-try:
-    from armscan.launch.job_process import run_job
-    run_job()
-except KeyboardInterrupt:
-    raise SystemExit(130)
-"""
+from armscan.utils.processes import child_command, on_parent_exit
 
 
 def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
@@ -32,7 +23,8 @@ def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
     One that is killed, for its memory say, takes neither the launcher nor the other jobs with it.
     """
     job.write_outcome(failure=NO_OUTCOME)
-    ended = subprocess.run([sys.executable, "-c", JOB_PROGRAM], input=pickle.dumps((config, invocation)), check=False)
+    command = child_command(__name__, run_job.__name__)
+    ended = subprocess.run(command, input=pickle.dumps((config, invocation)), check=False)
     if ended.returncode < 0:
         job.write_outcome(failure=f"killed by {signal.Signals(-ended.returncode).name}: out of memory?")
 

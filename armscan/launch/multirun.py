@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,27 +49,16 @@ class Multirun(Callback):
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Check what a single run would write down."""
-        self._answered(self._check, config)
+        with _answered():
+            for key in (TRACKING_URI, "study.storage"):
+                if isinstance(uri := OmegaConf.select(config, key), str):
+                    check_address(key, uri)
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Open the store, start the parent run and write its ID for the jobs."""
-        self._answered(self._check, config)
-        self._answered(self._start, config)
-
-    @staticmethod
-    def _answered(begin: Callable[[DictConfig], None], config: DictConfig) -> None:
-        try:
-            begin(config)
-        # Hydra would turn any exception of a callback into a warning, and start the jobs all the same.
-        except Exception as error:
-            print(f"error: {one_line_message(error) or repr(error)}", file=sys.stderr)
-            raise SystemExit(2) from error
-
-    @staticmethod
-    def _check(config: DictConfig) -> None:
-        for key in (TRACKING_URI, "study.storage"):
-            if isinstance(uri := OmegaConf.select(config, key), str):
-                check_address(key, uri)
+        self.on_run_start(config)
+        with _answered():
+            self._start(config)
 
     @staticmethod
     def _start(config: DictConfig) -> None:
@@ -95,6 +85,16 @@ class Multirun(Callback):
         word["is_repeated"] = Multirun.is_repeated
         (folder / PARENT_FILE).write_text(json.dumps(word))
         Multirun.folder = folder
+
+
+@contextmanager
+def _answered() -> Iterator[None]:
+    """Answer an error in one line and leave: Hydra would warn of any exception of a callback, and start the jobs."""
+    try:
+        yield
+    except Exception as error:
+        print(f"error: {one_line_message(error) or repr(error)}", file=sys.stderr)
+        raise SystemExit(2) from error
 
 
 def end_multirun(*, is_interrupted: bool = False) -> int:

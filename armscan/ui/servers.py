@@ -19,13 +19,13 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from armscan.config.credentials import TRACKING_PASSWORD, database_url, mask_passwords
 from armscan.errors import InvalidValueError, TrackingError
-from armscan.ui.mlflow_server import END_S
+from armscan.utils.processes import child_command, on_parent_exit
 
 if TYPE_CHECKING:
     from armscan.sweeps.storage.storage import Storage
 
 HOST = "127.0.0.1"
-START_S, POLL_S = 120.0, 0.1
+START_S, END_S, POLL_S = 120.0, 5.0, 0.1
 LOG_BYTES = 2000
 MLFLOW_OPTIONS = ("--host", HOST, "--workers", "1", "--uvicorn-opts=--no-access-log")
 
@@ -91,7 +91,7 @@ def mlflow_server(uri: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
     environment = os.environ | {"MLFLOW_BACKEND_STORE_URI": store, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
     environment.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     environment.pop("MLFLOW_TRACKING_URI", None)
-    command = [sys.executable, "-m", "armscan.ui.mlflow_server", *MLFLOW_OPTIONS, "--port", str(port)]
+    command = [*child_command(__name__, serve_mlflow.__name__), "server", *MLFLOW_OPTIONS, "--port", str(port)]
     with tempfile.TemporaryFile() as log:
         # In a process group of its own, which a Ctrl-C does not reach.
         process = subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
@@ -112,6 +112,20 @@ def mlflow_server(uri: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+
+
+def serve_mlflow() -> None:
+    """Run MLflow's program with the arguments of this process, which ends with its parent."""
+
+    def end_group() -> None:
+        os.killpg(0, signal.SIGTERM)
+        time.sleep(END_S)
+        os.killpg(0, signal.SIGKILL)
+
+    on_parent_exit(end_group)
+    from mlflow.cli import cli
+
+    cli()
 
 
 def _is_answering(port: int) -> bool:

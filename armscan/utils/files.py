@@ -6,6 +6,7 @@ import contextlib
 import errno
 import fnmatch
 import hashlib
+import mmap
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -45,7 +46,6 @@ RUN_ID = "[0-9a-f]" * 32
 UNFINISHED = "unfinished"
 # How the address of a database in a file begins.
 SQLITE_PREFIX = "sqlite:///"
-BLOCK_BYTES = 4096
 
 
 def cache_folder() -> Path:
@@ -148,10 +148,7 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextlib.contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Keep every other process from working in a run's folder; the system frees what a dead process held.
-
-    Args:
-        folder: of the run.
+    """Keep every other process from working in the folder of a run; the system frees what a dead process held.
 
     Raises:
         FolderInUseError: if another process holds it.
@@ -168,13 +165,10 @@ def folder_lock(folder: Path) -> Iterator[None]:
 def truncate_torn_line(path: Path) -> None:
     """Remove the beginning of a line whose writer died before its end."""
     with path.open("rb+") as file:
-        size = end = file.seek(0, os.SEEK_END)
-        while end > 0:
-            start = max(0, end - BLOCK_BYTES)
-            file.seek(start)
-            newline = file.read(end - start).rfind(b"\n")
-            end = start + newline + 1 if newline >= 0 else start
-            if newline >= 0:
-                break
-        if end < size:
-            file.truncate(end)
+        size = file.seek(0, os.SEEK_END)
+        # An empty file cannot be mapped.
+        if size > 0:
+            with mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ) as contents:
+                end = contents.rfind(b"\n") + 1
+            if end < size:
+                file.truncate(end)

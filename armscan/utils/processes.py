@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -27,6 +28,12 @@ def limit_threads() -> None:
     """
     for variable in THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")
+
+
+def child_command(module: str, function: str) -> list[str]:
+    """Return the command of a child process that runs a function, and may be interrupted while it still imports."""
+    program = f"from {module} import {function}\n    {function}()"
+    return [sys.executable, "-c", f"try:\n    {program}\nexcept KeyboardInterrupt:\n    raise SystemExit(130)"]
 
 
 def process_start(pid: int) -> str:

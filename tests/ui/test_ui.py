@@ -219,9 +219,7 @@ def test_ui_takes_its_servers_along_when_it_is_killed(both, look, number):
 
 def test_ui_ends_and_says_so_when_mlflow_ends_by_itself(both, look):
     looked = look(both)
-    (server,) = [
-        pid for pid in looked.servers if "armscan.ui.mlflow_server" in Path(f"/proc/{pid}/cmdline").read_text()
-    ]
+    (server,) = [pid for pid in looked.servers if "serve_mlflow" in Path(f"/proc/{pid}/cmdline").read_text()]
     os.kill(server, signal.SIGKILL)
     assert looked.process.wait(END_S) == 2
     said = looked.printed.partition("Ctrl-C ends both\n")[2]

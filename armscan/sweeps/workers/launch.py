@@ -80,8 +80,11 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
 
 def _words(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: Path) -> list[str]:
     """Return the words that the workers are launched with."""
-    n_workers = opened.settings.workers
-    words = ["-m", *given.launching, *_addresses(opened, given)]
+    n_workers, fixed = opened.settings.workers, fixed_by(given.words)
+    words = ["-m", *given.launching]
+    # The addresses that only this machine's environment has.
+    addresses = {STORAGE: opened.settings.storage, TRACKING_URI: opened.config.tracking.uri}
+    words += [f"{key}={written(uri)}" for key, uri in addresses.items() if key not in fixed]
     words += [f"{WORKER_KEY}={','.join(map(str, range(n_workers)))}", f"hydra.sweep.dir={written(str(folder))}"]
     if launcher == USUAL_LAUNCHER:
         # Before the others, which may say something else.
@@ -89,13 +92,6 @@ def _words(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: Path
     if launcher == "joblib":
         words.append(f"hydra.launcher.n_jobs={n_workers}")
     return words
-
-
-def _addresses(opened: OpenedStudy, given: StudyCommand) -> list[str]:
-    """Return overrides with the addresses of storage and tracking that only this machine's environment has."""
-    fixed = fixed_by(given.words)
-    addresses = {STORAGE: opened.settings.storage, TRACKING_URI: opened.config.tracking.uri}
-    return [f"{key}={written(uri)}" for key, uri in addresses.items() if key not in fixed]
 
 
 def _launch_elsewhere(opened: OpenedStudy, folder: Path, launcher: str, launch: Callable[[], object]) -> None:

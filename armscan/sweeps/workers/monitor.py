@@ -87,10 +87,15 @@ class StudyMonitor:
                 raise KeyboardInterrupt
 
         def watch() -> None:
+            over_s = 0.0
             with no_retry():
-                if self._seen_over(is_left):
-                    is_over.set()
-                    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
+                while over_s < OVER_S:
+                    if is_left.wait(LOOK_S):
+                        return
+                    with contextlib.suppress(StorageAwayError):
+                        over_s = over_s + LOOK_S if self.is_over() else 0.0
+            is_over.set()
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
 
         before = signal.signal(signal.SIGUSR1, interrupt)
         watching = threading.Thread(target=watch, daemon=True)
@@ -104,13 +109,3 @@ class StudyMonitor:
             is_left.set()
             watching.join()
             signal.signal(signal.SIGUSR1, before)
-
-    def _seen_over(self, is_left: threading.Event) -> bool:
-        """Return True once the study has been over for a while, False if the launcher returns before."""
-        over_s = 0.0
-        while over_s < OVER_S:
-            if is_left.wait(LOOK_S):
-                return False
-            with contextlib.suppress(StorageAwayError):
-                over_s = over_s + LOOK_S if self.is_over() else 0.0
-        return True

@@ -19,7 +19,7 @@ from typing import BinaryIO
 
 from armscan.errors import AwayError, StudyError
 from armscan.sweeps.workers.slurm import SOON, Notice
-from armscan.utils.processes import ProcessInfo, on_parent_exit
+from armscan.utils.processes import ProcessInfo, child_command, on_parent_exit
 
 LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
 # Exit codes of a worker that was told to leave, of one whose storage was away for too long, and of all that are not
@@ -33,13 +33,6 @@ MAX_RESTARTS = 100
 MAX_ERRORS = 5
 # Time that a worker has for its current epoch when it is told to leave soon.
 SOON_S = 60.0
-WORKER_PROGRAM = """
-try:
-    from armscan.sweeps.workers.supervisor import worker_main
-    worker_main()
-except KeyboardInterrupt:
-    raise SystemExit(130)
-"""
 
 
 def local_workers(folder: Path) -> list[ProcessInfo]:
@@ -95,7 +88,7 @@ def _launcher_of(folder: Path) -> ProcessInfo:
 def _worked(study_input: bytes, directory: str, log_file: BinaryIO, notice: Notice) -> int:
     """Run the process of a worker to its end; returns its exit code."""
     with subprocess.Popen(
-        [sys.executable, "-c", WORKER_PROGRAM],
+        child_command(__name__, worker_main.__name__),
         stdin=subprocess.PIPE,
         cwd=directory,
         env=_environment(),
