@@ -13,7 +13,7 @@ from mlflow.exceptions import MlflowException
 from armscan.agents import Learner
 from armscan.config.defaults import to_plain
 from armscan.errors import ExportError, InvalidValueError
-from armscan.evaluation import TrainedAgent, TrainingVolumes, agent_of_run, own_split, prepare
+from armscan.evaluation import TrainingVolumes, agent_of_run, own_split, prepare
 from armscan.policies.build import SUM_TAG, facts_of, make_model, tags_of_kept
 from armscan.policies.model import model_sha256
 from armscan.runs.model_card import Card
@@ -42,7 +42,10 @@ def export_policy(tracking: str, run_id: str, folder: Path) -> FoundRun:
     """
     subject = agent_of_run(tracking, run_id, {})
     assert subject.run is not None
-    _as_it_is(subject)
+    # A policy answers as the agent was evaluated: with its most likely action, on the CPU.
+    subject.config.compute.update(PLAIN_COMPUTE)
+    if "deterministic_eval" in subject.config.agent:
+        subject.config.agent.deterministic_eval = True
     own = cache(partial(own_split, subject, ("training", "test")))
     evaluator = prepare(subject, {TEST: own().test}, TrainingVolumes(own))
     if not isinstance(evaluator.agent, Learner):
@@ -50,12 +53,6 @@ def export_policy(tracking: str, run_id: str, folder: Path) -> FoundRun:
     env = evaluator.envs[TEST]
     make_model(evaluator.agent, env, folder, facts_of(to_plain(subject.config), env, subject.run.run_id))
     return subject.run
-
-
-def _as_it_is(subject: TrainedAgent) -> None:
-    subject.config.compute.update(PLAIN_COMPUTE)
-    if "deterministic_eval" in subject.config.agent:
-        subject.config.agent.deterministic_eval = True
 
 
 def register_policy(tracking: str, run_id: str, name: str) -> str:
@@ -99,11 +96,8 @@ def _check_name(name: str) -> None:
 
 
 def _is_kept(run: FoundRun) -> bool:
-    if SUM_TAG not in run.tags or POLICY_FOLDER not in run.files:
-        return False
-    return f"{POLICY_FOLDER}/{MODEL_FILE}" in [
-        each.path for each in run.client.list_artifacts(run.run_id, POLICY_FOLDER)
-    ]
+    files = run.client.list_artifacts(run.run_id, POLICY_FOLDER) if POLICY_FOLDER in run.files else []
+    return SUM_TAG in run.tags and f"{POLICY_FOLDER}/{MODEL_FILE}" in [file.path for file in files]
 
 
 def _check_kept(run: FoundRun, folder: Path) -> None:

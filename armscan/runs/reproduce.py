@@ -76,11 +76,9 @@ def _environment(text: str, run: FoundRun) -> Mapping[str, Any]:
     """Return what a run has kept of its environment."""
     try:
         kept = json.loads(text)
-    except ValueError:
-        kept = None
-    if not isinstance(kept, dict) or not isinstance(kept.get("packages"), dict):
-        raise TrackingError(f"run {run.run_id}: its {ENVIRONMENT_FILE} is damaged, or another file")
-    return kept
+        return dict(kept) | {"packages": dict(kept["packages"])}
+    except (ValueError, TypeError, KeyError) as error:
+        raise TrackingError(f"run {run.run_id}: its {ENVIRONMENT_FILE} is damaged, or another file") from error
 
 
 def differences(original: Original) -> list[str]:

@@ -31,9 +31,9 @@ def show(client: TrackingStore, run: Run, uri: str) -> None:
     """Print how a run was started and ended, its figures, files, children, and what can be done with it.
 
     Args:
-        client: of its store.
+        client: its store.
         run: the run.
-        uri: of the store, as somebody would type it.
+        uri: MLflow tracking URI, as somebody would type it.
     """
     console, entry = Console(), RunRow(client, run)
     tags = {name: value for name, value in run.data.tags.items() if value}
@@ -41,7 +41,8 @@ def show(client: TrackingStore, run: Run, uri: str) -> None:
     _print_figures(console, run)
     console.print("\ntags", style="bold")
     shown = {*STARTED_BY, FAILURE_TAG, PARENT_TAG}
-    _print_pairs(console, {name: tags[name] for name in sorted(tags) if name not in shown and not _is_mlflows(name)})
+    others = {name: tags[name] for name in sorted(tags) if name not in shown and not name.startswith("mlflow.")}
+    _print_pairs(console, others)
     artifacts = artifacts_of(client, run)
     folder = _print_folder(console, run)
     if artifacts is None:
@@ -68,10 +69,6 @@ def _facts(run: Run, entry: RunRow) -> dict[str, str]:
         "parent": tags.get(PARENT_TAG, ""),
     }
     return {name: value for name, value in facts.items() if name and value}
-
-
-def _is_mlflows(tag: str) -> bool:
-    return tag.startswith("mlflow.")
 
 
 def _print_pairs(console: Console, pairs: dict[str, str]) -> None:

@@ -118,15 +118,8 @@ def _row(entry: RunRow) -> dict[str, Any]:
 
 def print_plan(cases: Sequence[PruneItem]) -> None:
     """Print what would be removed, and why the rest would not."""
-    console = Console()
-    taken = [case for case in cases if case.left is None]
-    if taken:
-        table = narrow_table("id", "name", "status", "started", "frees>")
-        for case in taken:
-            info = case.run.info
-            row = (info.run_id[:ID_CHARS], Text(shortened(info.run_name)), info.status.lower())
-            table.add_row(*row, format_time(started(case.run)), decimal(case.n_bytes))
-        console.print(table)
     for case in cases:
-        if case.left:
-            console.print(Text(f"{case.run.info.run_id[:ID_CHARS]} stays: {case.left}"), soft_wrap=True)
+        info = case.run.info
+        named = f"{shortened(info.run_name)}, {info.status.lower()}, of {format_time(started(case.run))}"
+        what = f"frees {decimal(case.n_bytes)}: {named}" if case.left is None else f"stays: {case.left}"
+        Console().print(Text(f"{info.run_id[:ID_CHARS]} {what}"), soft_wrap=True)

@@ -9,7 +9,6 @@ from armscan.tracking.lookup import (
     FoundRun,
     check_version,
     find_run,
-    jobs_of,
     load_run,
 )
 from armscan.tracking.outbox import take_over
@@ -35,7 +34,6 @@ __all__ = [
     "environment_tags",
     "find_run",
     "flattened",
-    "jobs_of",
     "load_run",
     "note_end",
     "open_existing_store",

@@ -62,12 +62,9 @@ class FoundRun:
             TrackingError: if the run has kept none, it is damaged, or not the one that the run was started with.
         """
         try:
-            config = yaml.safe_load(self._started_with(CONFIG_FILE, folder))
-        except yaml.YAMLError as error:
+            return migrate(dict(yaml.safe_load(self._started_with(CONFIG_FILE, folder))))
+        except (yaml.YAMLError, TypeError, ValueError) as error:
             raise TrackingError(f"run {self.run_id}: its {CONFIG_FILE} is damaged") from error
-        if not isinstance(config, dict):
-            raise TrackingError(f"run {self.run_id}: its {CONFIG_FILE} holds no configuration")
-        return migrate(config)
 
     def checkpoint(self, folder: Path) -> Path | None:
         """Return the best checkpoint, fetched into `folder`; None where the run has kept none."""
@@ -120,9 +117,11 @@ def load_run(uri: str, run_id: str) -> FoundRun:
     with store_errors(uri):
         run = find_run(client, run_id)
         check_version(run)
-        if jobs := jobs_of(client, run):
-            ids = listed([job.info.run_id for job in jobs])
-            raise TrackingError(f"run {run.info.run_id} is the parent of a multirun: give one of its jobs, {ids}")
+        children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
+        if jobs := [child.info.run_id for child in children if EVALUATED_TAG not in child.data.tags]:
+            raise TrackingError(
+                f"run {run.info.run_id} is the parent of a multirun: give one of its jobs, {listed(jobs)}"
+            )
         return FoundRun(
             client=client,
             uri=uri,
@@ -139,8 +138,8 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
     """Return the run of an id.
 
     Args:
-        client: of an open store.
-        run_id: the id, or a beginning of it that no other run's has, in any experiment of the store.
+        client: the store.
+        run_id: MLflow run ID, or its first characters, in any experiment of the store.
 
     Raises:
         TrackingError: if no run is meant, or several are.
@@ -172,9 +171,3 @@ def check_version(run: Run) -> None:
             f"run {run.info.run_id} was made by armscan {version}, but this is {armscan.__version__}: "
             "it needs that version or a newer one"
         )
-
-
-def jobs_of(client: TrackingStore, run: Run) -> list[Run]:
-    """Return the runs of a multirun's jobs, by its parent run; none where the run is another."""
-    children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
-    return [child for child in children if EVALUATED_TAG not in child.data.tags]

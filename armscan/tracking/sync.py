@@ -29,10 +29,10 @@ class Delivery:
     """What became of the entries of a run.
 
     Args:
-        folder: of the run.
-        run_id: of the run; None where another process holds it.
-        n_entries: that were delivered now.
-        left: why some are not delivered; None where all are.
+        folder: the run's folder.
+        run_id: MLflow run ID; None if another process holds the outbox.
+        n_entries: number of entries delivered now.
+        left: why some are not delivered; None if all are.
     """
 
     folder: Path
@@ -127,8 +127,8 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
     What the store does not get now is in their folders.
 
     Args:
-        folder: of a trial.
-        store: that they are in.
+        folder: folder tree, such as a trial's.
+        store: the store that they are in.
         reason: why they failed.
     """
     for file in outbox_files(folder):
@@ -148,11 +148,11 @@ def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str
     """Note how a run has ended, for `sync` to deliver, without asking its store.
 
     Args:
-        folder: of the run.
-        run_id: of the run.
-        uri: of its store.
-        status: as MLflow calls it.
-        tags: to set.
+        folder: the run's folder.
+        run_id: MLflow run ID.
+        uri: MLflow tracking URI.
+        status: status as MLflow calls it.
+        tags: tags to set.
     """
     with contextlib.closing(Outbox.begin(folder, Address(run_id, absolute(uri)))) as outbox:
         if tags:
