@@ -41,7 +41,7 @@ def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -
     """Resume the run that a command line names.
 
     Args:
-        words: of the command line.
+        words: overrides on the command line.
         repeat_grid: runs what has not finished of the grid that its words describe.
 
     Raises:
@@ -67,9 +67,9 @@ def resume_run(client: TrackingStore, run_id: str, *, job_label: str | None = No
     """Go on with a run; see `resume`.
 
     Args:
-        client: of the store that it is in.
-        run_id: of the run.
-        job_label: what stands before the lines of one job of several, None for a single run.
+        client: the run's store.
+        run_id: MLflow run ID.
+        job_label: prefix of the printed lines of a multirun's job. Default: None, a single run.
     """
     folder = _folder_of(client.get_run(run_id))
     with folder_lock(folder):

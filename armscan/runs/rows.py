@@ -116,17 +116,11 @@ class RunRow:
 
     def value_of(self, sort: str) -> float | None:
         """Return what it is sorted by, `started`, `duration`, `success`, `steps` or `size`; None where it has none."""
-        match sort:
-            case "duration":
-                return self.duration_s
-            case "success":
-                return self.success_rate
-            case "steps":
-                return self.mean_steps
-            case "size":
-                return self.size.n_bytes
-            case _:
-                return float(self.run.info.start_time)
+        if sort == "size":
+            # A server is asked for each run's size.
+            return self.size.n_bytes
+        values = {"duration": self.duration_s, "success": self.success_rate, "steps": self.mean_steps}
+        return values.get(sort, self.started.timestamp())
 
 
 def started(run: Run) -> datetime:
@@ -145,7 +139,7 @@ def expand(entries: Sequence[RunRow], runs: Sequence[Run]) -> list[RunRow]:
 
     Args:
         entries: as `collapse` returns them, in any order.
-        runs: that they were folded from.
+        runs: the runs that they were folded from.
     """
     children, _ = _family(runs)
 
