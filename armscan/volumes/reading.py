@@ -154,8 +154,6 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
     if stored.GetDimension() == 4 and stored.GetSize()[3] == 1:
         # A single point in time.
         stored = stored[:, :, :, 0]
-    if 0 in stored.GetSize():
-        raise VolumeError(f"{path}: the image has the size {stored.GetSize()}, but a labelmap must not be empty")
     if stored.GetDimension() != 3 or stored.GetNumberOfComponentsPerPixel() != 1:
         raise VolumeError(
             f"{path}: the image is {stored.GetDimension()}-D with {stored.GetNumberOfComponentsPerPixel()} value(s) a "

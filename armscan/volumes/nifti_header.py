@@ -1,0 +1,87 @@
+"""What the header of a NIfTI file says, checked before SimpleITK reads the file.
+
+SimpleITK fills the missing end of a truncated file with zeros, shifts the image where its voxels begin within the
+header, makes voxels that are NaN or infinite 0, and prints pages where the place in the world is no number.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from armscan.errors import VolumeError
+from armscan.volumes.stored_voxels import GZIP, StoredVoxels, check_spacing, check_stored, count_voxels, pieces
+
+# Types of voxels by their codes; the header's own figure of their bytes can be anything and is not what is read.
+TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8"}
+# By what a header, NIfTI-1 or NIfTI-2, calls its own size: its fields as `struct` reads them, and where they stand.
+LAYOUTS = {
+    348: {
+        "magic": ("4s", 344),
+        "dimensions": ("8h", 40),
+        "type": ("h", 70),
+        "steps": ("8f", 76),
+        "begin": ("f", 108),
+        "place": ("18f", 256),
+    },
+    540: {
+        "magic": ("8s", 4),
+        "dimensions": ("8q", 16),
+        "type": ("h", 12),
+        "steps": ("8d", 104),
+        "begin": ("q", 168),
+        "place": ("18d", 352),
+    },
+}
+MAGIC = (b"n+1\0", b"n+2\0\r\n\032\n")
+LONGEST_HEADER = 544
+# No header is longer, extensions included.
+LARGEST_OFFSET = 1 << 24
+
+
+def check_nifti(path: Path) -> None:
+    """Raise `VolumeError` if a NIfTI file is damaged, its place in the world no number, or a voxel not finite."""
+    compression = GZIP if path.suffix == ".gz" else None
+    header = b""
+    with path.open("rb") as file:
+        for piece in pieces(path, file, compression):
+            header += piece[:LONGEST_HEADER]
+            if len(header) >= LONGEST_HEADER:
+                break
+    order, size = next(
+        ((order, size) for order in "<>" for size in LAYOUTS if header[:4] == struct.pack(f"{order}i", size)), ("<", 0)
+    )
+    if not 0 < size <= len(header) - 4:
+        raise VolumeError(f"{path}: the file does not begin with a NIfTI header")
+    fields = {name: struct.unpack_from(order + code, header, at) for name, (code, at) in LAYOUTS[size].items()}
+    (magic,), (n_dimensions, *sizes), (begin,), (code,) = (
+        fields[name] for name in ("magic", "dimensions", "begin", "type")
+    )
+    if magic not in MAGIC:
+        raise VolumeError(f"{path}: the header is damaged, or of a pair of files (.hdr and .img), which is not read")
+    # The four bytes behind a header say whether extensions follow.
+    if not size + 4 <= begin < LARGEST_OFFSET or begin != int(begin):
+        raise VolumeError(f"{path}: the header ends at byte {size + 4}, but its voxels begin at byte {begin:g}")
+    if not 1 <= n_dimensions <= 7 or code not in TYPES:
+        raise VolumeError(
+            f"{path}: has {n_dimensions} dimensions and voxels of type {code}, but a labelmap has 3, and integers or "
+            "floats"
+        )
+    # Spacings of axes that the image does not have are often 0, and mean nothing.
+    check_spacing(path, fields["steps"][1:4][:n_dimensions])
+    if not all(map(math.isfinite, fields["place"])):
+        raise VolumeError(f"{path}: its place in the world (qform, sform) holds a NaN or an infinity")
+    voxel = np.dtype(order + TYPES[code])
+    check_stored(
+        path,
+        StoredVoxels(
+            path,
+            int(begin) + count_voxels(path, sizes[:n_dimensions]) * voxel.itemsize,
+            compression=compression,
+            n_before=int(begin),
+            finite=voxel.str if voxel.kind == "f" else None,
+        ),
+    )

@@ -1,0 +1,121 @@
+"""The voxels of an image file as they are stored: as many as the header promises, and whole.
+
+SimpleITK makes room for what a header promises before it looks at the file, and checks neither the sums nor the ends of
+compressed voxels. Here nothing is read of a file that cannot hold what it promises, compressed voxels are inflated a
+piece at a time, which checks their sum, and no further than promised.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from armscan.errors import VolumeError
+
+PIECE_BYTES = 1 << 20
+# No stream of deflate is inflated to more of its size.
+LARGEST_RATIO = 1032
+# What zlib calls its formats; MetaImages are read from either, whatever their header says.
+GZIP, GZIP_OR_ZLIB = 31, 47
+
+
+@dataclass(frozen=True)
+class StoredVoxels:
+    """Where voxels are stored.
+
+    Args:
+        file: that holds them.
+        n_bytes: that the header promises, inflated, with `n_before`.
+        offset: bytes of the file before them, or before the stream that they are compressed in.
+        compression: `GZIP` or `GZIP_OR_ZLIB`, None where they are not compressed.
+        n_before: bytes between the offset, inflated, and the first voxel.
+        finite: the type of the voxels, such as '<f4', where a NaN or an infinity among them is looked for.
+    """
+
+    file: Path
+    n_bytes: int
+    offset: int = 0
+    compression: int | None = None
+    n_before: int = 0
+    finite: str | None = None
+
+
+def check_stored(path: Path, stored: StoredVoxels) -> None:
+    """Raise `VolumeError`, naming the image `path`, unless the voxels are as many as promised, and whole."""
+    n_stored = stored.file.stat().st_size - stored.offset
+    if stored.compression is None:
+        _check_length(path, n_stored, stored.n_bytes)
+        if stored.finite is None:
+            return
+    elif n_stored * LARGEST_RATIO < stored.n_bytes:
+        raise VolumeError(
+            f"{path}: the file is truncated or damaged: it holds {max(0, n_stored)} compressed bytes of voxels, which "
+            f"cannot be the {stored.n_bytes} that its header promises"
+        )
+    n_bytes, rest = 0, b""
+    with stored.file.open("rb") as file:
+        file.seek(stored.offset)
+        for piece in pieces(path, file, stored.compression):
+            first_voxel = max(0, stored.n_before - n_bytes)
+            n_bytes += len(piece)
+            if n_bytes > stored.n_bytes:
+                break
+            if stored.finite is not None:
+                voxels = rest + piece[first_voxel:]
+                n_whole = len(voxels) // np.dtype(stored.finite).itemsize
+                if not np.isfinite(np.frombuffer(voxels, stored.finite, n_whole)).all():
+                    raise VolumeError(f"{path}: holds a voxel that is NaN or infinite, but a labelmap holds numbers")
+                rest = voxels[n_whole * np.dtype(stored.finite).itemsize :]
+    _check_length(path, n_bytes, stored.n_bytes)
+
+
+def pieces(path: Path, file: BinaryIO, compression: int | None) -> Iterator[bytes]:
+    """Yield the rest of a file piece by piece, inflated where it is compressed.
+
+    Raises:
+        VolumeError: naming the image `path`, where what is compressed is damaged or ends too early.
+    """
+    if compression is None:
+        yield from iter(lambda: file.read(PIECE_BYTES), b"")
+        return
+    try:
+        inflater, stored = zlib.decompressobj(compression), file.read(PIECE_BYTES)
+        while stored:
+            yield inflater.decompress(stored, PIECE_BYTES)
+            stored = inflater.unconsumed_tail or inflater.unused_data or file.read(PIECE_BYTES)
+            if inflater.eof and stored:
+                # Some programs write several streams, one after the other.
+                inflater = zlib.decompressobj(compression)
+    except zlib.error as error:
+        raise VolumeError(f"{path}: the file is truncated or damaged ({error})") from error
+    if not inflater.eof:
+        raise VolumeError(f"{path}: the file is truncated: it ends within its compressed voxels")
+
+
+def _check_length(path: Path, n_stored: int, n_promised: int) -> None:
+    if n_stored != n_promised:
+        more = f"more than {n_promised}" if n_stored > n_promised else str(max(0, n_stored))
+        state = "truncated" if n_stored < n_promised else "damaged"
+        raise VolumeError(
+            f"{path}: the file is {state}: it holds {more} bytes of voxels, but its header promises {n_promised}"
+        )
+
+
+def count_voxels(path: Path, sizes: Sequence[int]) -> int:
+    """Return how many voxels an image of these sizes has; raise `VolumeError` if it has none."""
+    if min(sizes, default=0) < 1:
+        raise VolumeError(f"{path}: the image has the size {tuple(sizes)}, but a labelmap must not be empty")
+    return math.prod(sizes)
+
+
+def check_spacing(path: Path, spacing: Sequence[float]) -> None:
+    """Raise `VolumeError` unless each step, in mm, is finite and above 0."""
+    if not all(math.isfinite(step) and step > 0 for step in spacing):
+        received = ", ".join(f"{step:g}" for step in spacing)
+        raise VolumeError(f"{path}: the spacing in the file is ({received}) mm, but each must be finite and above 0")
