@@ -29,7 +29,7 @@ from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.phase import Phase
+from armscan.sweeps.study.open import Phase
 from armscan.sweeps.tasks.attempt import Attempt
 from armscan.sweeps.workers import worker as worker_module
 from armscan.sweeps.workers.heartbeat import Heartbeat

@@ -23,8 +23,7 @@ from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, StudyState
 from armscan.sweeps.space.overrides import overrides_of
 from armscan.sweeps.study.finalists import best_trials
-from armscan.sweeps.study.open import OpenedStudy
-from armscan.sweeps.study.phase import Phase
+from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.settings import StudySettings
 from armscan.utils.retry import no_retry
 
@@ -56,7 +55,8 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
             with Live(refresh_per_second=1) as live:
                 repeat(lambda: live.update(_table(opened)), stopped)
 
-    print(f"study {opened.settings.name} in {opened.storage.uri}, run {opened.run_id}", flush=True)
+    search = opened.search
+    print(f"study {search.name} in {search.scheduler.storage.uri}, run {search.run_id}", flush=True)
     print(f"the workers write into {folder}", flush=True)
     thread = threading.Thread(target=show, daemon=True)
     thread.start()

@@ -44,7 +44,7 @@ class TrialScheduler:
 
     def __init__(self, study: optuna.Study, storage: Storage, limits: Limits, *, is_open: bool = True) -> None:
         self.study, self.storage = study, storage
-        self._limits, self._is_open = limits, is_open
+        self.limits, self._is_open = limits, is_open
 
     def state(self) -> StudyState:
         """Return the state of the study."""
@@ -60,25 +60,23 @@ class TrialScheduler:
         Returns:
             The trial; None if there is none now, because enough are running or the study has ended.
         """
-        asked: list[Trial] = []
-        n_times = 0
+        is_repeated = False
 
         def claimed() -> Trial | None:
-            nonlocal n_times
-            n_times += 1
+            nonlocal is_repeated
             if outcome is not None:
-                self._tell(outcome, is_repeated=n_times > 1)
+                self._tell(outcome, is_repeated=is_repeated)
             state = self.state()
             # If the storage went away in the middle, one may have been claimed before, and only the answer been lost.
-            leases = {trial._trial_id: trial.user_attrs.get(LEASE) for trial in state.running}
-            for trial in asked:
-                if leases.get(trial._trial_id) == lease:
-                    return trial
+            own = [trial for trial in state.running if is_repeated and trial.user_attrs.get(LEASE) == lease]
+            is_repeated = True
+            if own:
+                return Trial(self.study, own[0]._trial_id)
             if not self.has_more(state):
                 return None
-            asked.append(self.study.ask())
-            asked[-1].set_user_attr(LEASE, dict(lease))
-            return asked[-1]
+            trial = self.study.ask()
+            trial.set_user_attr(LEASE, dict(lease))
+            return trial
 
         return self.storage.exclusive(claimed)
 
@@ -97,27 +95,23 @@ class TrialScheduler:
 
     def has_more(self, state: StudyState) -> bool:
         """Whether a trial can be claimed now."""
-        enough = len(state.finished) + len(state.running) >= self._limits.n_trials
+        enough = len(state.finished) + len(state.running) >= self.limits.n_trials
         return not enough and self.end(state) is None and (self._is_open or bool(state.waiting))
 
     def end(self, state: StudyState) -> str | None:
         """Return why no further trial is claimed; None while trials are missing."""
-        if len(state.finished) >= self._limits.n_trials:
+        if len(state.finished) >= self.limits.n_trials:
             return f"{len(state.finished)} trials have finished"
         if broken := self.broken(state):
             return broken
         if not self._is_open and not state.waiting:
             return f"{len(state.finished)} trials have finished, {len(state.failed)} failed"
-        return self.spent(state)
-
-    def spent(self, state: StudyState) -> str | None:
-        """See `Limits.spent`."""
-        return self._limits.spent(state)
+        return self.limits.spent(state)
 
     def broken(self, state: StudyState) -> str | None:
         """See `Limits.broken`; failures before the last restart are ignored."""
         reset = self.study.user_attrs.get(RESET_FAILURES, ()) if state.failed else ()
-        return self._limits.broken(state, reset)
+        return self.limits.broken(state, reset)
 
     def reset_failures(self) -> int:
         """Ignore the failures so far if they have ended the study, because it is started again.
@@ -205,7 +199,7 @@ class TrialScheduler:
         attempt, lease = trial.user_attrs.get(ATTEMPT, 0), trial.user_attrs.get(LEASE, {})
         reason = f"its worker died: {lease.get('worker', 'unknown')} on {lease.get('host', 'an unknown host')}"
         attributes: dict[str, Any] = {FAILURE: reason, ENV_STEPS: env_steps_of(trial)}
-        if attempt < self._limits.max_retries:
+        if attempt < self.limits.max_retries:
             attributes[RETRIED] = True
             # First, so that a death between the two loses nothing: the next worker finds it.
             if not any(other.user_attrs.get(RETRY_OF) == trial.number for other in state.all):

@@ -46,7 +46,7 @@ class StudyCommand:
             InvalidValueError: if they say something that no study can do.
         """
         own = [word for word in words if word not in (*MULTIRUN, PLAN)]
-        overrides = _overrides(own)
+        overrides = OverridesParser.create().parse_overrides(own)
         keys = [each.key_or_group for each in overrides]
         if (n_given := keys.count(SWEEP)) != 1:
             given = f"is given {n_given} times" if n_given else "is not set"
@@ -79,7 +79,7 @@ def words_of_trials(words: Sequence[str]) -> list[str]:
 
 def fixed_by(words: Sequence[str]) -> dict[str, Any]:
     """Return the values that words give to keys and groups of the configuration."""
-    return {each.key_or_group: each.value() for each in _overrides(words)}
+    return {each.key_or_group: each.value() for each in OverridesParser.create().parse_overrides(list(words))}
 
 
 def _merging(word: str) -> str:
@@ -92,10 +92,6 @@ def _merging(word: str) -> str:
         # Choices stand in the place of a range.
         value = f"{{{part}:{value}{NO_RANGE if part == 'choices' else ''}}}"
     return f"++{SPACE}={{{key}:{value}}}" if key else f"++{SPACE}={value}"
-
-
-def _overrides(words: Sequence[str]) -> list[Override]:
-    return OverridesParser.create().parse_overrides(list(words))
 
 
 def _check(override: Override) -> None:

@@ -16,6 +16,7 @@ from optuna.samplers import BaseSampler
 from armscan.config.error_messages import one_line_message
 from armscan.errors import ArmscanError, InvalidValueError, StudyError, listed
 from armscan.sweeps.space.overrides import overrides_of
+from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.tasks.attempt import composed, study_section
@@ -30,10 +31,16 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
     Raises:
         InvalidValueError: if something is not allowed.
     """
-    section = study_section(words)
+    # The command sets `worker` for each worker.
+    section = {key: value for key, value in study_section(words).items() if key != "worker"}
     if not section:
         raise InvalidValueError("there is no study in the configuration: give sweep=NAME of a file with one")
-    settings = StudySettings.of(section, fixed_by(words))
+    if "space" in section:
+        # What is given a value is not searched.
+        section["space"] = Space.read(section["space"]).without(fixed_by(words))
+        if not section["space"].parameters:
+            raise InvalidValueError("nothing is left to search: each key of study.space is given a value")
+    settings = StudySettings.read("study", section)
     # What cannot be made is refused here, and not by the first trial.
     make_sampler(settings.sampler, settings.seed)
     make_pruner(settings.pruner)

@@ -19,14 +19,14 @@ LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
 def note_run(
     target: optuna.Study | Trial, client: TrackingStore, experiment_id: str, run_id: str, folder: Path
 ) -> None:
-    """Leave a note with the link to the tracked run, and the folder.
+    """Leave a note with the link to the tracked run of a study or a trial, and its folder.
 
     Args:
         target: the study, or the trial.
-        client: of the tracking store.
-        experiment_id: of the run.
-        run_id: of the run.
-        folder: of the study or the trial.
+        client: the tracking store.
+        experiment_id: the MLflow experiment of the run.
+        run_id: the ID of the run.
+        folder: the folder of the study or the trial.
     """
     # Deferred: it takes a second, and only who works at a study needs it.
     from optuna_dashboard import save_note

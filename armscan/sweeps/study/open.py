@@ -4,27 +4,84 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import optuna
 from omegaconf import DictConfig
+from optuna.trial import FrozenTrial, Trial
 
 from armscan.config.defaults import to_plain
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits
-from armscan.sweeps.storage.storage import Storage, open_storage
+from armscan.sweeps.scheduling.state import FINAL_SEED, Limits
+from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import note_run
-from armscan.sweeps.study.finalists import final_seed_of
-from armscan.sweeps.study.phase import Phase
-from armscan.sweeps.study.settings import StudySettings
+from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX, StudySettings
 from armscan.sweeps.study.study import STUDY_RUN, make_study
+from armscan.sweeps.tasks.attempt import Attempt, trial_folder
 from armscan.sweeps.tasks.base import Task
-from armscan.tracking import TrackingStore, open_store, source_tags
+from armscan.tracking import TrackingStore, abandon, open_store, source_tags
+from armscan.tracking.run import FAILURE_TAG
 from armscan.utils.retry import RETRY_S
 
 NO_END = 10**9
+WORKER_DIED = "its worker died"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """What the trials of one phase have in common.
+
+    Args:
+        name: the name of its study in the storage.
+        scheduler: the one of its trials.
+        space: the keys that are searched.
+        objectives: names of the metrics that are the trial's values, in order.
+        reported: metric that running trials report to the pruner; None without pruning.
+        run: runs an attempt at a trial and returns its metrics.
+        seeds_of: returns the seeds that a trial is run with.
+        sampler: see `StudySettings`.
+        seed: what the samplers are seeded with, beside a trial's number.
+        folder: the folder of its study.
+        artifacts: see `StudySettings`.
+        client: the tracking store.
+        experiment_id: the MLflow experiment of the tracked runs.
+        run_id: the ID of the study's tracked run.
+    """
+
+    name: str
+    scheduler: TrialScheduler
+    space: Space
+    objectives: tuple[str, ...]
+    reported: str | None
+    run: Callable[[Attempt], dict[str, float]]
+    seeds_of: Callable[[Trial], tuple[int, ...]]
+    sampler: Mapping[str, Any]
+    seed: int
+    folder: Path
+    artifacts: Path
+    client: TrackingStore
+    experiment_id: str
+    run_id: str
+
+    def close_runs_of(self, trial: FrozenTrial) -> None:
+        """Close the tracked runs that a dead worker has left open, except those that a retry has resumed."""
+        abandon(trial_folder(self.folder, trial.number), self.client, WORKER_DIED)
+
+    def close_orphaned_runs(self) -> None:
+        """Close runs of failed trials whose workers died before they could write the run's ID to its folder."""
+        running = self.client.search_runs(
+            [self.experiment_id], f"tags.study = '{self.name}' AND attributes.status = 'RUNNING'"
+        )
+        state = self.scheduler.state()
+        failed = {str(trial.number) for trial in (*state.failed, *state.retried)}
+        for run in running:
+            if run.data.tags.get("trial") in failed:
+                self.client.set_tag(run.info.run_id, FAILURE_TAG, WORKER_DIED)
+                self.client.set_terminated(run.info.run_id, "FAILED")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,27 +89,21 @@ class OpenedStudy:
     """A study that workers can run.
 
     Args:
-        settings: of the study.
-        config: of its trials, without the searched values.
-        storage: that it is kept in.
-        client: of the tracking store.
-        run_id: of its own tracked run.
+        settings: what it is asked to do.
+        config: the configuration of its trials, without the searched values.
         search: the phase in which configurations are searched.
         final_eval: the phase in which the best are trained with other seeds; None without one.
     """
 
     settings: StudySettings
     config: DictConfig
-    storage: Storage
-    client: TrackingStore
-    run_id: str
     search: Phase
     final_eval: Phase | None
 
     @property
     def folder(self) -> Path:
-        """Of the study."""
-        return Path(self.settings.folder)
+        """The folder of the study."""
+        return self.search.folder
 
     @property
     def phases(self) -> tuple[Phase, ...]:
@@ -63,7 +114,7 @@ class OpenedStudy:
 def open_for_work(
     settings: StudySettings, task: Task, config: DictConfig, words: Sequence[str], *, retry: bool = False
 ) -> OpenedStudy:
-    """Open a study, and makes it where there is none.
+    """Open a study, and make it where there is none.
 
     Args:
         settings: as `read_settings` returns them.
@@ -94,7 +145,6 @@ def open_for_work(
             note_run(study, client, experiment_id, create_run(), Path(settings.folder))
         return str(study.user_attrs[STUDY_RUN])
 
-    run_id = storage.exclusive(tracked_run)
     objectives = tuple(settings.objectives)
     search = Phase(
         name=settings.name,
@@ -110,31 +160,23 @@ def open_for_work(
         artifacts=Path(settings.artifacts),
         client=client,
         experiment_id=experiment_id,
-        run_id=run_id,
+        run_id=storage.exclusive(tracked_run),
     )
-    return OpenedStudy(
-        settings=settings,
-        config=config,
-        storage=storage,
-        client=client,
-        run_id=run_id,
-        search=search,
-        final_eval=_final_phase(search, settings, task, storage) if settings.final_eval.top_k else None,
-    )
+    final_eval = _final_phase(search, settings, task) if settings.final_eval.top_k else None
+    return OpenedStudy(settings=settings, config=config, search=search, final_eval=final_eval)
 
 
-def _final_phase(search: Phase, settings: StudySettings, task: Task, storage: Storage) -> Phase:
-    study = storage.exclusive(
-        lambda: optuna.create_study(study_name=settings.final_eval_name, storage=storage.optuna, load_if_exists=True)
-    )
+def _final_phase(search: Phase, settings: StudySettings, task: Task) -> Phase:
+    storage, name = search.scheduler.storage, settings.name + FINAL_EVAL_SUFFIX
+    study = storage.exclusive(lambda: optuna.create_study(study_name=name, storage=storage.optuna, load_if_exists=True))
     limits = Limits(n_trials=NO_END, max_failures=settings.max_failures, max_retries=settings.max_retries)
     return dataclasses.replace(
         search,
-        name=settings.final_eval_name,
+        name=name,
         scheduler=TrialScheduler(study, storage, limits, is_open=False),
         objectives=(task.final_metric,),
         reported=None,
         run=task.evaluate,
-        seeds_of=final_seed_of,
+        seeds_of=lambda trial: (int(trial.user_attrs[FINAL_SEED]),),
         folder=search.folder / "judged",
     )

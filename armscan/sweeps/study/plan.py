@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import optuna
-from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.distributions import CategoricalDistribution, IntDistribution
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -47,7 +48,8 @@ def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
         console.print("cost       not known before the first trial has finished")
         return
     seconds = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
-    mean_s, spent_mib = sum(seconds) / len(seconds), _mib(Path(settings.folder))
+    files = [file for file in Path(settings.folder).rglob("*") if file.is_file()]
+    mean_s, spent_mib = sum(seconds) / len(seconds), sum(file.stat().st_size for file in files) / BYTES_A_MIB
     left = max(0, settings.n_trials - done)
     hours = (left + n_final / max(1, len(settings.seeds))) * mean_s / settings.workers / 3600
     console.print(
@@ -61,21 +63,14 @@ def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
 
 
 def _values(parameter: Parameter) -> str:
-    distribution = parameter.distribution
-    if isinstance(distribution, CategoricalDistribution):
-        return ", ".join(map(str, distribution.choices))
-    assert isinstance(distribution, FloatDistribution | IntDistribution)
-    spacing = ", log" if distribution.log else ""
-    if distribution.step is not None and distribution.step != 1:
-        spacing += f", in steps of {distribution.step:g}"
-    whole = ", whole" if isinstance(distribution, IntDistribution) else ""
-    return f"{distribution.low:g} to {distribution.high:g}{whole}{spacing}"
+    drawn: Any = parameter.distribution
+    if isinstance(drawn, CategoricalDistribution):
+        return ", ".join(map(str, drawn.choices))
+    how = ", whole" if isinstance(drawn, IntDistribution) else ""
+    how += ", log" if drawn.log else ""
+    how += f", in steps of {drawn.step:g}" if drawn.step not in (None, 1) else ""
+    return f"{drawn.low:g} to {drawn.high:g}{how}"
 
 
 def _conditions(parameter: Parameter) -> str:
     return ", ".join(f"{name} is {' or '.join(map(str, values))}" for name, values in parameter.when.items())
-
-
-def _mib(folder: Path) -> float:
-    files = folder.rglob("*") if folder.is_dir() else ()
-    return sum(file.stat().st_size for file in files if file.is_file()) / BYTES_A_MIB

@@ -122,25 +122,6 @@ class StudySettings(Limits):
     final_eval: FinalEvalSettings = Field(description="a section with top_k and n_seeds")
     allow_config_changes: bool = Field(description="true or false")
 
-    @classmethod
-    def of(cls, section: Mapping[str, Any], fixed: Mapping[str, Any]) -> Self:
-        """Return the settings of a configuration's section.
-
-        Args:
-            section: with plain values.
-            fixed: keys of the configuration that have been given a value, which are not searched.
-
-        Raises:
-            InvalidValueError: if a key is unknown, missing or has a value that is not allowed.
-        """
-        # The command sets `worker` for each worker.
-        values = {key: value for key, value in section.items() if key != "worker"}
-        if "space" in values:
-            values["space"] = Space.read(values["space"]).without(fixed)
-            if not values["space"].parameters:
-                raise InvalidValueError("nothing is left to search: each key of study.space is given a value")
-        return cls.read("study", values)
-
     @model_validator(mode="after")
     def _can_prune(self) -> Self:
         if len(self.objectives) > 1 and self.pruner["_target_"] != NO_PRUNER:
@@ -149,11 +130,6 @@ class StudySettings(Limits):
                 "study/pruner=none"
             )
         return self
-
-    @property
-    def final_eval_name(self) -> str:
-        """The name of the study of the final trainings."""
-        return self.name + FINAL_EVAL_SUFFIX
 
     def check_workers(self, n_cores: int) -> None:
         """Raise `InvalidValueError` if the workers' compute threads are more than the cores of one machine."""

@@ -71,10 +71,12 @@ def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.
 def _wanted(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a study says of itself, by which it is compared."""
     of_trials = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
+    left_out = tuple(f"{each}." for each in (*NOT_COMPARED, *(one.name for one in settings.space.parameters)))
+    shared = {key: value for key, value in flattened(fixed).items() if not f"{key}.".startswith(left_out)}
     return {
         SPACE: settings.space.to_plain(),
         DASHBOARD_OBJECTIVES: dict(settings.objectives),
-        FIXED: comparable_config(fixed, settings) | of_trials,
+        FIXED: shared | of_trials,
     }
 
 
@@ -84,17 +86,6 @@ def is_ours(study: optuna.Study) -> bool:
     if not {SPACE, FIXED, DASHBOARD_OBJECTIVES} <= there.keys():
         return False
     return [direction.name.lower() for direction in study.directions] == [*there[DASHBOARD_OBJECTIVES].values()]
-
-
-def comparable_config(config: Mapping[str, Any], settings: StudySettings) -> dict[str, Any]:
-    """Return the leaves of a configuration that trials of one study have in common."""
-    searched = {parameter.name for parameter in settings.space.parameters}
-    left_out = (*NOT_COMPARED, *searched)
-    return {
-        key: value
-        for key, value in flattened(config).items()
-        if not any(key == each or key.startswith(f"{each}.") for each in left_out)
-    }
 
 
 def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[str, Any]) -> None:

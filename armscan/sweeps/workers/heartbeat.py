@@ -195,4 +195,4 @@ class Heartbeat:
         self._next_check_s = time.monotonic() + self._liveness.interval_s - HEARTBEAT_S / 2
         for trial in self._scheduler.reclaim(self._liveness.is_dead, state):
             self._on_death(trial)
-        self._limit = self._scheduler.spent(state)
+        self._limit = self._scheduler.limits.spent(state)

@@ -64,7 +64,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     folder.mkdir(parents=True)
     ProcessInfo.current(str(working_folder())).write(folder / LAUNCHER_FILE)
     words = _words(opened, given, launcher, folder)
-    tracked = TrackedRun.joined(opened.client, opened.run_id, name=opened.settings.name, folder=folder)
+    tracked = TrackedRun.joined(opened.search.client, opened.search.run_id, name=opened.settings.name, folder=folder)
     tracked.set_status("RUNNING")
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
     with _leaving(opened, folder, tracked, leave_s), progress_display(opened, folder):
@@ -166,7 +166,7 @@ def _deliver(opened: OpenedStudy, tracked: TrackedRun, status: str) -> None:
     is_there = tracked.end(status, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
     left = []
     if is_there:
-        left = [each.folder for each in sync(opened.folder, lambda _: opened.client) if each.left]
+        left = [each.folder for each in sync(opened.folder, lambda _: opened.search.client) if each.left]
         with contextlib.suppress(AwayError), no_retry():
             for phase in opened.phases:
                 phase.close_orphaned_runs()

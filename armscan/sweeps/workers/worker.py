@@ -24,8 +24,7 @@ from armscan.sweeps.space.overrides import overrides_of
 from armscan.sweeps.study.components import make_sampler, read_settings
 from armscan.sweeps.study.dashboard import note_run, show_picture
 from armscan.sweeps.study.finalists import enqueue_final_trials
-from armscan.sweeps.study.open import open_for_work
-from armscan.sweeps.study.phase import Phase
+from armscan.sweeps.study.open import Phase, open_for_work
 from armscan.sweeps.tasks.attempt import CONFIG_SHA256, FOLDER, RUN, Attempt, composed, config_sha256, trial_folder
 from armscan.sweeps.tasks.base import check_metrics
 from armscan.sweeps.workers.heartbeat import Heartbeat, LimitReachedError
@@ -234,5 +233,5 @@ def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None
     run_phase(search)
     state = search.scheduler.state()
     if final is not None and state.finished and not search.scheduler.broken(state):
-        enqueue_final_trials(opened.storage, opened.settings, search.scheduler.study, final.scheduler.study)
+        enqueue_final_trials(search.scheduler.storage, opened.settings, search.scheduler.study, final.scheduler.study)
         run_phase(final)
