@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 STATUSES = ("finished", "failed", "killed", "running")
 SORTS = ("started", "duration", "success", "steps", "size")
 REPRODUCTIONS = Path("reproductions")
-
-
 SELECTION = (
     click.option("--experiment", metavar="NAME", help="Only runs of this MLflow experiment."),
     click.option(
@@ -144,8 +142,7 @@ def sync(folder: Path, tracking: str | None) -> int:
     from armscan.tracking import open_existing_store
     from armscan.tracking import sync as deliver
 
-    opened = cache(lambda tracked_in: open_existing_store(tracking or tracked_in))
-    deliveries = deliver(folder, opened)
+    deliveries = deliver(folder, cache(lambda tracked_in: open_existing_store(tracking or tracked_in)))
     for delivery in deliveries:
         which = f"run {delivery.run_id}" if delivery.run_id else "a run"
         left = f", the rest is left: {delivery.left}" if delivery.left else ""
@@ -187,11 +184,9 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str) -> int:
         print("code, packages, machine and volumes are those that it was made with")
     if dry_run:
         return 1 if differences else 0
-    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder = out or REPRODUCTIONS / f"{original.run.run_id[:8]}-{now}"
+    folder = out or REPRODUCTIONS / f"{original.run.run_id[:8]}-{datetime.now():%Y-%m-%d_%H-%M-%S}"
     comparison = reproduction.reproduce(original, folder, differences)
-    for line in comparison.lines():
-        print(line)
+    print(*comparison.lines(), sep="\n")
     return 0 if comparison.is_same else 1
 
 
@@ -216,10 +211,9 @@ def _selection(
 ) -> Selection:
     from armscan.runs.query import Selection, projection_params
 
-    choices = {f"choice.{group}": names for group, names in {"agent": agent, "obs": obs}.items() if names}
     return Selection(
         statuses=frozenset(each.upper() for each in status or ()),
-        choices=choices,
+        choices={f"choice.{group}": names for group, names in (("agent", agent), ("obs", obs)) if names},
         projections=projection_params(projection) if projection else (),
         sort=sort.removeprefix("-"),
         is_down=sort.startswith("-"),
