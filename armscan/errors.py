@@ -68,6 +68,10 @@ class ResumeError(ArmscanError, RuntimeError):
     """A run cannot be resumed."""
 
 
+class UntrustedError(ArmscanError, RuntimeError):
+    """What a stranger may have written would be executed."""
+
+
 class DisplayError(ArmscanError, RuntimeError):
     """There is no screen, notebook or library that could show a window."""
 

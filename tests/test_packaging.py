@@ -11,9 +11,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 import armscan
 from armscan.config.compose import compose
+from armscan.config.trust import TARGETS, offered_classes
 from tests.docker.files import instructions
 from tests.test_run import SMALL
 
@@ -58,6 +60,9 @@ def test_every_config_and_every_sweep_composes(path, monkeypatch):
     if path.parent != Path():
         chosen = config.hydra.runtime.choices
         assert "base" in path.name or chosen[str(path.parent)] == path.stem
+    # A stored run of it is built without --trust.
+    of_run = {key: value for key, value in config.items() if key not in ("hydra", "study")}
+    assert set(TARGETS.findall(OmegaConf.to_yaml(of_run))) <= offered_classes()
 
 
 def run(*command, cwd, **given):

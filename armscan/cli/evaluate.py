@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armscan.cli.options import FILE_PATH, clustering_option, examples, is_given, tracking_option
+from armscan.cli.options import FILE_PATH, clustering_option, examples, is_given, tracking_option, trust_option
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import LARGEST_SEED, check_int
 
@@ -78,6 +78,7 @@ OPTIONS = {
     metavar="NAME",
     help="MLflow experiment of the evaluation, with --agent; that of a run is the run's own.",
 )
+@trust_option
 def evaluate(
     run: tuple[str, ...],
     agent: str | None,
@@ -89,6 +90,7 @@ def evaluate(
     out: Path | None,
     tracking: str,
     tracking_experiment: str | None,
+    trust: bool,
     **rules: Any,
 ) -> None:
     """Evaluate or record an agent on any volumes.
@@ -124,7 +126,7 @@ def evaluate(
     if tracking_experiment is not None:
         store["experiment"] = tracking_experiment
     if agent is None:
-        subject = evaluation.agent_of_run(tracking, run[0], changes)
+        subject = evaluation.agent_of_run(tracking, run[0], changes, trust=trust)
     else:
         subject = evaluation.agent_of_overrides(overrides, folder, changes)
     if video:

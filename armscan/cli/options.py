@@ -112,6 +112,9 @@ storage_option = partial(
     show_default="ARMSCAN_STORAGE or optuna.journal",
     help="Optuna storage of the studies.",
 )
+trust_option = click.option(
+    "--trust", is_flag=True, help="Execute code of others that the run's configuration or policy names."
+)
 clustering_option = click.option(
     "--clustering",
     type=click.Choice(["pixels", "metric"]),

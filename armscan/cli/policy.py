@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from armscan.cli.options import FILE_PATH, examples, tracking_option
+from armscan.cli.options import FILE_PATH, examples, tracking_option, trust_option
 from armscan.errors import InvalidValueError
 
 
@@ -26,7 +26,8 @@ def policy() -> None:
     help="Folder of the model. An exported model there is replaced, nothing else.",
 )
 @tracking_option()
-def export(run: str, out: Path, tracking: str) -> None:
+@trust_option
+def export(run: str, out: Path, tracking: str, trust: bool) -> None:
     """Export the policy of RUN as an MLflow and ONNX model.
 
     RUN is an MLflow run ID or its first four or more characters. The model is made from the checkpoint of the run;
@@ -40,7 +41,7 @@ def export(run: str, out: Path, tracking: str) -> None:
         raise InvalidValueError(f"--out is {str(out)!r}, but something else is there, and would be lost: name another")
     if out.exists() and (others := others_in(out)):
         raise InvalidValueError(f"--out is {str(out)!r}, but {others[0]!r} is in it, and would be lost: name another")
-    export_policy(tracking, run, out)
+    export_policy(tracking, run, out, trust=trust)
     print(f"exported   {out}")
     _print_usage(str(out))
 
@@ -49,14 +50,15 @@ def export(run: str, out: Path, tracking: str) -> None:
 @click.argument("run")
 @click.option("--name", required=True, help="Name of the registered model, which is created if there is none.")
 @tracking_option(help="MLflow tracking store; its model registry is used.")
-def register(run: str, name: str, tracking: str) -> None:
+@trust_option
+def register(run: str, name: str, tracking: str, trust: bool) -> None:
     """Register the policy of RUN in MLflow's model registry.
 
     RUN is an MLflow run ID or its first four or more characters. Each call registers a new version.
     """
     from armscan.runs.policy_registry import register_policy
 
-    address = register_policy(tracking, run, name)
+    address = register_policy(tracking, run, name, trust=trust)
     print(f"registered {address}")
     print(f"its store  export MLFLOW_TRACKING_URI={shlex.quote(tracking)}")
     _print_usage(address)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armscan.cli.options import FILE_PATH, CommaSeparated, Moment, UriParam, examples, tracking_option
+from armscan.cli.options import FILE_PATH, CommaSeparated, Moment, UriParam, examples, tracking_option, trust_option
 
 if TYPE_CHECKING:
     from armscan.runs.query import Selection
@@ -161,7 +161,8 @@ def sync(folder: Path, tracking: str | None) -> int:
     "--out", type=FILE_PATH, metavar="FOLDER", show_default="reproductions/ID-TIME", help="Folder of the new run."
 )
 @tracking_option()
-def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str) -> int:
+@trust_option
+def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: bool) -> int:
     """Run a run once more, and compare every metric.
 
     RUN is an MLflow run ID or its first four or more characters. Nothing is checked out or installed: what differs in
@@ -175,7 +176,7 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str) -> int:
     limit_threads()
     from armscan.runs import reproduce as reproduction
 
-    original = reproduction.load_original(tracking, run)
+    original = reproduction.load_original(tracking, run, trust=trust)
     differences = reproduction.differences(original)
     print(f"run {original.run.run_id}: {original.run.name}")
     for difference in differences:

@@ -44,8 +44,14 @@ class TrainedAgent:
     volumes: Fingerprints | None = field(default=None, repr=False)
 
 
-def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any]) -> TrainedAgent:
+def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trust: bool = False) -> TrainedAgent:
     """Return the agent of a tracked run.
+
+    Args:
+        tracking: MLflow tracking URI.
+        run_id: MLflow run ID, or its first characters.
+        changes: changed rules, by the names in `CHANGES`.
+        trust: whether its configuration may name classes that are not armscan's; default: false.
 
     Raises:
         ArmscanError: if there is no such run, it has kept too little, or what it has kept is damaged.
@@ -54,7 +60,7 @@ def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any]) -> Trai
     if EVALUATED_TAG in run.tags:
         raise InvalidValueError(f"run is {run_id!r}, but that is an evaluation, of {run.tags[EVALUATED_TAG]}")
     with tempfile.TemporaryDirectory() as folder:
-        config = from_its_folder(changed(OmegaConf.create(run.config(Path(folder))), changes), run.tags)
+        config = from_its_folder(changed(OmegaConf.create(run.config(Path(folder), trust=trust)), changes), run.tags)
         weights, facts = _weights(run, Path(folder))
         # Of learners that were trained before runs kept them, the checkpoint has them.
         volumes = run.volumes(Path(folder)) or facts.get("volumes") or None

@@ -18,8 +18,8 @@ from omegaconf import OmegaConf
 
 from armscan.agents import Learner
 from armscan.config.defaults import RESUME, TRACKING_URI, default_tracking
-from armscan.config.legacy import migrate
-from armscan.errors import InvalidValueError, ResumeError
+from armscan.config.trust import TRUST, check_stored_words, stored_config
+from armscan.errors import InvalidValueError, ResumeError, UntrustedError
 from armscan.experiment.build import set_up
 from armscan.experiment.job import GRID_TAG
 from armscan.experiment.provenance import place_tags, volume_tags
@@ -46,30 +46,51 @@ def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -
 
     Raises:
         InvalidValueError: if the words say anything else.
+        UntrustedError: if it would execute code of others, and the words have no `--trust`.
         TrackingError: if the run is not found.
         ResumeError: if it cannot go on.
         FolderInUseError: if it is still going on.
         CheckpointError: if its checkpoint is damaged or another run's.
         ChangedVolumesError: if its volumes are not those any more that it was started with.
     """
-    wanted, uri = _read(words)
+    trust = TRUST in words
+    wanted, uri = _read([word for word in words if word != TRUST])
     client = open_existing_store(uri)
     run = find_run(client, wanted)
     if GRID_TAG not in run.data.tags:
-        resume_run(client, run.info.run_id)
+        resume_run(client, run.info.run_id, trust=trust)
         return
     _check_unfinished(run)
+    grid = json.loads(run.data.tags[GRID_TAG])
+    if not trust:
+        _check_grid(run, grid, uri)
     _enter_working_folder(run)
-    repeat_grid(json.loads(run.data.tags[GRID_TAG]))
+    repeat_grid(grid)
 
 
-def resume_run(client: TrackingStore, run_id: str, *, job_label: str | None = None) -> dict[str, dict[str, float]]:
+def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
+    """Raise `UntrustedError` where a grid's command line, or its working folder, may be a stranger's."""
+    where = f"run {run.info.run_id}"
+    check_stored_words(words, uri, where=where)
+    # Its `conf/` and `sweeps/` are part of the configuration.
+    folder = Path(run.data.tags["working_folder"])
+    if folder.resolve() != Path.cwd().resolve():
+        raise UntrustedError(
+            f"{where}: it was started in {folder}, whose configuration could execute code of others; repeat the "
+            f"command there or, if you trust whoever made it, with {TRUST}"
+        )
+
+
+def resume_run(
+    client: TrackingStore, run_id: str, *, job_label: str | None = None, trust: bool = False
+) -> dict[str, dict[str, float]]:
     """Go on with a run; see `resume`.
 
     Args:
         client: the run's store.
         run_id: MLflow run ID.
         job_label: prefix of the printed lines of a multirun's job. Default: None, a single run.
+        trust: whether its configuration may name classes that are not armscan's; default: false.
     """
     folder = _folder_of(client.get_run(run_id))
     with folder_lock(folder):
@@ -78,11 +99,12 @@ def resume_run(client: TrackingStore, run_id: str, *, job_label: str | None = No
         run = client.get_run(run_id)
         _check_unfinished(run)
         config: dict[str, Any] = yaml.safe_load(_started_with(run, folder / CONFIG_FILE, "configuration"))
+        migrated = stored_config(config, where=f"run {run_id}", trust=trust)
         _check_last_checkpoint(run, folder)
         remove_unfinished(folder)
         _enter_working_folder(run)
         print(f"resuming {run.info.run_name}, run {run_id}", flush=True)
-        setup = set_up(OmegaConf.create(migrate(config)))
+        setup = set_up(OmegaConf.create(migrated))
         _check_volumes(run, folder, setup.fingerprints)
         agent = setup.agent
         earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id)) if isinstance(agent, Learner) else []

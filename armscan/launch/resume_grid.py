@@ -43,7 +43,8 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     for run in earlier:
         if run.info.status != "RUNNING" and (Path(run.data.tags["folder"]) / LAST_CHECKPOINT).exists():
             _adopt(client, run, job)
-            return resume_run(client, run.info.run_id, job_label=job.label)
+            # Its configuration is this job's.
+            return resume_run(client, run.info.run_id, job_label=job.label, trust=True)
     return run_experiment(config, invocation)
 
 

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import logging
 import tempfile
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
-import mlflow.pyfunc
 from mlflow.exceptions import MlflowException
+from mlflow.models import Model
 
 from armscan.agents import Learner
 from armscan.config.defaults import to_plain
 from armscan.errors import ExportError, InvalidValueError
 from armscan.evaluation import TrainingVolumes, agent_of_run, own_split, prepare
-from armscan.policies.build import SUM_TAG, facts_of, make_model, tags_of_kept
-from armscan.policies.model import model_sha256
+from armscan.policies.build import SUM_TAG, facts_of, make_model, onnx_answers, tags_of_kept
+from armscan.policies.model import ONNX_FILE, model_sha256
 from armscan.runs.model_card import Card
 from armscan.tracking import FoundRun, check_artifacts, load_run
 from armscan.tracking.client import reason_in
@@ -29,18 +29,19 @@ MAX_NAME_CHARS = 256
 PLAIN_COMPUTE = {"device": "cpu", "precision": "float32", "compile": False}
 
 
-def export_policy(tracking: str, run_id: str, folder: Path) -> FoundRun:
+def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = False) -> FoundRun:
     """Write the policy of a tracked run as a model, from its checkpoint; return the run.
 
     Args:
         tracking: MLflow tracking URI.
         run_id: MLflow run ID, or its first characters.
         folder: folder of the model.
+        trust: whether its configuration may name classes that are not armscan's; default: false.
 
     Raises:
         ArmscanError: if there is no such run, its agent does not learn, or its checkpoint or volumes are missing.
     """
-    subject = agent_of_run(tracking, run_id, {})
+    subject = agent_of_run(tracking, run_id, {}, trust=trust)
     assert subject.run is not None
     # A policy answers as the agent was evaluated: with its most likely action, on the CPU.
     subject.config.compute.update(PLAIN_COMPUTE)
@@ -55,13 +56,15 @@ def export_policy(tracking: str, run_id: str, folder: Path) -> FoundRun:
     return subject.run
 
 
-def register_policy(tracking: str, run_id: str, name: str) -> str:
+def register_policy(tracking: str, run_id: str, name: str, *, trust: bool = False) -> str:
     """Register the policy of a tracked run, exporting it from the checkpoint if the run has none with a SHA-256.
 
     Args:
         tracking: MLflow tracking URI, whose model registry is used.
         run_id: MLflow run ID, or its first characters.
         name: name of the registered model, which is created if it does not exist.
+        trust: whether its configuration may name classes that are not armscan's, if its policy is exported; default:
+            false.
 
     Returns:
         The URI of the new version, `models:/NAME/VERSION`.
@@ -77,7 +80,7 @@ def register_policy(tracking: str, run_id: str, name: str) -> str:
             _check_kept(run, Path(run.client.download_artifacts(run.run_id, POLICY_FOLDER, beside)))
         else:
             check_artifacts(run.client, run.experiment_id)
-            export_policy(tracking, run_id, folder)
+            export_policy(tracking, run_id, folder, trust=trust)
         card = Card.of(run, Path(beside))
         if not is_kept:
             run.client.log_artifacts(run.run_id, str(folder), POLICY_FOLDER)
@@ -101,22 +104,23 @@ def _is_kept(run: FoundRun) -> bool:
 
 
 def _check_kept(run: FoundRun, folder: Path) -> None:
-    """Raise `ExportError` if a model is not the one that its run saved, or cannot predict."""
-    # Checked before loading, which executes the code in the model.
+    """Raise `ExportError` if a model is not the one that its run saved, or its ONNX file cannot predict.
+
+    The model itself is not loaded, because that executes the code in it.
+    """
     if model_sha256(folder) != run.tags[SUM_TAG]:
         raise _not_kept(run)
-    # It also logs what it raises.
-    logging.getLogger("torch.export").setLevel(logging.CRITICAL)
     try:
-        model = mlflow.pyfunc.load_model(str(folder))
-        model.predict(model.input_example)
+        model = Model.load(str(folder))
+        example: Any = model.load_input_example(str(folder))
+        onnx_answers(folder / ONNX_FILE, example)
     # A damaged file may raise anything.
     except Exception as error:
         raise ExportError(
             f"run {run.run_id}: its {POLICY_FOLDER}/ is damaged, it does not answer its own example: {reason_in(error)}"
         ) from error
     # A SHA-256 may have been copied from another run together with its model.
-    if (model.metadata.metadata or {}).get("run") != run.run_id:
+    if (model.metadata or {}).get("run") != run.run_id:
         raise _not_kept(run)
 
 

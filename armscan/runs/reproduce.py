@@ -48,8 +48,13 @@ class Original:
     environment: Mapping[str, Any] | None = field(repr=False)
 
 
-def load_original(tracking: str, run_id: str) -> Original:
+def load_original(tracking: str, run_id: str, *, trust: bool = False) -> Original:
     """Return a tracked run, ready to be made again.
+
+    Args:
+        tracking: MLflow tracking URI.
+        run_id: MLflow run ID, or its first characters.
+        trust: whether its configuration may name classes that are not armscan's; default: false.
 
     Raises:
         ArmscanError: if there is no such run, it is none of `armscan run`, it has not ended, what it has kept is gone
@@ -61,7 +66,7 @@ def load_original(tracking: str, run_id: str) -> Original:
     if run.status not in ENDED:
         raise InvalidValueError(f"run {run.run_id} has not ended ({run.status}): there is nothing to compare with yet")
     with tempfile.TemporaryDirectory() as folder:
-        config = from_its_folder(OmegaConf.create(run.config(Path(folder))), run.tags)
+        config = from_its_folder(OmegaConf.create(run.config(Path(folder), trust=trust)), run.tags)
         volumes = run.volumes(Path(folder))
         text = run.text(ENVIRONMENT_FILE, Path(folder))
     config.tracking.uri = tracking

@@ -13,7 +13,7 @@ from mlflow.entities import Run
 from packaging.version import Version
 
 import armscan
-from armscan.config.legacy import migrate
+from armscan.config.trust import stored_config
 from armscan.errors import TrackingError, listed
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.store import open_existing_store, store_errors
@@ -55,16 +55,22 @@ class FoundRun:
     tags: dict[str, str] = field(repr=False)
     files: tuple[str, ...]
 
-    def config(self, folder: Path) -> dict[str, Any]:
-        """Return the resolved configuration, with the keys of this version; `folder` takes the file.
+    def config(self, folder: Path, *, trust: bool = False) -> dict[str, Any]:
+        """Return the resolved configuration, with the keys of this version.
+
+        Args:
+            folder: folder to download the file to.
+            trust: whether it may name classes that are not armscan's; default: false.
 
         Raises:
+            UntrustedError: if it is not trusted, and names other classes.
             TrackingError: if the run has kept none, it is damaged, or not the one that the run was started with.
         """
         try:
-            return migrate(dict(yaml.safe_load(self._started_with(CONFIG_FILE, folder))))
+            config = dict(yaml.safe_load(self._started_with(CONFIG_FILE, folder)))
         except (yaml.YAMLError, TypeError, ValueError) as error:
             raise TrackingError(f"run {self.run_id}: its {CONFIG_FILE} is damaged") from error
+        return stored_config(config, where=f"run {self.run_id}", trust=trust)
 
     def checkpoint(self, folder: Path) -> Path | None:
         """Return the best checkpoint, fetched into `folder`; None where the run has kept none."""

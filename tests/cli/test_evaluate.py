@@ -230,7 +230,7 @@ def test_own_volumes_are_those_of_the_folder_that_the_run_was_started_in(answer,
     shutil.copytree(wrists, elsewhere / "wrists")
     manifest = yaml.safe_load((wrists / "manifest.yaml").read_text())
     (elsewhere / "wrists" / "manifest.yaml").write_text(yaml.safe_dump(swapped(manifest)))
-    words = [run_id, "--episodes=2", f"--tracking=sqlite:///{tmp_path}/mlruns.db", "--out=a.json"]
+    words = [run_id, "--trust", "--episodes=2", f"--tracking=sqlite:///{tmp_path}/mlruns.db", "--out=a.json"]
     code, _, errors = answer(*words, cwd=elsewhere)
     assert (code, errors) == (0, "")
     assert list(json.loads((elsewhere / "a.json").read_text())["volumes"]["test volumes"]) == manifest["splits"]["test"]
@@ -249,10 +249,10 @@ def test_own_volumes_that_have_changed_are_refused_where_they_matter(answer, tmp
     manifest = yaml.safe_load((wrists / "manifest.yaml").read_text())
     (wrists / "manifest.yaml").write_text(yaml.safe_dump(swapped(manifest)))
     line = f"the training volumes are not those that run {run_id} was started with: "
-    code, _, errors = answer(run_id, "--episodes=2")
+    code, _, errors = answer(run_id, "--trust", "--episodes=2")
     assert code == 2
     assert errors.startswith(f"error: {line}")
-    code, printed, errors = answer(run_id, "--data=wrists", "--episodes=4")
+    code, printed, errors = answer(run_id, "--trust", "--data=wrists", "--episodes=4")
     if reward == "agreement":
         assert code == 2
         assert errors.startswith(
@@ -276,7 +276,7 @@ def test_volumes_of_the_training_are_known_under_other_names_and_others_under_th
         shutil.copy(wrists / name, copies / copy)
     entries = {"copy.nii.gz": manifest["volumes"][one], third: manifest["volumes"][last]}
     (copies / "manifest.yaml").write_text(yaml.safe_dump({"volumes": entries}))
-    code, printed, errors = answer(run_id, "--data=copies", "--episodes=2")
+    code, printed, errors = answer(run_id, "--trust", "--data=copies", "--episodes=2")
     assert (code, errors) == (0, "")
     assert f"note: the agent was trained on these volumes: copy.nii.gz (there {one})\n" in printed
     assert f"note: the agent's checkpoint was chosen on other volumes of these names: {third}\n" in printed
@@ -284,17 +284,17 @@ def test_volumes_of_the_training_are_known_under_other_names_and_others_under_th
 
 def test_run_without_fingerprints_is_evaluated_with_a_note(answer, tmp_path):
     run_id = tracked(tmp_path, agent=GUESSER, kept=("config.yaml",))
-    code, printed, _ = answer(run_id, "--episodes=1")
+    code, printed, _ = answer(run_id, "--trust", "--episodes=1")
     assert code == 0
     assert "note: the run has not kept fingerprints of its volumes" in printed
-    code, printed, _ = answer(run_id, "--data=phantom", "--phantoms=1", "--episodes=1")
+    code, printed, _ = answer(run_id, "--trust", "--data=phantom", "--phantoms=1", "--episodes=1")
     assert code == 0
     assert "fingerprints" not in printed
 
 
 def test_baselines_are_evaluated_by_their_run_or_by_name(answer, tmp_path, phantom):
     run_id = tracked(tmp_path, "projection=zy", agent=GUESSER)
-    assert answer(run_id, "--data=phantom", "--phantoms=2", "--episodes=2", "--out=run.json")[0] == 0
+    assert answer(run_id, "--trust", "--data=phantom", "--phantoms=2", "--episodes=2", "--out=run.json")[0] == 0
     words = [
         "--agent=sac",
         "~agent.network",

@@ -1,0 +1,97 @@
+"""What a stored configuration or command line may execute.
+
+Hydra builds objects by the names of their classes, so a configuration is a program. What this user typed is trusted.
+What comes from a store or a run's folder may be anybody's: of its classes only armscan's own are built, and nothing
+else in it is computed, unless the user says `--trust`.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from armscan.config.legacy import migrate
+from armscan.config.sources import config_folder, sweeps_folder
+from armscan.errors import UntrustedError
+
+TRUST = "--trust"
+HOW = f"if you trust whoever made it, repeat the command with {TRUST}"
+TARGET, INTERPOLATION = "_target_", "${"
+TARGETS = re.compile(rf"{TARGET}: *([\w.]+)")
+# Of grids and studies, not of the runs in them.
+GROUPS_OF_COMMANDS = ("hydra", "study", "local")
+PACKAGES_OF_COMMANDS = ("armscan.launch.", "armscan.sweeps.")
+
+
+@functools.cache
+def offered_classes() -> frozenset[str]:
+    """Return the names of the classes and functions that armscan's own configuration builds runs of."""
+    root = config_folder()
+    files = [path for path in root.rglob("*.yaml") if path.relative_to(root).parts[0] not in GROUPS_OF_COMMANDS]
+    names = {
+        name
+        for file in [*files, *sweeps_folder().glob("*.yaml")]
+        for name in TARGETS.findall(file.read_text(encoding="utf-8"))
+    }
+    return frozenset(name for name in names if not name.startswith(PACKAGES_OF_COMMANDS))
+
+
+def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict[str, Any]:
+    """Return a stored configuration with the keys and classes of this version.
+
+    Args:
+        config: configuration as it was stored, resolved.
+        where: what it belongs to, for the error, such as `run 3bf2`.
+        trust: whether it may name any class.
+
+    Raises:
+        UntrustedError: if it names a class that armscan does not offer, or holds an interpolation.
+    """
+    config = migrate(config)
+    for key, value in () if trust else _leaves(config):
+        if key.rpartition(".")[2] == TARGET and str(value) not in offered_classes():
+            raise UntrustedError(
+                f"{where}: its configuration builds {key.removesuffix(f'.{TARGET}')} by {value!r}, which is none of "
+                f"armscan's classes and would execute code of others; {HOW}"
+            )
+        if isinstance(value, str) and INTERPOLATION in value:
+            raise UntrustedError(
+                f"{where}: its configuration has {key}={value!r}, but a stored value holds no interpolation, which "
+                f"could read this machine's environment; {HOW}"
+            )
+    return config
+
+
+def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
+    """Raise `UntrustedError` where a stored command line could execute code, or send results elsewhere.
+
+    Args:
+        words: overrides of the command line.
+        uri: address of the store that they were read from.
+        where: what they belong to, for the error.
+    """
+    for word in words:
+        key, _, value = word.lstrip("+~").partition("=")
+        # A server is sent this user's password.
+        is_elsewhere = key.startswith("tracking.") and "://" in value and not value.startswith(("sqlite:", uri))
+        if is_elsewhere or TARGET in word or INTERPOLATION in word or key.startswith(("hydra", "-")):
+            raise UntrustedError(
+                f"{where}: its command line has {word!r}, which could execute code of others or send results "
+                f"elsewhere; {HOW}"
+            )
+
+
+def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Iterate over all keys of mappings and items of sequences, at any depth, with their values."""
+    if isinstance(value, Mapping):
+        items: Iterable[tuple[Any, Any]] = value.items()
+    elif isinstance(value, list | tuple):
+        items = enumerate(value)
+    else:
+        return
+    for key, each in items:
+        name = f"{path}.{key}" if path else str(key)
+        yield name, each
+        yield from _leaves(each, name)

@@ -1,0 +1,123 @@
+"""Runs that a stranger has made: no command executes what they name."""
+
+import json
+import re
+import shlex
+
+import pytest
+import yaml
+
+from armscan.errors import UntrustedError
+from armscan.experiment.job import GRID_TAG
+from armscan.experiment.resume import resume
+from armscan.policies.build import SUM_TAG
+from armscan.policies.model import CODE, model_sha256
+from armscan.tracking import open_store
+from armscan.utils.files import CONFIG_FILE, SHA256_TAGS, sha256
+from tests.cli.test_evaluate import GUESSER, tracked
+from tests.cli.test_policy import registered, store_of
+
+# Of libraries that are always there; Hydra builds each without a word.
+DOORS = {
+    "a shell": lambda marker: {"_target_": "torch.utils.collect_env.run", "command": f"touch {shlex.quote(marker)}"},
+    "a process": lambda marker: {"_target_": "subprocess.check_output", "args": ["touch", marker]},
+    "a file": lambda marker: {
+        "_target_": "pathlib.Path.touch",
+        "self": {"_target_": "pathlib.Path", "_args_": [marker]},
+    },
+}
+COMMANDS = {
+    "evaluate": ["evaluate", "{run}", "--episodes=3"],
+    "evaluate --video": ["evaluate", "{run}", "--video"],
+    "reproduce": ["runs", "reproduce", "{run}"],
+    "export": ["policy", "export", "{run}", "--out=model"],
+    "register": ["policy", "register", "{run}", "--name=n"],
+}
+
+
+@pytest.fixture(autouse=True)
+def working_folder(database, tmp_path, monkeypatch):
+    """A folder with the store in which the user looks."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlruns.db")
+
+
+def run_with(folder, **sections):
+    """Tracks a run, replaces sections of its configuration, and lets its tag say that it was started so."""
+    run_id = tracked(folder)
+    file, client = folder / CONFIG_FILE, store_of(folder)
+    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | sections))
+    client.log_artifact(run_id, str(file))
+    client.set_tag(run_id, SHA256_TAGS[CONFIG_FILE], sha256(file.read_bytes()))
+    client.set_tag(run_id, "folder", str(folder))
+    return run_id
+
+
+def answered(armscan, name, run_id, *more):
+    command, *words = (word.format(run=run_id) for word in [*COMMANDS[name], *more])
+    return armscan(command, *words)
+
+
+@pytest.mark.parametrize(("door", "section"), list(zip(DOORS, ["data", "agent", "env"], strict=True)))
+def test_no_command_executes_what_a_run_names(armscan, tmp_path, door, section):
+    marker = tmp_path / "executed"
+    run_id = run_with(tmp_path, **{section: DOORS[door](str(marker))})
+    line = f"run {run_id}: its configuration builds {section}"
+    for name in COMMANDS:
+        code, _, errors = answered(armscan, name, run_id)
+        assert code == 2, name
+        assert errors.startswith(f"error: {line}"), name
+        assert "--trust" in errors
+        assert len(errors.splitlines()) == 1
+        assert not marker.exists(), name
+    store_of(tmp_path).set_terminated(run_id, "KILLED")
+    with pytest.raises(UntrustedError, match=line):
+        resume([f"resume={run_id}"], list)
+    assert not marker.exists()
+
+
+def test_run_with_a_class_of_ones_own_is_evaluated_with_trust(armscan, tmp_path):
+    run_id = tracked(tmp_path, agent=GUESSER)
+    code, _, errors = answered(armscan, "evaluate", run_id)
+    assert code == 2
+    assert "its configuration builds agent by 'tests.cli.test_evaluate.Guesser'" in errors
+    assert answered(armscan, "evaluate", run_id, "--trust")[0] == 0
+
+
+@pytest.mark.parametrize(
+    "word", ["agent._target_=os.getcwd", "+hydra.searchpath=[/tmp]", "tracking.uri=http://elsewhere"]
+)
+def test_grid_whose_command_line_names_code_is_not_resumed(tmp_path, word):
+    run_id = grid_in(tmp_path, [word, "seed=1,2"])
+    with pytest.raises(UntrustedError, match=re.escape(f"run {run_id}: its command line has {word!r}")):
+        resume([f"resume={run_id}"], list)
+
+
+def test_grid_of_another_folder_is_not_resumed(tmp_path, monkeypatch):
+    run_id = grid_in(tmp_path, ["seed=1,2"])
+    (tmp_path / "mine").mkdir()
+    monkeypatch.chdir(tmp_path / "mine")
+    with pytest.raises(UntrustedError, match=f"run {run_id}: it was started in {tmp_path}, whose configuration could"):
+        resume([f"resume={run_id}"], list)
+    repeated = []
+    resume([f"resume={run_id}", "--trust"], repeated.extend)
+    assert repeated == ["seed=1,2"]
+
+
+def grid_in(folder, words):
+    """Tracks the parent of a grid that was started in a folder."""
+    client, experiment_id = open_store(
+        f"sqlite:///{folder}/mlruns.db", experiment="armscan", artifacts=str(folder / "artifacts"), wait_s=60.0
+    )
+    tags = {GRID_TAG: json.dumps(words), "working_folder": str(folder)}
+    return client.create_run(experiment_id, name="grid", tags=tags).info.run_id
+
+
+def test_code_in_a_kept_policy_is_not_executed_when_it_is_registered(armscan, tmp_path):
+    run_id, model = registered(lambda *words: armscan("policy", *words), tmp_path)
+    marker = tmp_path / "executed"
+    code = model / CODE.name
+    code.write_text(f"import pathlib\npathlib.Path({str(marker)!r}).touch()\n{code.read_text()}")
+    store_of(tmp_path).set_tag(run_id, SUM_TAG, model_sha256(model))
+    assert armscan("policy", "register", run_id, "--name=n")[0] == 0
+    assert not marker.exists()
