@@ -30,11 +30,7 @@ class Random:
 
 
 class RandomAgent:
-    """Draws planes.
-
-    Args:
-        n_free: components of an action.
-    """
+    """Draws planes with `n_free` components."""
 
     def __init__(self, n_free: int) -> None:
         self._n_free = n_free
@@ -110,14 +106,7 @@ class Exhaustive:
 
 
 class ExhaustiveAgent:
-    """Goes through planes in a fixed order; see `Exhaustive`.
-
-    Args:
-        free: names of the action's components.
-        swept: those of them that are swept.
-        step_mm: between planes along translations.
-        step_deg: between planes about rotations.
-    """
+    """Goes through planes in the order of `Exhaustive`, with actions of the `free` components."""
 
     def __init__(self, free: Sequence[str], swept: Sequence[str], *, step_mm: float, step_deg: float) -> None:
         self._free, self._swept = tuple(free), tuple(swept)
@@ -150,14 +139,9 @@ class ExhaustiveAgent:
         # A step that ends on the range's end is within it, however the quotient was rounded.
         n_each_side = [math.floor(half + 1e-9) for half in halves]
         if (n_planes := math.prod(2 * n + 1 for n in n_each_side)) > MOST_PLANES:
-            ranges = " and ".join(
-                f"+-{bound:g} degrees of {name}" if name in ROTATIONS else f"{bound:g} mm of {name}"
-                for name, bound in zip(COMPONENTS, bounds.rotation_deg + bounds.translation_mm, strict=True)
-                if name in self._swept
-            )
             raise InvalidValueError(
                 f"agent.step_mm is {self._step_mm:g} and agent.step_deg is {self._step_deg:g}, which give {n_planes} "
-                f"planes within {ranges}, but there must be at most {MOST_PLANES}"
+                f"planes of {listed(self._swept)}, but there must be at most {MOST_PLANES}"
             )
         counts = np.meshgrid(*(np.arange(-n, n + 1) for n in n_each_side), indexing="ij")
         steps = np.stack(counts, axis=-1).reshape(-1, len(self._swept))

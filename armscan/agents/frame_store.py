@@ -95,11 +95,7 @@ def _decode(joined: Pixels, ends: NDArray[np.uint64], pixels: Pixels) -> None:
 
 
 class FrameStore:
-    """Frames of one size by id, each for as long as something refers to it.
-
-    Args:
-        n_pixels: of a frame.
-    """
+    """Frames of `n_pixels` by id, each for as long as something refers to it."""
 
     def __init__(self, n_pixels: int) -> None:
         self._n_pixels = n_pixels

@@ -52,6 +52,10 @@ class Parameters:
             elif each.type == "float":
                 check_float(name, value, **each.metadata["limits"])
 
+    def lr_after(self, n_env_steps: int, total_env_steps: int) -> float:
+        """Return the learning rate after `n_env_steps`: linear from `lr` to `lr_end_factor` times as much."""
+        return (1.0 - (1.0 - self.lr_end_factor) * min(1.0, n_env_steps / total_env_steps)) * self.lr
+
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyParameters(Parameters):
@@ -59,11 +63,6 @@ class PolicyParameters(Parameters):
 
     deterministic_eval: bool = True
     """Whether the policy is evaluated by its mode; false: its actions are sampled, as they are during training."""
-
-
-def lr_share(final_share: float, n_env_steps: int, total_env_steps: int) -> float:
-    """Return the factor of the learning rate after `n_env_steps`: linear from 1 to `final_share`."""
-    return 1.0 - (1.0 - final_share) * min(1.0, n_env_steps / total_env_steps)
 
 
 def round_up(n_env_steps: int, num_envs: int) -> int:

@@ -36,8 +36,8 @@ class ImageReplay(Replay):
     Two batches of the same transitions, asked for one after the other, share the memory of their images.
 
     Args:
-        size: transitions in all.
-        n_envs: environments.
+        size: number of transitions in all.
+        n_envs: number of environments.
         images: the parts of an observation that are images, by name.
     """
 
@@ -116,12 +116,7 @@ class ImageReplay(Replay):
 
 
 class _ImageStore:
-    """The frames of one image part of the observations.
-
-    Args:
-        shape: of one image.
-        n_envs: environments.
-    """
+    """The frames of one image part of the observations, images of one shape."""
 
     def __init__(self, shape: tuple[int, ...], n_envs: int) -> None:
         self._shape = shape

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -72,11 +73,10 @@ class Multimodal:
         """Count the weights of one network before it is made, but for those of the vectors that come in."""
         n_weights, n_features = linear_weights(self.vector_sizes), self.vector_sizes[-1]
         for box in images:
-            n_pixels, n_channels = np.array(box.shape[-2:]), int(np.prod(box.shape[:-2]))
-            for n_filters, (kernel, stride) in zip(self.filters, CONVOLUTIONS, strict=True):
-                n_weights += n_channels * n_filters * kernel**2
-                n_pixels, n_channels = (n_pixels - kernel) // stride + 1, n_filters
-            n_features += n_channels * int(np.prod(n_pixels))
+            channels = [int(np.prod(box.shape[:-2])), *self.filters]
+            kernels = (kernel**2 for kernel, _ in CONVOLUTIONS)
+            n_weights += sum(n_in * n * size for (n_in, n), size in zip(pairwise(channels), kernels, strict=True))
+            n_features += _n_features(box, self.filters)
         return n_weights + linear_weights([n_features, *self.head_sizes])
 
     def actor(self, observation_space: spaces.Space[Any], n_free: int, log_std: float | None) -> Actor:
@@ -122,7 +122,7 @@ class MultimodalBody(ModuleWithVectorOutput):
         self._vectors = [name for name in space if name not in images]
         self._scales = {name: 1.0 / float(box.high.max()) for name, box in images.items()}
         self.convolutions = nn.ModuleDict({name: _convolutions(box, network.filters) for name, box in images.items()})
-        n_features = sum(_n_features(self.convolutions[name], box) for name, box in images.items())
+        n_features = sum(_n_features(box, network.filters) for box in images.values())
         n_vector = sum(int(np.prod(space[name].shape or ())) for name in self._vectors) + n_action
         self.vector = _linear_layers(n_vector, network.vector_sizes)
         self.head = _linear_layers(n_features + network.vector_sizes[-1], network.head_sizes)
@@ -149,11 +149,7 @@ class MultimodalBody(ModuleWithVectorOutput):
 
 
 class MultimodalCritic(nn.Module):
-    """A critic of observations, or of observations with actions.
-
-    Args:
-        body: all but its output.
-    """
+    """A critic of observations, or of observations with actions: a body and its output."""
 
     def __init__(self, body: MultimodalBody) -> None:
         super().__init__()
@@ -167,22 +163,19 @@ class MultimodalCritic(nn.Module):
 
 
 def _convolutions(box: spaces.Box, filters: Sequence[int]) -> nn.Sequential:
-    n_channels = int(np.prod(box.shape[:-2]))
-    layers: list[nn.Module] = []
-    for n_filters, (kernel, stride) in zip(filters, CONVOLUTIONS, strict=True):
-        layers += [nn.Conv2d(n_channels, n_filters, kernel, stride), nn.ReLU()]
-        n_channels = n_filters
-    return nn.Sequential(*layers, nn.Flatten())
+    channels = pairwise([int(np.prod(box.shape[:-2])), *filters])
+    layers = [(nn.Conv2d(*each, *shape), nn.ReLU()) for each, shape in zip(channels, CONVOLUTIONS, strict=True)]
+    return nn.Sequential(*chain.from_iterable(layers), nn.Flatten())
 
 
-def _n_features(convolutions: nn.Module, box: spaces.Box) -> int:
-    with torch.no_grad():
-        frames = torch.zeros(1, int(np.prod(box.shape[:-2])), *box.shape[-2:])
-        return int(convolutions(frames).shape[1])
+def _n_features(box: spaces.Box, filters: Sequence[int]) -> int:
+    """Return how many numbers the convolutions make of an image."""
+    sides = np.array(box.shape[-2:])
+    for kernel, stride in CONVOLUTIONS:
+        sides = (sides - kernel) // stride + 1
+    return filters[-1] * int(np.prod(sides))
 
 
 def _linear_layers(n_inputs: int, sizes: Sequence[int]) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for n_before, n in zip([n_inputs, *sizes], sizes, strict=False):
-        layers += [nn.Linear(n_before, n), nn.ReLU()]
-    return nn.Sequential(*layers)
+    layers = [(nn.Linear(n_before, n), nn.ReLU()) for n_before, n in pairwise([n_inputs, *sizes])]
+    return nn.Sequential(*chain.from_iterable(layers))

@@ -55,12 +55,7 @@ class OptunaSearch:
 
 
 class OptunaAgent:
-    """Asks a study for planes and tells it their rewards.
-
-    Args:
-        names: of the action's components.
-        search: how it searches.
-    """
+    """Asks a study for planes and tells it their rewards; `names` are those of the action's components."""
 
     def __init__(self, names: Sequence[str], search: OptunaSearch) -> None:
         self._names = tuple(names)
@@ -86,9 +81,6 @@ def _sampler(search: OptunaSearch, seed: int) -> BaseSampler:
 
     # Each sampler has a number of its own where none is given.
     startup: dict[str, Any] = {} if search.n_startup_trials is None else {"n_startup_trials": search.n_startup_trials}
-    match search.sampler:
-        case "cmaes":
-            return CmaEsSampler(seed=seed, warn_independent_sampling=False, **startup)
-        case "gp":
-            return GPSampler(seed=seed, **startup)
-    return TPESampler(seed=seed, **startup)
+    if search.sampler == "cmaes":
+        return CmaEsSampler(seed=seed, warn_independent_sampling=False, **startup)
+    return (GPSampler if search.sampler == "gp" else TPESampler)(seed=seed, **startup)

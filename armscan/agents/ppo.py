@@ -109,6 +109,4 @@ class PPO(PolicyParameters):
             update_step_num_repetitions=self.n_epochs,
             batch_size=self.batch_size,
         )
-        return TianshouLearner(
-            OnPolicyTrainer(algorithm, params), bounded=clip_action, lr_end_factor=self.lr_end_factor, setup=setup
-        )
+        return TianshouLearner(OnPolicyTrainer(algorithm, params), bounded=clip_action, parameters=self, setup=setup)

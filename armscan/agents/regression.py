@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
 from torch import nn
 
-from armscan.agents.hyperparameters import Parameters, buffer_capacity, check_batch, check_updates, lr_share, number
+from armscan.agents.hyperparameters import Parameters, buffer_capacity, check_batch, check_updates, number
+from armscan.agents.networks import Network
 from armscan.agents.policy import Policy, clip_action
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.supervised_buffer import SupervisedBuffer
-from armscan.agents.tianshou_learner import load_into
+from armscan.agents.tianshou_learner import diverged, is_finite, load_into
 from armscan.envs.actions import ActionBounds
 from armscan.envs.history import observation_of, parts_of
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
-from armscan.errors import DivergedError, InvalidValueError
+from armscan.errors import InvalidValueError
 from armscan.volumes.plane import FloatArray
 
 # Of normalised actions: 10 ** -2.5 is half a millimetre along an arm of 300 mm, or a third of a degree.
@@ -64,7 +64,7 @@ class Regression(Parameters):
             InvalidValueError: if the training takes too few steps to learn anything, or the network cannot take the
                 observations.
         """
-        chosen = self.network.chosen_for(setup.observation_space)
+        network = self.network.chosen_for(setup.observation_space)
         if self.num_envs > setup.total_env_steps:
             raise InvalidValueError(
                 f"agent.num_envs is {self.num_envs}, but it must be at most training.env_steps = "
@@ -73,11 +73,7 @@ class Regression(Parameters):
         check_updates(self.utd_ratio, setup)
         size = buffer_capacity(self.buffer_size, self.num_envs, setup)
         check_batch(self.batch_size, size, "which is all that is kept of the training's slices")
-        n_free = len(setup.action_names)
-        torch.manual_seed(setup.seed)
-        network = chosen.actor(setup.observation_space, n_free, log_std=-0.5).to(setup.compute.torch_device)
-        examples = SupervisedBuffer(size, setup.observation_space, n_free)
-        return RegressionLearner(self, setup.make_envs(self.num_envs), network, examples, setup)
+        return RegressionLearner(self, network, size, setup)
 
 
 class RegressionLearner:
@@ -87,31 +83,25 @@ class RegressionLearner:
     number, so that it goes on from its state bit for bit.
 
     Args:
-        regression: its parameters.
-        envs: the training environments, without autoreset.
-        network: gives mean and spread of actions, of which the mean is fitted.
-        examples: what was seen.
-        setup: what the agent was given.
+        regression: parameters of the algorithm.
+        network: kind of network; the mean of its actor's actions is fitted.
+        size: number of slices that are kept.
+        setup: what the agent is made from.
     """
 
-    def __init__(
-        self,
-        regression: Regression,
-        envs: VectorEnv[Any, Any, Any],
-        network: nn.Module,
-        examples: SupervisedBuffer,
-        setup: AgentSetup,
-    ) -> None:
+    def __init__(self, regression: Regression, network: Network, size: int, setup: AgentSetup) -> None:
         self._regression = regression
+        envs, n_free = setup.make_envs(regression.num_envs), len(setup.action_names)
         assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
         self._envs, self._teacher = envs, envs.unwrapped
-        self._network = network
-        self._examples = examples
+        self._examples = SupervisedBuffer(size, setup.observation_space, n_free)
         self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
         self._compute, self._device = setup.compute, setup.compute.torch_device
-        self._optimiser = torch.optim.Adam(network.parameters(), lr=regression.lr)
+        torch.manual_seed(setup.seed)
+        self._network = network.actor(setup.observation_space, n_free, log_std=-0.5).to(self._device)
+        self._optimiser = torch.optim.Adam(self._network.parameters(), lr=regression.lr)
         self._n_env_steps = self._n_epochs = 0
-        setup.compute.apply_to(network)
+        setup.compute.apply_to(self._network)
 
     @property
     def n_env_steps(self) -> int:
@@ -137,16 +127,16 @@ class RegressionLearner:
         torch.manual_seed(int(for_torch.generate_state(1)[0]))
         rng = np.random.default_rng(for_draws)
         seeds = [int(word) for word in for_envs.generate_state(self._envs.num_envs)]
-        share = lr_share(self._regression.lr_end_factor, self._n_env_steps, self._total_env_steps)
         for group in self._lr_groups():
-            group["lr"] = share * self._regression.lr
+            group["lr"] = self._regression.lr_after(self._n_env_steps, self._total_env_steps)
         observations, _ = reset_each(self._envs, seeds)
         n_before, losses, start_s = self._n_env_steps, [], time.perf_counter()
         while self._n_env_steps - n_before < n_env_steps:
             n_updates_before = self._n_updates
             observations = self._step(observations, rng)
             losses += [self._update(rng) for _ in range(self._n_updates - n_updates_before)]
-        self._check_weights()
+        if not is_finite(self._network):
+            raise diverged(self._n_env_steps)
         seconds = time.perf_counter() - start_s
         return {
             **({"update/loss": float(torch.stack(losses).mean())} if losses else {}),
@@ -180,7 +170,7 @@ class RegressionLearner:
         with torch.no_grad():
             chosen = self._predicted(observations).cpu().numpy()
         if not np.isfinite(chosen).all():
-            raise self._diverged()
+            raise diverged(self._n_env_steps)
         spread = 10.0 ** rng.uniform(*LOG_SPREADS, (len(planes), 1))
         near = np.clip(rng.normal(chosen, spread), -1.0, 1.0)
         return np.where(rng.random((len(planes), 1)) < self._regression.own_planes_share, near, planes)
@@ -197,16 +187,6 @@ class RegressionLearner:
         """Return the predicted optimal actions of a batch, shape (n, n_free), not yet clipped."""
         (mean, _), _ = self._network(observations)
         return torch.as_tensor(mean)
-
-    def _check_weights(self) -> None:
-        if not all(torch.isfinite(weights).all() for weights in self._network.parameters()):
-            raise self._diverged()
-
-    def _diverged(self) -> DivergedError:
-        return DivergedError(
-            f"learning has diverged: after {self.n_env_steps} environment steps the network's weights are not finite "
-            "any more; a smaller agent.lr may help"
-        )
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
         """Learn that an episode begins, in which nothing is drawn."""

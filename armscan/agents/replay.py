@@ -13,15 +13,7 @@ Tree = dict[str, Any]
 
 
 class Replay(VectorReplayBuffer):
-    """Transitions of several environments, each in a ring of its own.
-
-    Args:
-        size: transitions in all.
-        n_envs: environments.
-    """
-
-    def __init__(self, size: int, n_envs: int) -> None:
-        super().__init__(size, n_envs)
+    """At most `total_size` transitions of `buffer_num` environments, each environment's in a ring of its own."""
 
     def hasnull(self) -> bool:
         """Say that nothing is NaN.

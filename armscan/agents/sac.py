@@ -119,7 +119,7 @@ class SAC(PolicyParameters):
             EvenUpdatesTrainer(algorithm, params, n_random),
             learning_starts=n_random,
             bounded=torch.tanh,
-            lr_end_factor=self.lr_end_factor,
+            parameters=self,
             setup=setup,
         )
 

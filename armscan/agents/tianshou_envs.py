@@ -63,13 +63,12 @@ class TianshouVectorEnv(BaseVectorEnv):
         return _batched(observations), rewards, terminated, truncated, self._no_info(np.arange(self.env_num))
 
     def seed(self, seed: int | list[int] | None = None) -> list[list[int] | None]:
-        """Seeds the next reset and the random actions."""
-        seeds = [seed + i for i in range(self.env_num)] if isinstance(seed, int) else seed
-        self._seeds = None if seeds is None else list(seeds)
-        if seeds is not None:
-            for space, one_seed in zip(self._action_spaces, seeds, strict=True):
-                space.seed(one_seed)
-        return [None if seeds is None else [one_seed] for one_seed in seeds or [0] * self.env_num]
+        """Seeds the next reset and the random actions, from a seed for each environment."""
+        assert isinstance(seed, list)
+        self._seeds = list(seed)
+        for space, one_seed in zip(self._action_spaces, seed, strict=True):
+            space.seed(one_seed)
+        return [[one_seed] for one_seed in seed]
 
     @staticmethod
     def _no_info(ids: NDArray[np.int64]) -> NDArray[Any]:

@@ -13,7 +13,7 @@ from tianshou.data import Batch, Collector
 from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
 from armscan.agents.epoch_metrics import EpochMetrics
-from armscan.agents.hyperparameters import lr_share
+from armscan.agents.hyperparameters import Parameters
 from armscan.agents.policy import Policy
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
@@ -36,8 +36,7 @@ class TianshouLearner:
     Args:
         trainer: with `training_parameters`.
         bounded: takes the mean of the policy's actions to [-1, 1], as the trainer's policy does.
-        lr_end_factor: what the learning rates of actor and critics have come down to at the training's end, as a share
-            of what they were; they fall by as much in each epoch as it has steps.
+        parameters: parameters of the algorithm; the learning rates fall by as much in each epoch as it has steps.
         setup: what the agent was given.
         learning_starts: steps with random actions before the first update; default: none.
     """
@@ -47,7 +46,7 @@ class TianshouLearner:
         trainer: OnPolicyTrainer | OffPolicyTrainer,
         *,
         bounded: Callable[[torch.Tensor], torch.Tensor],
-        lr_end_factor: float,
+        parameters: Parameters,
         setup: AgentSetup,
         learning_starts: int = 0,
     ) -> None:
@@ -61,10 +60,9 @@ class TianshouLearner:
         self._metrics = cast(EpochMetrics, trainer.params.logger)
         self._learning_starts = learning_starts
         self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
-        self._lr_end_factor = lr_end_factor
+        self._parameters = parameters
         self._bounded, self._compute = bounded, setup.compute
         self._n_epochs = 0
-        self._first_lrs = [group["lr"] for group in self._lr_groups()]
         critics = [module for name, module in self._algorithm.named_children() if name.startswith("critic")]
         # Lagging copies of the critics included.
         for network in (self._algorithm.policy.actor, *critics):
@@ -123,20 +121,16 @@ class TianshouLearner:
         self._envs.seed([int(word) for word in for_envs.generate_state(self._collector.env_num)])
         self._envs.n_ended = self._envs.n_successes = 0
         self._collector.reset_env()
-        share = lr_share(self._lr_end_factor, self.n_env_steps, self._total_env_steps)
-        for group, first_lr in zip(self._lr_groups(), self._first_lrs, strict=True):
-            group["lr"] = share * first_lr
+        for group in self._lr_groups():
+            group["lr"] = self._parameters.lr_after(self.n_env_steps, self._total_env_steps)
 
     def _lr_groups(self) -> list[dict[str, Any]]:
         return [group for optimiser in self._algorithm._optimizers for group in optimiser._optim.param_groups]
 
     def _check_weights(self, cause: ValueError | None = None) -> None:
-        if not all(torch.isfinite(weights).all() for weights in self._algorithm.parameters()):
+        if not is_finite(self._algorithm):
             or_entropy = " or agent.ent_coef_lr" if _entropy_optimiser(self._algorithm) else ""
-            raise DivergedError(
-                f"learning has diverged: after {self.n_env_steps} environment steps the networks' weights are not "
-                f"finite any more; a smaller agent.lr{or_entropy} may help"
-            ) from cause
+            raise diverged(self.n_env_steps, f"agent.lr{or_entropy}") from cause
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
         """Learn that an episode begins; only a policy whose evaluation samples actions draws anything in it."""
@@ -206,6 +200,19 @@ def training_parameters(policy: TianshouPolicy, envs: TianshouVectorEnv, replay:
         "verbose": False,
         "show_progress": False,
     }
+
+
+def is_finite(module: torch.nn.Module) -> bool:
+    """Whether all weights are finite."""
+    return all(bool(torch.isfinite(weights).all()) for weights in module.parameters())
+
+
+def diverged(n_env_steps: int, too_large: str = "agent.lr") -> DivergedError:
+    """Return the error of a training whose networks are not finite any more."""
+    return DivergedError(
+        f"learning has diverged: after {n_env_steps} environment steps the networks' weights are not finite any more; "
+        f"a smaller {too_large} may help"
+    )
 
 
 def load_into(module: torch.nn.Module, weights: dict[str, Any]) -> None:

@@ -119,7 +119,7 @@ def evaluate(
     # Deferred: a mistake on the command line is answered before these are loaded.
     from armscan import evaluation
     from armscan.config.defaults import default_tracking
-    from armscan.evaluation.apply import apply
+    from armscan.evaluation.runner import apply
 
     n_episodes = episodes or (N_VIDEO_EPISODES if video else N_EPISODES)
     store = default_tracking() | {"uri": tracking}

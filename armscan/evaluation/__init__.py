@@ -2,22 +2,15 @@
 
 from armscan.evaluation.agent_source import TrainedAgent, agent_of_overrides, agent_of_run
 from armscan.evaluation.report import EvaluationReport, report_tables
-from armscan.evaluation.runner import AgentEvaluator, prepare
-from armscan.evaluation.volumes import TrainingVolumes, data_name, known_volumes, own_split, volume_groups
-from armscan.training import PARTS
+from armscan.evaluation.runner import prepare
+from armscan.evaluation.volumes import own_split
 
 __all__ = [
-    "PARTS",
-    "AgentEvaluator",
     "EvaluationReport",
     "TrainedAgent",
-    "TrainingVolumes",
     "agent_of_overrides",
     "agent_of_run",
-    "data_name",
-    "known_volumes",
     "own_split",
     "prepare",
     "report_tables",
-    "volume_groups",
 ]

@@ -27,10 +27,10 @@ class TrainedAgent:
 
     Args:
         name: what tables and files call it.
-        config: resolved, with the changes that were asked for.
-        run: that it was trained in, None for an agent that no run is of.
-        weights: of a learner, None where it has kept none.
-        n_env_steps: that it was trained for.
+        config: resolved configuration, with the changes that were asked for.
+        run: run that it was trained in, None for an agent that no run is of.
+        weights: weights of a learner, None where it has kept none.
+        n_env_steps: environment steps that it was trained for.
         domain: what it was trained on, None where that was not kept.
         volumes: the fingerprints of its run's volumes, None where these were not kept.
     """
@@ -72,9 +72,9 @@ def agent_of_overrides(words: Sequence[str], folder: str | None, changes: Mappin
     """Return the agent of a configuration, composed as `python -m armscan.run` composes it.
 
     Args:
-        words: `key=value`, `agent=NAME` among them, and `data=nifti` where there is a folder.
-        folder: of the volumes that it is evaluated on, which are its own then; None for those of the configuration.
-        changes: of the rules.
+        words: overrides `key=value`, `agent=NAME` among them, and `data=nifti` where there is a folder.
+        folder: folder of the volumes that it is evaluated on, which are its own then; None: those of the configuration.
+        changes: changed rules, by the names in `CHANGES`.
     """
     config = compose(words)
     if folder:

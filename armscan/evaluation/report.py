@@ -37,11 +37,8 @@ SUMMARY_ROWS = (
     ("time per plane (ms)", "mean_seconds_per_plane", "{:.2f}"),
 )
 COUNTS = (("volumes", "n_volumes"), ("episodes", "n_episodes"), ("started solved", "n_started_solved"))
-ROWS_OF_THE_OTHERS = (
-    ("success rate", f"success_rate{NOT_STARTED_SOLVED}", "{:.1%}"),
-    ("mean steps", f"mean_steps{NOT_STARTED_SOLVED}", "{:.2f}"),
-    ("median steps", f"median_steps{NOT_STARTED_SOLVED}", "{:.1f}"),
-)
+N_ROWS_OF_THE_OTHERS = 3
+"""Of the rows above, how many are also shown of the episodes that did not start solved."""
 VOLUME_COLUMNS = (
     ("success", "success_rate", "{:.0%}"),
     ("steps", "mean_steps", "{:.1f}"),
@@ -49,8 +46,6 @@ VOLUME_COLUMNS = (
     ("°", "mean_distance_deg", "{:.1f}"),
     ("Dice", "mean_dice", "{:.2f}"),
 )
-# Metrics that are shown in another unit than they are kept in.
-SHOWN_TIMES = {"mean_seconds_per_plane": 1000.0}
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,7 @@ class EvaluationReport:
     """An evaluation that has been played.
 
     Args:
-        evaluations: by what their volumes are called.
+        evaluations: evaluations by what their volumes are called.
         has_total: whether all of them are put together too; not where some volumes were trained on and others not.
         facts: what was evaluated, and how; plain values for the JSON file.
     """
@@ -122,8 +117,7 @@ def metrics_in_markdown(metrics: Mapping[str, MetricEstimates]) -> str:
     """Return the metrics by what their volumes are called, each with its interval, as a table in Markdown."""
     rows = [["metrics, with 95 % intervals", *metrics], ["---", *("---:" for _ in metrics)]]
     for text, key, form in SUMMARY_ROWS:
-        times = SHOWN_TIMES.get(key, 1.0)
-        cells = (_cell(each.estimates[key], form, times=times, apart=" (") for each in metrics.values())
+        cells = (_cell(_shown(each, key), form, apart=" (") for each in metrics.values())
         rows.append([text, *(f"{cell})" if "(" in cell else cell for cell in cells)])
     for text, count in COUNTS:
         rows.append([text, *(str(getattr(each, count)) for each in metrics.values())])
@@ -137,8 +131,7 @@ def _summary(metrics: Mapping[str, MetricEstimates]) -> Table:
         table.add_column(label, justify="right")
     apart = "\n" if len(metrics) > 1 else "  "
     for text, key, form in SUMMARY_ROWS:
-        times = SHOWN_TIMES.get(key, 1.0)
-        table.add_row(text, *(_cell(each.estimates[key], form, times=times, apart=apart) for each in metrics.values()))
+        table.add_row(text, *(_cell(_shown(each, key), form, apart=apart) for each in metrics.values()))
         if key == "success_rate":
             wilson = (each.estimates["success_rate_wilson"] for each in metrics.values())
             table.add_row("  its interval by Wilson", *(_interval(estimate, form) for estimate in wilson))
@@ -147,8 +140,9 @@ def _summary(metrics: Mapping[str, MetricEstimates]) -> Table:
         table.add_row(text, *(str(getattr(each, count)) for each in metrics.values()))
     table.add_section()
     table.add_row("those not started solved:")
-    for text, key, form in ROWS_OF_THE_OTHERS:
-        table.add_row(f"  {text}", *(_cell(each.estimates[key], form, apart=apart) for each in metrics.values()))
+    for text, key, form in SUMMARY_ROWS[:N_ROWS_OF_THE_OTHERS]:
+        others = (_shown(each, key + NOT_STARTED_SOLVED) for each in metrics.values())
+        table.add_row(f"  {text}", *(_cell(estimate, form, apart=apart) for estimate in others))
     return table
 
 
@@ -164,14 +158,20 @@ def _by_volume(label: str, volumes: Mapping[str, MetricEstimates]) -> Table:
     return table
 
 
-def _cell(estimate: Estimate, form: str, *, times: float = 1.0, apart: str) -> str:
+def _shown(metrics: MetricEstimates, key: str) -> Estimate:
+    """Return a metric in the unit that it is shown in."""
+    estimate = metrics.estimates[key]
+    return Estimate(*(1000.0 * seconds for seconds in estimate)) if key == "mean_seconds_per_plane" else estimate
+
+
+def _cell(estimate: Estimate, form: str, *, apart: str) -> str:
     if math.isnan(estimate.value):
         return "-"
-    return f"{form.format(estimate.value * times)}{apart}{_interval(estimate, form, times=times)}"
+    return f"{form.format(estimate.value)}{apart}{_interval(estimate, form)}"
 
 
-def _interval(estimate: Estimate, form: str, *, times: float = 1.0) -> str:
-    low, high = (form.format(number * times) for number in (estimate.low, estimate.high))
+def _interval(estimate: Estimate, form: str) -> str:
+    low, high = form.format(estimate.low), form.format(estimate.high)
     # Of two percentages, one sign is enough; a dash between numbers below zero would be read as another minus.
     between = " to " if estimate.low < 0 else "–"
     return f"{low.removesuffix('%')}{between}{high}"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from textwrap import shorten
 
-from omegaconf import DictConfig
+import torch
 
 from armscan.agents import Agent, Learner
 from armscan.anatomy import USUAL_PIXEL_MM
@@ -14,13 +15,12 @@ from armscan.config.command_hints import resume_command
 from armscan.envs import EnvFactory
 from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed
 from armscan.evaluation.agent_source import TrainedAgent
-from armscan.evaluation.volumes import Volumes
+from armscan.evaluation.volumes import TrainingVolumes, Volumes, known_volumes, own_split, volume_groups
 from armscan.experiment.build import apply_crop, make_agent, make_env_factory
 from armscan.tracking import FoundRun
-from armscan.training import Evaluation, TrainingDomain, evaluate
+from armscan.training import PARTS, Evaluation, Split, TrainingDomain, evaluate
 from armscan.training.domain import smallest_slice
 from armscan.training.rollout import Env
-from armscan.volumes import LabelVolume
 
 # First seed of an evaluation's episodes: none of them is played by a run, whose seeds lie below.
 FIRST_SEED = 5 * 10**6
@@ -29,18 +29,22 @@ MAX_REASON_CHARS = 250
 
 
 @dataclass(frozen=True)
-class AgentEvaluator:
-    """An agent and the environments that it is evaluated in.
+class PreparedAgent:
+    """An agent that is ready to play on volumes.
 
     Args:
-        agent: with its weights.
-        envs: by what their volumes are called.
-        notes: differences from the training domain, a sentence each.
+        subject: the agent's configuration and weights.
+        agent: the agent with its weights.
+        envs: its environments, by what their volumes are called.
+        notes: what differs from its training, a sentence each.
+        data: the folder of the volumes, `phantom`, or None for the volumes of the agent's own configuration.
     """
 
+    subject: TrainedAgent
     agent: Agent
     envs: dict[str, Env]
     notes: tuple[str, ...]
+    data: str | None = None
 
     def evaluate(
         self, n_episodes: int, seed: int, tell: Callable[[str], None] = lambda _: None
@@ -53,19 +57,52 @@ class AgentEvaluator:
         return evaluations
 
 
-def prepare(
+def apply(
     subject: TrainedAgent,
-    groups: Mapping[str, Volumes],
-    training: Mapping[str, LabelVolume],
+    data: str | None,
+    n_phantoms: int,
     *,
+    check: Callable[[Mapping[str, Volumes]], None] = lambda _: None,
     render_mode: str | None = None,
-) -> AgentEvaluator:
+) -> PreparedAgent:
+    """Bring an agent to volumes, and print what differs from its training.
+
+    Args:
+        subject: the agent.
+        data: a folder of volumes, `phantom`, or None for the volumes of the agent's own configuration.
+        n_phantoms: number of phantoms, at least 1; used for `phantom` only.
+        check: raises an error if the volumes, by their labels, do not suit the caller.
+        render_mode: Gymnasium render mode of the environments; default: None.
+
+    Raises:
+        ArmscanError: if volumes are missing or damaged, or the agent cannot be applied to them.
+    """
+    torch.set_num_threads(1)
+    # Elsewhere, of an agent's own volumes only those matter that its reward is fitted to.
+    parts = ("training",) if data else PARTS
+    own = cache(partial(own_split, subject, parts))
+    groups = volume_groups(data, n_phantoms, own)
+    check(groups)
+    prepared = prepare(subject, groups, own, render_mode=render_mode)
+    notes = list(prepared.notes)
+    if data and subject.run:
+        notes += known_volumes(subject, groups)
+    if subject.run and subject.volumes is None and own.cache_info().currsize:
+        notes.append("the run has not kept fingerprints of its volumes: nobody knows whether these are still the same")
+    for note in notes:
+        print(f"note: {note}")
+    return replace(prepared, notes=tuple(notes), data=data)
+
+
+def prepare(
+    subject: TrainedAgent, groups: Mapping[str, Volumes], own: Callable[[], Split], *, render_mode: str | None = None
+) -> PreparedAgent:
     """Make the agent and its environments on the volumes that it is evaluated on.
 
     Args:
         subject: the agent's configuration and weights.
         groups: the volumes, by what they are called.
-        training: the volumes that the agent was trained on; looked at only where its reward is fitted to them.
+        own: reads the agent's own volumes; called only where its reward is fitted to those that it was trained on.
         render_mode: Gymnasium render mode of the environments; default: None.
 
     Raises:
@@ -76,8 +113,10 @@ def prepare(
     trained = subject.domain
     agent = None
     for label, volumes in groups.items():
-        config = subject.config if trained is None else _seen_as_trained(subject.config, trained, volumes)
-        maker = make_env_factory(config, training)
+        config = subject.config
+        if trained is not None:
+            config = apply_crop(config, trained.slice_px, smallest_slice(volumes.values()))
+        maker = make_env_factory(config, TrainingVolumes(own))
         envs[label] = _env(maker, volumes, config.env.clustering, render_mode)
         here = TrainingDomain.of(envs[label])
         if subject.domain is not None:
@@ -90,12 +129,7 @@ def prepare(
             agent = make_agent(config, maker, volumes, total_env_steps=budget, seed=int(config.seed))
             _load_weights(agent, subject)
     assert agent is not None
-    return AgentEvaluator(agent, envs, tuple(notes))
-
-
-def _seen_as_trained(config: DictConfig, trained: TrainingDomain, volumes: Volumes) -> DictConfig:
-    """Return the configuration with images cropped as they were in training."""
-    return apply_crop(config, trained.slice_px, smallest_slice(volumes.values()))
+    return PreparedAgent(subject, agent, envs, tuple(notes))
 
 
 def _env(maker: EnvFactory, volumes: Volumes, clustering: object, render_mode: str | None) -> Env:

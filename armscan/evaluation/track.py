@@ -10,11 +10,11 @@ from typing import Any
 
 from armscan.config.defaults import to_plain
 from armscan.errors import InvalidValueError
-from armscan.evaluation.apply import AppliedAgent, file_name
 from armscan.evaluation.report import EvaluationReport
-from armscan.evaluation.volumes import data_name
+from armscan.evaluation.runner import PreparedAgent
+from armscan.evaluation.volumes import check_out, data_name, file_name
 from armscan.tracking import EVALUATED_TAG, TrackedRun, check_artifacts, deliver_pending, open_store
-from armscan.utils.files import atomic_write, check_writable
+from armscan.utils.files import atomic_write
 
 FOLDER, SUFFIX = Path("evaluations"), ".json"
 # Keys of the JSON file of every evaluation.
@@ -22,7 +22,7 @@ REPORT_KEYS = {"of", "name", "splits", "volumes", "episodes", "tracked_as"}
 
 
 def evaluate_and_track(
-    applied: AppliedAgent,
+    applied: PreparedAgent,
     store: Mapping[str, Any],
     *,
     n_episodes: int,
@@ -35,7 +35,7 @@ def evaluate_and_track(
     Args:
         applied: the agent on its volumes.
         store: the config section `tracking`; used for an agent without a run.
-        n_episodes: for each group of volumes.
+        n_episodes: number of episodes for each group of volumes.
         seed: seed of the first episode; the others follow from it.
         changes: rules of the episodes that differ from the agent's configuration.
         out: the JSON file. Default: a new one in `evaluations`.
@@ -47,12 +47,11 @@ def evaluate_and_track(
         ArmscanError: if the report cannot be written or tracked.
     """
     subject = applied.subject
+    _check_out(out)
     if subject.run is not None:
         client, experiment_id = subject.run.client, subject.run.experiment_id
         check_artifacts(client, experiment_id)
-        _check_out(out)
     else:
-        _check_out(out)
         client, experiment_id = open_store(**store)
     deliver_pending(client)
     of, data = subject.run.run_id if subject.run else subject.name, data_name(applied.data)
@@ -74,7 +73,7 @@ def evaluate_and_track(
         folder=FOLDER,
         parent_id=subject.run.run_id if subject.run else None,
     ) as tracked:
-        evaluations = applied.evaluator.evaluate(n_episodes, seed, tell=partial(print, flush=True))
+        evaluations = applied.evaluate(n_episodes, seed, tell=partial(print, flush=True))
         # An agent's own training and test volumes are never merged into one total.
         report = EvaluationReport(
             evaluations, has_total=applied.data is not None, facts={**facts, "tracked_as": tracked.run_id}
@@ -90,19 +89,12 @@ def evaluate_and_track(
 
 
 def _check_out(out: Path | None) -> None:
-    """Write where the JSON file will lie, before an evaluation that may take hours."""
+    """Look whether the JSON file can be written, and would replace nothing but an evaluation."""
     file = out or FOLDER / "evaluation.json"
     if file.suffix != SUFFIX:
         raise InvalidValueError(f"--out is {str(file)!r}, but it must be a file whose name ends with {SUFFIX}")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        check_writable(file)
-        is_other = out is not None and file.exists() and not _is_report(file)
-    except OSError as error:
-        raise InvalidValueError(
-            f"--out is {str(file)!r}, but no file can be written there: {error.strerror}"
-        ) from error
-    if is_other:
+    check_out(file, out, "file")
+    if out is not None and file.exists() and not _is_report(file):
         raise InvalidValueError(
             f"--out is {str(file)!r}, but that file is no evaluation, and would be lost: name another"
         )

@@ -7,23 +7,21 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
-from armscan.errors import InvalidValueError
-from armscan.evaluation.apply import AppliedAgent, file_name
-from armscan.evaluation.runner import FIRST_SEED
-from armscan.evaluation.volumes import data_name
+from armscan.evaluation.runner import FIRST_SEED, PreparedAgent
+from armscan.evaluation.volumes import check_out, data_name, file_name
 from armscan.training import TEST, VideoRecorder, outcome
-from armscan.utils.files import atomic_write, check_writable
+from armscan.utils.files import atomic_write
 
 FOLDER = Path("films")
 SUFFIXES = (".gif", ".mp4")
 
 
-def record_video(applied: AppliedAgent, *, n_episodes: int, seed: int, out: Path | None = None) -> list[Path]:
+def record_video(applied: PreparedAgent, *, n_episodes: int, seed: int, out: Path | None = None) -> list[Path]:
     """Record the episodes that an evaluation with the same seed plays, and print how each went.
 
     Args:
         applied: the agent on its volumes; of its own volumes, only the test volumes are shown.
-        n_episodes: for each group of volumes.
+        n_episodes: number of episodes for each group of volumes.
         seed: seed of the first episode; the others follow from it.
         out: the folder of the files. Default: `films`.
 
@@ -31,7 +29,7 @@ def record_video(applied: AppliedAgent, *, n_episodes: int, seed: int, out: Path
         The GIF and the MP4.
     """
     folder = out or FOLDER
-    _check_folder(folder)
+    check_out(folder / "video", folder, "video")
     subject = applied.subject
     which = [subject.run.run_id[:8]] if subject.run else []
     name = file_name("-".join([subject.name, data_name(applied.data), *which, f"seed{seed}"]))
@@ -45,8 +43,8 @@ def record_video(applied: AppliedAgent, *, n_episodes: int, seed: int, out: Path
     return files
 
 
-def _record(applied: AppliedAgent, n_episodes: int, seed: int, gif: Path, mp4: Path) -> None:
-    envs = applied.evaluator.envs
+def _record(applied: PreparedAgent, n_episodes: int, seed: int, gif: Path, mp4: Path) -> None:
+    envs = applied.envs
     shown = envs if applied.data else {TEST: envs[TEST]}
     with VideoRecorder(gif, mp4) as video:
         for label, env in shown.items():
@@ -54,17 +52,6 @@ def _record(applied: AppliedAgent, n_episodes: int, seed: int, gif: Path, mp4: P
             for number in range(n_episodes):
                 volume, title = names[number % len(names)], f"seed {seed + number}"
                 episode = video.capture(
-                    applied.evaluator.agent, env, volume_name=volume, seed=FIRST_SEED + seed + number, title=title
+                    applied.agent, env, volume_name=volume, seed=FIRST_SEED + seed + number, title=title
                 )
                 print(f"{label}: {volume}, {title}: {outcome(episode)}", flush=True)
-
-
-def _check_folder(folder: Path) -> None:
-    """Write where the video will lie, before the agent plays for it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        check_writable(folder / "video")
-    except OSError as error:
-        raise InvalidValueError(
-            f"--out is {str(folder)!r}, but no video can be written there: {error.strerror}"
-        ) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +14,7 @@ from armscan.config.error_messages import one_line_message
 from armscan.errors import InvalidValueError
 from armscan.evaluation.agent_source import TrainedAgent
 from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged, fingerprint
+from armscan.utils.files import check_writable
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 
@@ -26,7 +28,7 @@ def own_split(subject: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
 
     Args:
         subject: the agent.
-        parts: of the split that matter: in these the volumes of a run must still be those that it was started with.
+        parts: parts of the split that matter: in these the volumes of a run must be those that it was started with.
 
     Raises:
         ChangedVolumesError: if they are not.
@@ -73,6 +75,25 @@ def data_name(data: str | None) -> str:
     return "own volumes" if data is None else Path(data).resolve().name
 
 
+def file_name(text: str) -> str:
+    """Return a text as a file can be named by it."""
+    return re.sub(r"[^\w.\-]+", "-", text)
+
+
+def check_out(file: Path, out: Path | None, what: str) -> None:
+    """Write where a file will lie, before the agent plays for hours.
+
+    Raises:
+        InvalidValueError: if none can be written there; it names `--out` and `what` would be written.
+    """
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(file)
+    except OSError as error:
+        named = str(out or file)
+        raise InvalidValueError(f"--out is {named!r}, but no {what} can be written there: {error.strerror}") from error
+
+
 def known_volumes(subject: TrainedAgent, groups: Mapping[str, Volumes]) -> list[str]:
     """Return a sentence for each purpose that an agent's run has had these volumes for, or others of these names.
 
@@ -102,11 +123,7 @@ def known_volumes(subject: TrainedAgent, groups: Mapping[str, Volumes]) -> list[
 
 
 class TrainingVolumes(Mapping[str, LabelVolume]):
-    """The training volumes, which are not read before somebody looks at them: only some rewards do.
-
-    Args:
-        load: reads the volumes of a run.
-    """
+    """The training volumes, which `load` does not read before somebody looks at them: only some rewards do."""
 
     def __init__(self, load: Callable[[], Split]) -> None:
         self._load = load

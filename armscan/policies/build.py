@@ -43,11 +43,11 @@ def save_policy(agent: Learner, env: Env, tracked: TrackedRun, folder: Path, tel
     What cannot be kept stops no run: it is told, and noted in a tag.
 
     Args:
-        agent: of the run.
-        env: that the agent can act in.
+        agent: agent of the run.
+        env: environment that the agent can act in.
         tracked: the run.
-        folder: of the run, with its configuration.
-        tell: hears why the policy is not kept.
+        folder: folder of the run, with its configuration.
+        tell: called with the reason, where the policy is not kept.
     """
     config = yaml.safe_load((folder / CONFIG_FILE).read_bytes())
     # Runs of earlier versions say nothing of it.
@@ -76,9 +76,9 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
 
     Args:
         agent: which has learned.
-        env: that it can act in.
-        folder: of the model.
-        facts: about it.
+        env: environment that it can act in.
+        folder: folder of the model.
+        facts: what stays with the model; see `facts_of`.
 
     Raises:
         ExportError: if the policy cannot be written down, or the model does not answer as the agent does.
@@ -107,9 +107,9 @@ def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]
     """Return what stays with a model: where it comes from, what it has seen, what its actions stand for.
 
     Args:
-        config: resolved, of the run.
-        env: as it is in the configuration.
-        run_id: of the run.
+        config: resolved configuration of the run.
+        env: environment of the configuration.
+        run_id: MLflow run ID.
     """
     rules = config["env"]
     turns = dict(zip(("rz", "rx"), rules["rotation_bounds_deg"], strict=True))

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import mlflow.pyfunc
-import numpy as np
 import torch
 import yaml
-from mlflow.models import ModelSignature
-from mlflow.types import Schema, TensorSpec
+from mlflow.models import infer_signature
 from numpy.typing import NDArray
 
 from armscan.agents.policy import Batch, Policy
@@ -45,10 +43,10 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
     """Write a policy as a model, with an ONNX file beside it.
 
     Args:
-        folder: of the model, which is not there yet.
-        policy: of a learner.
+        folder: folder of the model, which is not there yet.
+        policy: policy of a learner.
         batch: two observations or more, which show their shapes; two of them stay with the model as its example.
-        facts: about the policy, which stay with the model; plain values.
+        facts: facts about the policy, which stay with the model; plain values.
 
     Raises:
         ExportError: if torch.export or ONNX cannot take the policy.
@@ -61,7 +59,7 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
             folder,
             python_model=str(CODE),
             artifacts={"program": str(file)},
-            signature=_signature(arrays_of(batch), arrays_of(policy(batch))),
+            signature=infer_signature(arrays_of(batch), arrays_of(policy(batch))),
             input_example=_first(2, arrays_of(batch)),
             pip_requirements=[f"{name}=={_release(name)}" for name in REQUIREMENTS],
             metadata=dict(facts),
@@ -104,13 +102,3 @@ def _release(name: str) -> str:
 
 def _first(n: int, arrays: Arrays) -> Arrays:
     return {name: part[:n] for name, part in arrays.items()} if isinstance(arrays, dict) else arrays[:n]
-
-
-def _signature(observations: Arrays, actions: Arrays) -> ModelSignature:
-    """Of batches of every size."""
-    return ModelSignature(inputs=_schema(observations), outputs=_schema(actions))
-
-
-def _schema(arrays: Arrays) -> Schema:
-    parts = arrays if isinstance(arrays, dict) else {None: arrays}
-    return Schema([TensorSpec(np.dtype(part.dtype), (-1, *part.shape[1:]), name) for name, part in parts.items()])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import wrap
 from typing import Any
@@ -12,9 +12,8 @@ from plotly.colors import hex_to_rgb, qualitative
 from plotly.graph_objects import Figure
 from plotly.subplots import make_subplots
 
-from armscan.reports.curves import AXES, Curve
+from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
-from armscan.reports.significance import evaluated_trainings
 from armscan.training import MetricEstimates
 from armscan.volumes.plane import FloatArray
 
@@ -42,7 +41,7 @@ class Trace:
 
     Args:
         kind: one of `BANDS` and `SEEDS`, or nothing where it is of the whole group.
-        look: of the line.
+        look: Plotly's arguments of the line.
         over: its points over each of `AXES`.
     """
 
@@ -58,13 +57,7 @@ def colours(n: int) -> list[str]:
 
 
 def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str, str]) -> Figure:
-    """Return figures below each other, with switches for the axis and for the lines of single seeds.
-
-    Args:
-        groups: in their order.
-        curves: of the figures.
-        titles: of the figures that are drawn, by name.
-    """
+    """Return the figures of `titles` below each other, with switches for the axis and for the lines of single seeds."""
     entry_px = SAMPLE_PX + LETTER_PX * max(len(group.label) for group in groups)
     legend_px = LEGEND_ROW_PX * math.ceil(len(groups) / max(1, LEGEND_PX // entry_px))
     shown = "bands and seeds" if len(groups) <= MANY else "neither"
@@ -72,7 +65,7 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
     traces: list[Trace] = []
     for row, (name, title) in enumerate(titles.items(), start=1):
         for number, (group, colour) in enumerate(zip(groups, colours(len(groups)), strict=True)):
-            of_axes = [curves.get((name, axis, number)) for axis in AXES]
+            of_axes = [curves.get((name, axis, number), NOTHING) for axis in AXES]
             for trace in _traces(of_axes, colour):
                 figure.add_scatter(
                     **trace.look, **trace.over[0], name=group.label, legendgroup=str(number), row=row, col=1
@@ -104,12 +97,7 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
 
 
 def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Figure:
-    """Return the final figures of all groups with their intervals, and beside them those of single seeds.
-
-    Args:
-        groups: in their order.
-        reached: by each of them.
-    """
+    """Return what each group has reached at the end, with its interval, and beside it what single seeds have."""
     figure = make_subplots(rows=1, cols=len(FINAL), shared_yaxes=True, horizontal_spacing=0.04)
     for column, (name, title) in enumerate(FINAL.items(), start=1):
         here = {"mode": "markers", "showlegend": False, "row": 1, "col": column}
@@ -117,13 +105,11 @@ def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
             if figures is None:
                 continue
             value, low, high = figures.estimates[name]
-            seeds = [
-                (each.label, each.evaluation.metrics()[name]) for each in evaluated_trainings(group) if each.evaluation
-            ]
+            seeds = {each.label: each.evaluation.metrics()[name] for each in group.trainings if each.evaluation}
             figure.add_scatter(
-                x=[of_seed for _, of_seed in seeds],
+                x=list(seeds.values()),
                 y=[_wrapped(group.label)] * len(seeds),
-                text=[label for label, _ in seeds],
+                text=list(seeds),
                 hovertemplate="%{text}: %{x}<extra></extra>",
                 marker={"color": colour, "opacity": 0.45, "size": 8},
                 **here,
@@ -142,24 +128,22 @@ def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
     return figure.update_layout(height=height, margin={"t": 20, "b": 50, "l": 10, "r": 20}, template="plotly_white")
 
 
-def _traces(of_axes: Sequence[Curve | None], colour: str) -> Iterator[Trace]:
+def _traces(of_axes: Sequence[Curve], colour: str) -> Iterator[Trace]:
     """Yield the band, the lines of the seeds, and the line of all of them together."""
     curve = of_axes[0]
-    if curve is None:
-        return
     if curve.n_seeds > 1:
         unseen = {"mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
         faint = "rgba({}, {}, {}, 0.2)".format(*hex_to_rgb(colour))
-        yield Trace(BANDS, unseen, [_points(each, "lows") for each in of_axes])
-        yield Trace(
-            BANDS, unseen | {"fill": "tonexty", "fillcolor": faint}, [_points(each, "highs") for each in of_axes]
-        )
+        yield Trace(BANDS, unseen, [_points(each.places, each.band.lows) for each in of_axes])
+        filled = unseen | {"fill": "tonexty", "fillcolor": faint}
+        yield Trace(BANDS, filled, [_points(each.places, each.band.highs) for each in of_axes])
         thin = {"line": {"color": colour, "width": 1}, "opacity": 0.5}
-        for label in curve.lines:
-            said = {"mode": _mode(*curve.lines[label][:1]), "hovertemplate": f"%{{y:.3g}} ({label})"}
-            yield Trace(SEEDS, thin | said, [_line(each, label) for each in of_axes])
-    thick = {"mode": _mode(curve.places), "line": {"color": colour, "width": 2.5}, "hovertemplate": "%{text}"}
-    yield Trace("", thick, [_points(each, "values") | {"text": _said(each)} for each in of_axes])
+        for label, (places, _) in curve.lines.items():
+            said = {"mode": _mode(places), "hovertemplate": f"%{{y:.3g}} ({label})"}
+            yield Trace(SEEDS, thin | said, [_points(*each.lines.get(label, ((), ()))) for each in of_axes])
+    if curve.n_seeds:
+        thick = {"mode": _mode(curve.places), "line": {"color": colour, "width": 2.5}, "hovertemplate": "%{text}"}
+        yield Trace("", thick, [_points(each.places, each.band.values) | {"text": _said(each)} for each in of_axes])
 
 
 def _mode(places: FloatArray) -> str:
@@ -167,21 +151,14 @@ def _mode(places: FloatArray) -> str:
     return "lines" if len(places) > 1 else "lines+markers"
 
 
-def _points(curve: Curve | None, which: str) -> Points:
-    return {"x": curve.places.tolist(), "y": getattr(curve.band, which).tolist()} if curve else {"x": [], "y": []}
+def _points(places: Iterable[float], values: Iterable[float]) -> Points:
+    return {"x": [float(place) for place in places], "y": [float(value) for value in values]}
 
 
-def _line(curve: Curve | None, label: str) -> Points:
-    if curve is None or label not in curve.lines:
-        return {"x": [], "y": []}
-    places, values = curve.lines[label]
-    return {"x": places.tolist(), "y": values.tolist()}
-
-
-def _said(curve: Curve | None) -> list[str]:
+def _said(curve: Curve) -> list[str]:
     """Return what is said of each place of a curve."""
-    if curve is None or curve.n_seeds == 1:
-        return [f"{value:.3g} (one seed)" for value in curve.band.values] if curve else []
+    if curve.n_seeds == 1:
+        return [f"{value:.3g} (one seed)" for value in curve.band.values]
     return [f"{value:.3g} ({low:.3g} to {high:.3g})" for value, low, high in zip(*curve.band, strict=True)]
 
 
@@ -194,13 +171,10 @@ def _axis_switch(traces: Sequence[Trace], n_rows: int) -> dict[str, Any]:
     last = f"xaxis{n_rows if n_rows > 1 else ''}"
     buttons = []
     for number, axis in enumerate(AXES):
-        points: dict[str, list[Any]] = {
-            key: [trace.over[number].get(key) for trace in traces] for key in ("x", "y", "text")
-        }
+        points = {key: [trace.over[number].get(key) for trace in traces] for key in ("x", "y", "text")}
         scale = {f"xaxis{row if row > 1 else ''}.autorange": True for row in range(1, n_rows + 1)}
-        buttons.append(
-            {"label": f"by {axis}", "method": "update", "args": [points, scale | {f"{last}.title.text": axis}]}
-        )
+        changes: list[Any] = [points, scale | {f"{last}.title.text": axis}]
+        buttons.append({"label": f"by {axis}", "method": "update", "args": changes})
     return _switch(buttons, active=0, x=0.0)
 
 

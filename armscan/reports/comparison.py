@@ -62,10 +62,10 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     """Write the report.
 
     Args:
-        groups: that are compared.
+        groups: groups that are compared.
         left_out: trainings that repeat another one.
-        title: of the page.
-        folder: takes `report.html` and the CSV files.
+        title: title of the page.
+        folder: folder that takes `report.html` and the CSV files.
 
     Returns:
         The HTML file.
@@ -102,13 +102,12 @@ def _figures(groups: Sequence[Group]) -> list[str]:
 
 def _summary(groups: Sequence[Group]) -> str:
     n_trainings = sum(len(group.trainings) for group in groups)
-    rows = [{"group": group.title, "seeds": ", ".join(_seeds(group.trainings))} for group in groups]
+    rows = [
+        {"group": group.title, "seeds": ", ".join(each.seed or each.label for each in group.trainings)}
+        for group in groups
+    ]
     counted = f"{n_trainings} runs in {len(groups)} group{'s' if len(groups) > 1 else ''}"
     return f"<p>{counted}: those of a group differ by nothing but the seed.</p>{table(rows)}"
-
-
-def _seeds(trainings: Sequence[TrackedTraining]) -> list[str]:
-    return [training.seed if training.seed is not None else training.label for training in trainings]
 
 
 def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
@@ -123,7 +122,7 @@ def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
 def _of_the_training(groups: Sequence[Group], curves: Curves, figures: Sequence[str]) -> Iterator[str]:
     if figures:
         drawn = chart(learning_curves(groups, curves, {name: name.partition("/")[2] for name in figures}))
-        summary = "<summary>MetricEstimates of the training itself: losses, returns, speed</summary>"
+        summary = "<summary>Metrics of the training itself: losses, returns, speed</summary>"
         yield f'<details ontoggle="{FITTED}">{summary}{drawn}</details>'
 
 

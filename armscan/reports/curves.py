@@ -25,10 +25,10 @@ class Curve:
     """A figure of a group over an axis.
 
     Args:
-        places: on the axis, ascending.
-        band: over the seeds at these places.
-        n_seeds: that it is of.
-        lines: of each seed, by its label: places and values, as they were measured.
+        places: places on the axis, ascending.
+        band: mean and interval over the seeds at these places.
+        n_seeds: number of its seeds.
+        lines: the line of each seed, by its label: places and values, as they were measured.
     """
 
     places: FloatArray
@@ -37,17 +37,16 @@ class Curve:
     lines: dict[str, tuple[FloatArray, FloatArray]]
 
 
+NOTHING = Curve(np.empty(0), Band(*[np.empty(0)] * 3), 0, {})
+"""What stands where no training has measured the figure over an axis."""
+
+
 def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
-    """Return the curve of a group; None where none of its trainings has measured the figure.
+    """Return the curve of a group over one of `AXES`; None where none of its trainings has measured the figure.
 
     Between two validations a seed's line is straight. A training that has run to its end is carried on with its last
     value for as long as others of its group go on; where one has not, the curve ends with it. It begins where all are
     known.
-
-    Args:
-        group: of trainings.
-        figure: its name.
-        axis: one of `AXES`.
     """
     trainings = [training for training in group.trainings if figure in training.series]
     lines = [_line(training.series[figure], axis) for training in trainings]

@@ -26,10 +26,10 @@ class Group:
     """Trainings with the same configuration.
 
     Args:
-        number: from 1.
+        number: number of the group, from 1.
         name: the keys by which it differs from the other groups.
         label: number and name, short enough for a legend.
-        trainings: each with another seed.
+        trainings: its trainings, each with another seed.
     """
 
     number: int

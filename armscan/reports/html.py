@@ -52,10 +52,10 @@ def write_page(folder: Path, title: str, parts: Sequence[str], tables: Mapping[s
     """Write a report.
 
     Args:
-        folder: takes `report.html` and the CSV files.
-        title: of the page.
-        parts: HTML, one below the other.
-        tables: by the names of their files; each row's values by column.
+        folder: folder that takes `report.html` and the CSV files.
+        title: title of the page.
+        parts: pieces of HTML, one below the other.
+        tables: rows by the names of their files; each row's values by column.
 
     Returns:
         The HTML file.

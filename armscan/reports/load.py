@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from mlflow.entities import Run
@@ -30,8 +30,7 @@ VALIDATION = {
 OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
 BUDGET = "training.env_steps"
 CHOICE = "choice."
-# In the fingerprints of a run's volumes.
-TEST_PART = "test"
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -39,9 +38,9 @@ class Series:
     """How a figure went, one value for each epoch.
 
     Args:
-        env_steps: at the end of each epoch, ascending, shape (epochs,).
+        env_steps: environment steps at the end of each epoch, ascending, shape (epochs,).
         wall_s: seconds of the training by then, NaN where they are not known.
-        values: of the figure.
+        values: values of the figure.
     """
 
     env_steps: FloatArray
@@ -54,15 +53,15 @@ class TrackedTraining:
     """One training.
 
     Args:
-        run_id: of its run.
-        name: of its run.
-        status: of its run.
-        started_ms: when it was started.
+        run_id: MLflow run ID.
+        name: name of the run.
+        status: status of the run, in small letters; `pruned` if its trial was.
+        started_ms: time of its start, in ms since 1970.
         is_whole: whether it has run to its end; not where it was pruned, fails, or is still running.
         params: its configuration, leaves by dotted keys.
         choices: what was chosen of each group of the configuration.
-        series: by the name of the figure.
-        evaluation: on the test volumes, None where it has kept none.
+        series: its curves by the name of the figure.
+        evaluation: final evaluation on the test volumes, None where it has kept none.
         volumes: fingerprints of its test volumes by name, None where it has kept none.
         video: an episode as an animated GIF, None where it has kept none.
     """
@@ -97,12 +96,12 @@ class TrackedTraining:
     @property
     def env_steps(self) -> float:
         """That it has taken by its last validation; NaN where it has none, or nothing was to be learned."""
-        return self._last(lambda series: series.env_steps)
+        return self._last("env_steps")
 
     @property
     def wall_s(self) -> float:
         """Seconds that it took until then."""
-        return self._last(lambda series: series.wall_s)
+        return self._last("wall_s")
 
     @property
     def missing(self) -> list[str]:
@@ -110,8 +109,8 @@ class TrackedTraining:
         kept = {EVALUATION_FILE: self.evaluation, VIDEO_FILE: self.video}
         return [name for name, contents in kept.items() if contents is None]
 
-    def _last(self, of: Any) -> float:
-        ends = [float(of(each)[-1]) for name, each in self.series.items() if name in VALIDATION]
+    def _last(self, axis: str) -> float:
+        ends = [float(getattr(each, axis)[-1]) for name, each in self.series.items() if name in VALIDATION]
         return max(ends, default=float("nan"))
 
 
@@ -119,9 +118,9 @@ def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> Tr
     """Return what a run says of a training.
 
     Args:
-        store: that it is in.
+        store: the store that it is in.
         found: the run.
-        folder: takes its files.
+        folder: new folder that takes its files.
 
     Raises:
         TrackingError: if a file of it is damaged, or the store cannot be used.
@@ -130,8 +129,8 @@ def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> Tr
     folder.mkdir()
     with store_errors(store.uri):
         series = _series(store, run)
-        files = _Files(store, run, folder)
-        video, evaluation, volumes = files.contents(VIDEO_FILE), files.evaluation(), files.test_volumes()
+        files = _files(store, run, folder)
+    evaluation = _parsed(run, files, EVALUATION_FILE, lambda contents: Evaluation.of_plain(contents[TEST]["episodes"]))
     params = migrate(run.data.params)
     n_env_steps = max((each.env_steps[-1] for name, each in series.items() if name in VALIDATION), default=0.0)
     is_cut = found.is_pruned and n_env_steps < float(params.get(BUDGET, "inf"))
@@ -144,9 +143,9 @@ def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> Tr
         params=params,
         choices={tag.removeprefix(CHOICE): value for tag, value in sorted(tags.items()) if tag.startswith(CHOICE)},
         series=series,
-        evaluation=evaluation,
-        volumes=volumes,
-        video=video,
+        evaluation=evaluation if evaluation and evaluation.episodes else None,
+        volumes=_parsed(run, files, VOLUMES_FILE, lambda contents: dict(contents["test"])),
+        video=files.get(VIDEO_FILE),
     )
 
 
@@ -165,38 +164,23 @@ def _history(store: TrackingStore, run: Run, name: str) -> dict[int, float]:
     return {point.step: point.value for point in store.get_metric_history(run.info.run_id, name)}
 
 
-class _Files:
-    """The files that a run has kept."""
+def _files(store: TrackingStore, run: Run, folder: Path) -> dict[str, bytes]:
+    """Return the files that a run has kept of those that a comparison needs."""
+    names = {artifact.path for artifact in store.list_artifacts(run.info.run_id)}
+    return {
+        name: Path(store.download_artifacts(run.info.run_id, name, str(folder))).read_bytes()
+        for name in names & {EVALUATION_FILE, VIDEO_FILE, VOLUMES_FILE}
+    }
 
-    def __init__(self, store: TrackingStore, run: Run, folder: Path) -> None:
-        self._store, self._run, self._folder = store, run, folder
-        self._names = {artifact.path for artifact in store.list_artifacts(run.info.run_id)}
 
-    def contents(self, name: str) -> bytes | None:
-        if name not in self._names:
-            return None
-        return Path(self._store.download_artifacts(self._run.info.run_id, name, str(self._folder))).read_bytes()
-
-    def evaluation(self) -> Evaluation | None:
-        """Return the final evaluation on the test volumes."""
-        if (contents := self.contents(EVALUATION_FILE)) is None:
-            return None
-        try:
-            evaluation = Evaluation.of_plain(json.loads(contents)[TEST]["episodes"])
-        except (ValueError, TypeError, KeyError) as error:
-            raise self._damaged(EVALUATION_FILE) from error
-        return evaluation if evaluation.episodes else None
-
-    def test_volumes(self) -> dict[str, str] | None:
-        """Return the fingerprints of the test volumes."""
-        if (contents := self.contents(VOLUMES_FILE)) is None:
-            return None
-        if sha256(contents) != self._run.data.tags.get(SHA256_TAGS[VOLUMES_FILE], sha256(contents)):
-            raise self._damaged(VOLUMES_FILE)
-        try:
-            return dict(json.loads(contents)[TEST_PART])
-        except (ValueError, TypeError, KeyError) as error:
-            raise self._damaged(VOLUMES_FILE) from error
-
-    def _damaged(self, name: str) -> TrackingError:
-        return TrackingError(f"run {self._run.info.run_id}: its {name} is damaged; put it back, or leave the run out")
+def _parsed(run: Run, files: Mapping[str, bytes], name: str, read: Callable[[Any], T]) -> T | None:
+    """Return what a file of a run says, None where it has kept none."""
+    if (contents := files.get(name)) is None:
+        return None
+    damaged = TrackingError(f"run {run.info.run_id}: its {name} is damaged; put it back, or leave the run out")
+    if run.data.tags.get(SHA256_TAGS.get(name, ""), digest := sha256(contents)) != digest:
+        raise damaged
+    try:
+        return read(json.loads(contents))
+    except (ValueError, TypeError, KeyError) as error:
+        raise damaged from error

@@ -11,13 +11,7 @@ from armscan.stats.aggregation import FEWEST_SEEDS
 
 
 def notes_on(groups: Sequence[Group], left_out: Sequence[TrackedTraining], *, has_other_volumes: bool) -> str:
-    """Return the notes as a list, nothing where there are none.
-
-    Args:
-        groups: that are compared.
-        left_out: trainings that repeat another one.
-        has_other_volumes: whether some groups were judged on other volumes than others.
-    """
+    """Return the notes as a list, nothing where there are none; `left_out` are trainings that repeat another one."""
     notes = [
         *_on_seeds(groups),
         *_on_unfinished(groups),
@@ -48,7 +42,7 @@ def _on_unfinished(groups: Sequence[Group]) -> Iterator[str]:
     unfinished = [(group, training) for group in groups for training in group.trainings if not training.is_whole]
     if unfinished:
         which = [f"{_named(group, training)}: {training.status}" for group, training in unfinished]
-        yield f"Not run to the end, and here with what they have: {_listed(which)}."
+        yield f"Not run to the end, and here with what they have: {'; '.join(which)}."
 
 
 def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
@@ -59,7 +53,7 @@ def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
             for file in training.missing if training.is_whole else ():
                 of_files.setdefault(file, []).append(_named(group, training))
     for file, which in of_files.items():
-        yield f"No {file} is among the artifacts of {_listed(which)}."
+        yield f"No {file} is among the artifacts of {'; '.join(which)}."
 
 
 def _on_rules(groups: Sequence[Group], *, has_other_volumes: bool) -> Iterator[str]:
@@ -80,7 +74,3 @@ def _numbered(numbers: Sequence[int], groups: Sequence[Group]) -> str:
     if len(numbers) == len(groups):
         return "All groups"
     return f"Group{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return "; ".join(names)

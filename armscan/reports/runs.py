@@ -12,8 +12,8 @@ from pathlib import Path
 from armscan.reports.comparison import write_comparison
 from armscan.reports.groups import group_trainings
 from armscan.reports.load import read_training
-from armscan.reports.select import find_trainings, label_of, read_runs
-from armscan.tracking import TrackingStore, open_existing_store
+from armscan.reports.select import EXPERIMENT, ID_CHARS, find_trainings, read_runs
+from armscan.tracking import open_existing_store
 
 REPORTS = Path("reports")
 # A folder of more runs than fit is named by a sum of them.
@@ -25,8 +25,8 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
 
     Args:
         text: what names them; see `read_runs`.
-        uri: of the store that they are in.
-        out: takes the report; None for a folder in `reports` that is named after the runs.
+        uri: address of the store that they are in.
+        out: folder that takes the report; None for a folder in `reports` that is named after the runs.
 
     Returns:
         The HTML file.
@@ -44,10 +44,10 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
         trainings = [read_training(store, each, Path(folder) / each.run.info.run_id) for each in found]
     groups, left_out = group_trainings(trainings)
     title = f"Runs {', '.join(named)}" if len(", ".join(named)) <= MAX_NAME_CHARS else f"{len(trainings)} runs"
-    return write_comparison(groups, left_out, title, Path(out) if out else REPORTS / _folder_name(store, named))
+    return write_comparison(groups, left_out, title, Path(out) if out else REPORTS / _folder_name(named))
 
 
-def _folder_name(store: TrackingStore, named: Sequence[str]) -> str:
-    labels = [label_of(store, name) for name in named]
+def _folder_name(named: Sequence[str]) -> str:
+    labels = [name.removeprefix(EXPERIMENT) if name.startswith(EXPERIMENT) else name[:ID_CHARS] for name in named]
     name = re.sub(r"[^\w.\-]+", "-", "-".join(["runs", *labels]))
     return name if len(name) <= MAX_NAME_CHARS else f"runs-{hashlib.sha256(name.encode()).hexdigest()[:SUM_CHARS]}"

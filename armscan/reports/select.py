@@ -27,7 +27,7 @@ class SelectedRuns:
     """A training that was found.
 
     Args:
-        run: its run.
+        run: run of the training.
         is_pruned: whether it is of a trial that was pruned.
     """
 
@@ -53,53 +53,44 @@ def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[SelectedR
     """Return the trainings that are meant, each once: in the order in which they are named, and then were started.
 
     Args:
-        store: that they are in.
-        named: ids or their beginnings, of trainings or of their parents, or whole experiments; see `read_runs`.
+        store: the store that they are in.
+        named: IDs or their beginnings, of trainings or of their parents, or whole experiments; see `read_runs`.
 
     Raises:
         TrackingError: if one of them is not found, is an evaluation, or there is no training in it.
     """
-    found: dict[str, SelectedRuns] = {}
+    found: dict[str, Run] = {}
     with store_errors(store.uri):
         for name in named:
             trainings = _in_experiment(store, name) if name.startswith(EXPERIMENT) else _meant(store, name)
-            found |= {training.run.info.run_id: training for training in trainings}
-    return list(found.values())
+            found |= {run.info.run_id: run for run in trainings}
+        return [_selected(store, run) for run in found.values()]
 
 
-def label_of(store: TrackingStore, named: str) -> str:
-    """Return a name for what was named that does not depend on how the IDs were abbreviated."""
-    if named.startswith(EXPERIMENT):
-        return named.removeprefix(EXPERIMENT)
-    with store_errors(store.uri):
-        return str(find_run(store, named).info.run_id[:ID_CHARS])
-
-
-def _meant(store: TrackingStore, name: str) -> list[SelectedRuns]:
+def _meant(store: TrackingStore, name: str) -> list[Run]:
     run = find_run(store, name)
     if EVALUATED_TAG in run.data.tags:
         raise TrackingError(
             f"run {run.info.run_id} is an evaluation, but runs are compared: give the run that it is of"
         )
-    trainings = list(_below(store, run, is_pruned=False))
+    trainings = list(_below(store, run))
     if not trainings:
         raise TrackingError(
             f"run {run.info.run_id} ({run.info.run_name}) is no training of armscan, and has none below it"
         )
-    return [_checked(store, training) for training in trainings]
+    return trainings
 
 
-def _below(store: TrackingStore, run: Run, *, is_pruned: bool) -> Iterator[SelectedRuns]:
+def _below(store: TrackingStore, run: Run) -> Iterator[Run]:
     """Yield a run if it is a training, else those of its jobs, trials and seeds."""
     if OF_A_TRAINING in run.data.tags:
-        yield SelectedRuns(run, is_pruned)
+        yield run
         return
-    pruned = PRUNED_TAG in run.data.tags
-    for child in _runs(store, run.info.experiment_id, f"tags.{_quoted(PARENT_TAG)} = '{run.info.run_id}'"):
-        yield from _below(store, child, is_pruned=pruned)
+    for child in _runs(store, run.info.experiment_id, f"tags.`{PARENT_TAG}` = '{run.info.run_id}'"):
+        yield from _below(store, child)
 
 
-def _in_experiment(store: TrackingStore, name: str) -> list[SelectedRuns]:
+def _in_experiment(store: TrackingStore, name: str) -> list[Run]:
     wanted = name.removeprefix(EXPERIMENT)
     experiment = store.get_experiment_by_name(wanted)
     if experiment is None or experiment.lifecycle_stage != "active":
@@ -109,16 +100,15 @@ def _in_experiment(store: TrackingStore, name: str) -> list[SelectedRuns]:
     trainings = [run for run in _runs(store, experiment.experiment_id) if OF_A_TRAINING in run.data.tags]
     if not trainings:
         raise TrackingError(f"the experiment is {wanted!r}, but in {store.uri!r} it has no training of armscan")
-    return [_checked(store, SelectedRuns(run, is_pruned=False)) for run in trainings]
+    return trainings
 
 
-def _checked(store: TrackingStore, training: SelectedRuns) -> SelectedRuns:
-    """Return a training with whether its trial was pruned; each that is meant comes by here, however it was named."""
-    check_version(training.run)
-    tags = training.run.data.tags
-    if TRIAL_TAG not in tags or training.is_pruned or PARENT_TAG not in tags:
-        return training
-    return SelectedRuns(training.run, PRUNED_TAG in store.get_run(tags[PARENT_TAG]).data.tags)
+def _selected(store: TrackingStore, run: Run) -> SelectedRuns:
+    """Return a training with whether its trial was pruned."""
+    check_version(run)
+    tags = run.data.tags
+    is_of_trial = TRIAL_TAG in tags and PARENT_TAG in tags
+    return SelectedRuns(run, is_of_trial and PRUNED_TAG in store.get_run(tags[PARENT_TAG]).data.tags)
 
 
 def _runs(store: TrackingStore, experiment_id: str, condition: str = "") -> Iterator[Run]:
@@ -130,7 +120,3 @@ def _runs(store: TrackingStore, experiment_id: str, condition: str = "") -> Iter
         yield from page
         if not (token := page.token):
             return
-
-
-def _quoted(tag: str) -> str:
-    return f"`{tag}`"

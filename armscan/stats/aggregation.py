@@ -48,8 +48,8 @@ def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
     """Return the mean over seeds and volumes, with an interval that draws seeds, each with all its volumes.
 
     Args:
-        scores: shape (seeds, volumes).
-        mean: see `mean_for`.
+        scores: scores, shape (seeds, volumes).
+        mean: how values are put together; see `mean_for`.
         seed: seed of the resamples; default: 0.
 
     Returns:
@@ -58,17 +58,16 @@ def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
     value = float(mean(scores))
     if len(scores) < 2 or np.isnan(scores).any():
         return Estimate(value, np.nan, np.nan)
-    low, high = _ends((np.arange(len(scores)),), lambda drawn: mean(scores[drawn]), seed, vectorized=False)
+    low, high = _ends((np.arange(len(scores)),), lambda drawn: mean(scores[drawn]), seed=seed, vectorized=False)
     return Estimate(value, float(low), float(high))
 
 
-def band_over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Band:
+def band_over_seeds(scores: FloatArray, mean: Mean) -> Band:
     """Return the mean over the seeds at each point, with an interval; a resample has the same seeds at all points.
 
     Args:
-        scores: shape (seeds, points), all finite.
-        mean: see `mean_for`.
-        seed: of the resamples.
+        scores: scores, shape (seeds, points), all finite.
+        mean: how values are put together; see `mean_for`.
 
     Returns:
         The band, without an interval where there is one seed.
@@ -77,20 +76,19 @@ def band_over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Band:
     if len(scores) < 2 or not scores.size:
         return Band(values, *(np.full(len(values), np.nan) for _ in range(2)))
     at_once = max(1, MOST_VALUES // scores.size)
-    low, high = _ends((scores,), mean, seed, vectorized=True, axis=0, batch=at_once)
+    low, high = _ends((scores,), mean, vectorized=True, axis=0, batch=at_once)
     return Band(values, np.asarray(low), np.asarray(high))
 
 
-def probability_of_improvement(ours: FloatArray, theirs: FloatArray, *, seed: int = 0) -> Estimate:
+def probability_of_improvement(ours: FloatArray, theirs: FloatArray) -> Estimate:
     """Return how likely a training of ours is better than one of theirs on the same volume, averaged over the volumes.
 
     The share of pairs of seeds in which ours is greater, where ties count half: the statistic of Mann and Whitney. The
     interval draws each seed with all its volumes, because one training was judged on all of them.
 
     Args:
-        ours: shape (seeds, volumes), greater is better, all finite.
-        theirs: shape (seeds, the same volumes).
-        seed: seed of the resamples; default: 0.
+        ours: our scores, shape (seeds, volumes), greater is better, all finite.
+        theirs: their scores, shape (seeds, the same volumes).
 
     Returns:
         The estimate, without an interval where either has one seed.
@@ -114,11 +112,11 @@ def probability_of_improvement(ours: FloatArray, theirs: FloatArray, *, seed: in
 
     drawn = tuple(np.arange(n) for n in wins.shape)
     at_once = max(1, MOST_VALUES // wins.size)
-    low, high = _ends(drawn, of_drawn, seed, vectorized=True, axis=-1, batch=at_once)
+    low, high = _ends(drawn, of_drawn, vectorized=True, axis=-1, batch=at_once)
     return Estimate(value, float(low), float(high))
 
 
-def _ends(samples: tuple[NDArray[Any], ...], statistic: Mean, seed: int, **how: Any) -> tuple[Any, Any]:
+def _ends(samples: tuple[NDArray[Any], ...], statistic: Mean, *, seed: int = 0, **how: Any) -> tuple[Any, Any]:
     how |= {"n_resamples": N_RESAMPLES, "confidence_level": LEVEL, "method": "percentile"}
     interval = bootstrap(samples, statistic, rng=np.random.default_rng(seed), **how).confidence_interval
     return interval.low, interval.high

@@ -72,10 +72,10 @@ def estimates(
     """Return figures with their intervals, by name; all of them from the same resamples.
 
     Args:
-        columns: by the name of the figure, its statistic and the value of each episode, NaN for those left out.
+        columns: by the name of each figure its statistic and the value of each episode, NaN for those left out.
         volumes: which volume each episode is on.
         trainings: which training each episode is of; None where all are of one.
-        seed: of the resampling; the same one gives the same intervals.
+        seed: seed of the resampling; the same one gives the same intervals.
 
     Raises:
         InvalidValueError: if a column has another length than `volumes`, or there is no episode.

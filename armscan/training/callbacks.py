@@ -14,11 +14,11 @@ class EpochReport:
     """What is known at the end of an epoch.
 
     Args:
-        epoch: its number, from 1.
+        epoch: number of the epoch, from 1.
         n_env_steps: environment steps taken so far.
         wall_s: seconds of training so far; the time between an interruption and a resumption is none.
         metrics: means of the epoch's training, by name.
-        evaluation: on the validation volumes.
+        evaluation: evaluation on the validation volumes.
         is_best: whether no epoch before was as good.
     """
 
@@ -37,7 +37,7 @@ class Callback(Protocol):
         """Handle the start, called once before the first step.
 
         Args:
-            total_env_steps: that training may take.
+            total_env_steps: environment steps that training may take.
             earlier: epochs before the interruption of a resumed training; they may be reported a second time.
         """
 

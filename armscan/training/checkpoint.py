@@ -9,7 +9,7 @@ import hashlib
 import io
 import re
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn, cast
+from typing import Any, BinaryIO, cast
 
 import torch
 
@@ -19,25 +19,27 @@ from armscan.utils.files import atomic_write
 FORMAT = 1
 MAGIC = b"armscan checkpoint "
 HEADER = re.compile(rb"armscan checkpoint ([0-9]{1,9}) ([0-9a-f]{64})\n")
-CHUNK_BYTES = 1 << 20
 
 
 def save_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> None:
     """Write a checkpoint; a reader sees the old one or the new one, never half of one.
 
     Args:
-        path: the file.
-        state: of the learner.
+        path: place of the file.
+        state: state of the learner.
         facts: numbers and texts about it, such as how many steps it has taken.
     """
 
     def write(file: BinaryIO) -> None:
-        # Summed up as it is written, so that a large replay buffer is never in memory as one file beside itself.
-        file.write(_header("0" * 64))
-        summing = _Summing(file)
-        torch.save({"state": state, "facts": facts}, cast(BinaryIO, summing))
+        # Summed up from the file, so that a large replay buffer is never in memory as one file beside itself.
+        start = file.write(_header("0" * 64))
+        torch.save({"state": state, "facts": facts}, file)
+        file.flush()
+        with Path(file.name).open("rb") as written:
+            written.seek(start)
+            digest = hashlib.file_digest(written, "sha256")
         file.seek(0)
-        file.write(_header(summing.digest.hexdigest()))
+        file.write(_header(digest.hexdigest()))
 
     atomic_write(path, write)
 
@@ -96,43 +98,19 @@ def _verified(file: io.BufferedReader, path: Path) -> BinaryIO:
     """Return the contents after the first line, whose sum is the one that the line names."""
     header = file.readline(len(_header("0" * 64)) + 8)
     if (match := HEADER.fullmatch(header)) is None:
-        _refuse(path, header)
+        if not header:
+            raise CheckpointError(f"{path}: is empty, but it must be a checkpoint")
+        if header.startswith(MAGIC):
+            raise CheckpointError(f"{path}: is damaged: its first line is {header!r}")
+        raise CheckpointError(f"{path}: is no checkpoint of armscan, or damaged: it begins with {header[:16]!r}")
     if int(match[1]) != FORMAT:
         newer = "it was written by a newer version" if int(match[1]) > FORMAT else "there never was such a format"
         raise CheckpointError(
             f"{path}: is a checkpoint of format {int(match[1])}, but this version of armscan reads {FORMAT}: {newer}"
         )
-    digest = hashlib.sha256()
-    while chunk := file.read(CHUNK_BYTES):
-        digest.update(chunk)
-    if digest.hexdigest().encode() != match[2]:
+    if hashlib.file_digest(file, "sha256").hexdigest().encode() != match[2]:
         raise CheckpointError(f"{path}: is damaged: its contents are not those that were written")
     return cast(BinaryIO, _After(file, len(header)))
-
-
-def _refuse(path: Path, header: bytes) -> NoReturn:
-    if not header:
-        raise CheckpointError(f"{path}: is empty, but it must be a checkpoint")
-    if header.startswith(MAGIC):
-        raise CheckpointError(f"{path}: is damaged: its first line is {header!r}")
-    raise CheckpointError(f"{path}: is no checkpoint of armscan, or damaged: it begins with {header[:16]!r}")
-
-
-class _Summing:
-    """A file to write to that knows the sum of what was written."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self.digest = hashlib.sha256()
-
-    def write(self, data: bytes) -> int:
-        """Write, and adds to the sum."""
-        self.digest.update(data)
-        return self._file.write(data)
-
-    def flush(self) -> None:
-        """Hand on what is waiting."""
-        self._file.flush()
 
 
 class _After(io.RawIOBase):

@@ -29,7 +29,7 @@ class CheckpointProvenance:
     """Provenance of a checkpoint: a training is resumed only from its own checkpoint, on the same volumes.
 
     Args:
-        run_id: of the run.
+        run_id: MLflow run ID.
         volumes: fingerprints of the volumes, by split and name.
     """
 
@@ -68,9 +68,9 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
     """Restore a learner to the state of its last checkpoint.
 
     Args:
-        learner: that has learned nothing yet.
-        folder: with the checkpoints.
-        provenance: of this training.
+        learner: learner that has learned nothing yet.
+        folder: folder with the checkpoints.
+        provenance: provenance of this training.
 
     Returns:
         The reports of the epochs so far, for `train`; none where there is no checkpoint yet.
@@ -129,8 +129,8 @@ def _read(text: Any, path: Path) -> list[EpochReport]:
             rows = zip(*(columns[name] for name in EPISODE_FIELDS), strict=True)
             episodes = tuple(EpisodeResult(**dict(zip(EPISODE_FIELDS, row, strict=True))) for row in rows)
             reports.append(EpochReport(**record, evaluation=Evaluation(episodes)))
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        # One of them is the best.
+        next(report for report in reports if report.is_best)
+    except (TypeError, ValueError, KeyError, AttributeError, StopIteration) as error:
         raise CheckpointError(f"{path}: holds no reports of the epochs so far, which resuming needs") from error
-    if not any(report.is_best for report in reports):
-        raise CheckpointError(f"{path}: holds no reports of the epochs so far, which resuming needs")
     return reports

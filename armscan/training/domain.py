@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 from gymnasium import spaces
+from pydantic import TypeAdapter
 
 from armscan.envs.observation_registry import NAMED_OBSERVATIONS
 from armscan.errors import InvalidValueError
@@ -41,7 +42,7 @@ class TrainingDomain:
         """Return what an environment is like.
 
         Args:
-            env: the environment.
+            env: environment with the volumes.
             slice_px: crop of its images if the configuration gives none; default: the smallest slice.
         """
         space, volumes = env.observation_space, env.get_wrapper_attr("volumes").values()
@@ -60,15 +61,7 @@ class TrainingDomain:
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Read what `to_json` wrote."""
-        stored: Mapping[str, Any] = json.loads(text)
-        across, depth = stored["slice_px"]
-        pixel, size = stored["pixel_mm"], stored["size_mm"]
-        return cls(
-            observed={name: tuple(shape) for name, shape in stored["observed"].items()},
-            slice_px=(across, depth),
-            pixel_mm=(_range(pixel[0]), _range(pixel[1])),
-            size_mm=(_range(size[0]), _range(size[1])),
-        )
+        return TypeAdapter(cls).validate_json(text)
 
     def check_observed(self, other: TrainingDomain) -> None:
         """Raise `InvalidValueError` where other environments show something of another shape than these."""
@@ -111,9 +104,9 @@ def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> A
     data sets. Images that are resized to one shape keep that rule if slices are smaller.
 
     Args:
-        rules: plain dictionaries and lists, or the name of an observation.
+        rules: configuration as plain dictionaries and lists, or the name of an observation.
         trained: the smallest slice of the training volumes, (across, depth) in pixels.
-        here: that of the volumes that the agent is applied to.
+        here: the smallest slice of the volumes that the agent is applied to.
 
     Raises:
         InvalidValueError: if images would have to be larger than the slices.

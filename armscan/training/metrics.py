@@ -3,33 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from armscan.stats.bootstrap import Estimate, Statistic, estimates, mean, quantile, wilson
-from armscan.training.rollout import EpisodeResult, Evaluation
+from armscan.training.rollout import MEANS, Evaluation
 
 # Suffix of metrics over the episodes that did not start solved.
 NOT_STARTED_SOLVED = "_not_started_solved"
 MEDIAN, P95 = quantile(0.5), quantile(0.95)
 
-METRICS: dict[str, tuple[Statistic, Callable[[EpisodeResult], float]]] = {
-    "success_rate": (mean, lambda episode: episode.is_success),
-    "mean_steps": (mean, lambda episode: episode.n_steps),
-    "median_steps": (MEDIAN, lambda episode: episode.n_steps),
-    "p95_steps": (P95, lambda episode: episode.n_steps),
-    "mean_return": (mean, lambda episode: episode.episode_return),
-    "mean_final_reward": (mean, lambda episode: episode.final_reward),
-    "mean_best_reward": (mean, lambda episode: episode.best_reward),
-    "mean_distance_mm": (mean, lambda episode: episode.distance_mm),
-    "median_distance_mm": (MEDIAN, lambda episode: episode.distance_mm),
-    "mean_distance_deg": (mean, lambda episode: episode.distance_deg),
-    "median_distance_deg": (MEDIAN, lambda episode: episode.distance_deg),
-    "mean_dice": (mean, lambda episode: episode.mean_dice),
-    "mean_dice_bones": (mean, lambda episode: episode.dice_bones),
-    "mean_dice_tendons": (mean, lambda episode: episode.dice_tendons),
-    "mean_dice_artery": (mean, lambda episode: episode.dice_artery),
-    "mean_seconds_per_plane": (mean, lambda episode: episode.seconds_per_plane),
+# By name, the statistic, and what of an episode it is of.
+METRICS: dict[str, tuple[Statistic, str]] = {
+    **{name: (mean, value) for name, value in MEANS.items()},
+    "median_steps": (MEDIAN, "n_steps"),
+    "p95_steps": (P95, "n_steps"),
+    "median_distance_mm": (MEDIAN, "distance_mm"),
+    "median_distance_deg": (MEDIAN, "distance_deg"),
+    **{f"mean_{value}": (mean, value) for value in ("dice_bones", "dice_tendons", "dice_artery", "seconds_per_plane")},
 }
 
 
@@ -38,11 +31,11 @@ class MetricEstimates:
     """What some episodes add up to.
 
     Args:
-        n_volumes: that they are on.
-        n_episodes: how many they are.
-        n_started_solved: how many of them started on a rewarded plane.
-        estimates: by name, over all episodes; those whose names end with `_not_started_solved` over the others only.
-            `success_rate_wilson` is the success rate with Wilson's interval.
+        n_volumes: number of volumes that they are on.
+        n_episodes: number of episodes.
+        n_started_solved: number of those that started on a rewarded plane.
+        estimates: metrics by name, over all episodes; those whose names end with `_not_started_solved` over the others
+            only. `success_rate_wilson` is the success rate with Wilson's interval.
     """
 
     n_volumes: int
@@ -60,13 +53,13 @@ class MetricEstimates:
         """
         episodes = evaluation.episodes
         volumes = [episode.volume for episode in episodes]
+        are_solved = [episode.starts_solved for episode in episodes]
         columns: dict[str, tuple[Statistic, list[float]]] = {}
         for name, (statistic, value) in METRICS.items():
-            columns[name] = statistic, [value(episode) for episode in episodes]
-            columns[name + NOT_STARTED_SOLVED] = (
-                statistic,
-                [math.nan if episode.starts_solved else value(episode) for episode in episodes],
-            )
+            values = [float(getattr(episode, value)) for episode in episodes]
+            columns[name] = statistic, values
+            of_others = np.where(are_solved, math.nan, values).tolist()
+            columns[name + NOT_STARTED_SOLVED] = statistic, of_others
         others = [episode for episode in episodes if not episode.starts_solved]
         return cls(
             n_volumes=len(set(volumes)),

@@ -16,7 +16,7 @@ def progress_reporter(label: str | None = None) -> Callback:
     """Return a progress bar on a terminal; one line per epoch elsewhere, and for a job of a multirun.
 
     Args:
-        label: of the job, printed before each line; None for a single run.
+        label: label of the job, printed before each line; None for a single run.
     """
     return ProgressBar() if label is None and sys.stdout.isatty() else ProgressLines(label)
 
@@ -51,11 +51,7 @@ class ProgressBar:
 
 
 class ProgressLines:
-    """One line per epoch, for logs and for jobs side by side.
-
-    Args:
-        label: printed before each line; None for none.
-    """
+    """One line per epoch, for logs and for jobs side by side; a label, if there is one, is printed before each."""
 
     def __init__(self, label: str | None) -> None:
         self._label = f"[{label}] " if label else ""

@@ -6,6 +6,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from operator import attrgetter
 from typing import Any, Self, get_type_hints
 
 import gymnasium as gym
@@ -23,6 +24,18 @@ TRAINING, VALIDATION, TEST = "training volumes", "validation volumes", "test vol
 # Above any number of an episode; sums of such are finite.
 LARGEST = 1e100
 
+# Means over episodes, by name, and what of an episode each is of.
+MEANS = {
+    "success_rate": "is_success",
+    "mean_steps": "n_steps",
+    "mean_return": "episode_return",
+    "mean_final_reward": "final_reward",
+    "mean_best_reward": "best_reward",
+    "mean_distance_mm": "distance_mm",
+    "mean_distance_deg": "distance_deg",
+    "mean_dice": "mean_dice",
+}
+
 Env = gym.Env[Observed, FloatArray]
 
 
@@ -32,15 +45,15 @@ class EpisodeResult:
 
     Args:
         volume: name of its volume.
-        seed: it was reset with.
-        n_steps: steps taken.
+        seed: seed that it was reset with.
+        n_steps: number of steps taken.
         is_success: whether it ended on a rewarded plane.
         starts_solved: whether it also began on one.
         episode_return: sum of the rewards.
-        final_reward: of the last plane.
-        best_reward: of the planes that were chosen; the start is not among them.
-        distance_mm: of the last plane from the optimal one.
-        distance_deg: likewise.
+        final_reward: reward of the last plane.
+        best_reward: best reward of the planes that were chosen; the start is not among them.
+        distance_mm: distance of the last plane from the optimal one, in mm.
+        distance_deg: angle between the two, in degrees.
         dice_bones: how far the last slice shows the bones where the optimal plane's slice does, as `tissue_dice` says.
         dice_tendons: likewise.
         dice_artery: likewise.
@@ -89,12 +102,12 @@ class Evaluation:
     @property
     def success_rate(self) -> float:
         """Share of the episodes that ended on a rewarded plane."""
-        return self._mean(lambda episode: episode.is_success)
+        return self._mean("success_rate")
 
     @property
     def mean_steps(self) -> float:
         """Mean number of steps, episodes without success included."""
-        return self._mean(lambda episode: episode.n_steps)
+        return self._mean("mean_steps")
 
     @property
     def score(self) -> tuple[float, float]:
@@ -105,14 +118,7 @@ class Evaluation:
         """Return the figures by name; those of episodes that did not start solved stand beside those of all."""
         unsolved = Evaluation(tuple(episode for episode in self.episodes if not episode.starts_solved))
         return {
-            "success_rate": self.success_rate,
-            "mean_steps": self.mean_steps,
-            "mean_return": self._mean(lambda episode: episode.episode_return),
-            "mean_final_reward": self._mean(lambda episode: episode.final_reward),
-            "mean_best_reward": self._mean(lambda episode: episode.best_reward),
-            "mean_distance_mm": self._mean(lambda episode: episode.distance_mm),
-            "mean_distance_deg": self._mean(lambda episode: episode.distance_deg),
-            "mean_dice": self._mean(lambda episode: episode.mean_dice),
+            **{name: self._mean(name) for name in MEANS},
             "episodes": len(self.episodes),
             "episodes_started_solved": len(self.episodes) - len(unsolved.episodes),
             "success_rate_not_started_solved": unsolved.success_rate,
@@ -128,8 +134,8 @@ class Evaluation:
         """Return the figures and every episode, ready for JSON."""
         return {"metrics": self.metrics(), "episodes": [asdict(episode) for episode in self.episodes]}
 
-    def _mean(self, figure: Callable[[EpisodeResult], float]) -> float:
-        return statistics.fmean(map(figure, self.episodes)) if self.episodes else float("nan")
+    def _mean(self, name: str) -> float:
+        return statistics.fmean(map(attrgetter(MEANS[name]), self.episodes)) if self.episodes else float("nan")
 
 
 def _episode_of(plain: object) -> EpisodeResult:
@@ -149,13 +155,10 @@ def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluatio
     """Play episodes on each of the environment's volumes in turn.
 
     Args:
-        agent: plays them.
+        agent: agent that plays them.
         env: an `ArmscanEnv`, with or without wrappers.
-        n_episodes: how many episodes; a multiple of the number of volumes treats them alike.
-        seed: of the first episode, the next has the next seed: the same seed gives the same episodes to every agent.
-
-    Returns:
-        The episodes.
+        n_episodes: number of episodes; a multiple of the number of volumes treats them alike.
+        seed: seed of the first episode, the next has the next: the same seed gives the same episodes to every agent.
     """
     names = list(env.get_wrapper_attr("volumes"))
     count = check_int("episodes", n_episodes, at_least=1)
@@ -168,10 +171,10 @@ def play(
     """Play an episode.
 
     Args:
-        agent: plays it.
-        env: as in `evaluate`.
-        volume_name: of the environment's volumes.
-        seed: of the episode.
+        agent: agent that plays it.
+        env: an `ArmscanEnv`, with or without wrappers.
+        volume_name: name of one of the environment's volumes.
+        seed: seed of the episode.
         look: called when it begins, and after every step.
     """
     observation, info = env.reset(seed=seed, options={"volume": volume_name})

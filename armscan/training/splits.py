@@ -74,11 +74,11 @@ def phantom_data(
     """Phantom wrists; those for validation and test come from seeds that no training phantom has.
 
     Args:
-        n_training: phantoms to train on.
-        n_validation: phantoms that choose the checkpoint.
-        n_test: phantoms to judge on.
-        first_seed: of the training phantoms, which have consecutive seeds.
-        cache_dir: where phantoms are kept; the user's cache folder where it is None.
+        n_training: number of phantoms to train on.
+        n_validation: number of phantoms that choose the checkpoint.
+        n_test: number of phantoms to judge on.
+        first_seed: seed of the first of the training phantoms, which have consecutive seeds.
+        cache_dir: folder where phantoms are kept; the user's cache folder where it is None.
 
     Raises:
         InvalidValueError: if a number is out of range.

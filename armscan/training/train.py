@@ -52,7 +52,7 @@ class Budget:
     Args:
         env_steps: environment steps to take at most, all of them counted; rounded up to what the agent takes at once.
         eval_every_env_steps: environment steps between two validations, rounded up likewise.
-        validation_episodes: episodes of a validation.
+        validation_episodes: number of episodes of a validation.
         solved: stop as soon as this holds; None to spend the whole budget.
     """
 
@@ -101,10 +101,10 @@ def train(
     """Train a learner; it ends with the weights of its best epoch.
 
     Args:
-        learner: to train.
+        learner: learner to train.
         budget: how long.
         validate: evaluates the learner on the validation volumes.
-        folder: where `best.pt` and `last.pt` are kept.
+        folder: folder where `best.pt` and `last.pt` are kept.
         callbacks: called at start, after each epoch and at the end.
         provenance: what the checkpoints say that they come from.
         earlier: what `resume_from_checkpoint` returned, for a resumed training.

@@ -56,11 +56,11 @@ class VideoRecorder:
         """Play an episode and record it; the last frame is held longer.
 
         Args:
-            agent: plays it.
-            env: made with `render_mode="rgb_array"`.
-            volume_name: of the environment's volumes.
-            seed: of the episode.
-            title: stands above each picture, and what became of the episode above the last; empty for neither.
+            agent: agent that plays it.
+            env: environment made with `render_mode="rgb_array"`.
+            volume_name: name of one of the environment's volumes.
+            seed: seed of the episode.
+            title: text above each picture, and before what became of the episode above the last; empty for neither.
 
         Returns:
             The episode, as an evaluation would have played it.
@@ -132,10 +132,10 @@ def record_episode(agent: Agent, env: Env, path: Path, *, seed: int) -> None:
     """Play an episode on the first volume and write it as an animated GIF; the last frame is held longer.
 
     Args:
-        agent: plays it.
-        env: made with `render_mode="rgb_array"`.
+        agent: agent that plays it.
+        env: environment made with `render_mode="rgb_array"`.
         path: the file, ending in `.gif`.
-        seed: of the episode; where it starts solved, that of the next one is tried, a few times.
+        seed: seed of the episode; where it starts solved, that of the next one is tried, a few times.
     """
     first = next(iter(env.get_wrapper_attr("volumes")))
     for attempt in range(MAX_ATTEMPTS):
