@@ -141,7 +141,7 @@ class ExhaustiveAgent:
         if (n_planes := math.prod(2 * n + 1 for n in n_each_side)) > MOST_PLANES:
             raise InvalidValueError(
                 f"agent.step_mm is {self._step_mm:g} and agent.step_deg is {self._step_deg:g}, which give {n_planes} "
-                f"planes of {listed(self._swept)}, but there must be at most {MOST_PLANES}"
+                f"planes of {' and '.join(self._swept)}, but there must be at most {MOST_PLANES}"
             )
         counts = np.meshgrid(*(np.arange(-n, n + 1) for n in n_each_side), indexing="ij")
         steps = np.stack(counts, axis=-1).reshape(-1, len(self._swept))

@@ -12,12 +12,11 @@ from torch import nn
 
 from armscan.agents.hyperparameters import Parameters, buffer_capacity, check_batch, check_updates, number
 from armscan.agents.networks import Network
-from armscan.agents.policy import Policy, clip_action
+from armscan.agents.policy import Batch, Policy, batch_of, clip_action
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.supervised_buffer import SupervisedBuffer
 from armscan.agents.tianshou_learner import diverged, is_finite, load_into
 from armscan.envs.actions import ActionBounds
-from armscan.envs.history import observation_of, parts_of
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
 from armscan.errors import InvalidValueError
@@ -183,7 +182,7 @@ class RegressionLearner:
         self._optimiser.step()
         return loss.detach()
 
-    def _predicted(self, observations: Observed) -> torch.Tensor:
+    def _predicted(self, observations: Observed | Batch) -> torch.Tensor:
         """Return the predicted optimal actions of a batch, shape (n, n_free), not yet clipped."""
         (mean, _), _ = self._network(observations)
         return torch.as_tensor(mean)
@@ -193,9 +192,8 @@ class RegressionLearner:
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
         """Return the optimal action as predicted from this observation alone, shape (n_free,)."""
-        one = observation_of({name: part[None] for name, part in parts_of(observation).items()})
         with torch.no_grad():
-            return self._predicted(one)[0].clamp(-1.0, 1.0).cpu().numpy()
+            return self._predicted(batch_of([observation]))[0].clamp(-1.0, 1.0).cpu().numpy()
 
     def policy(self) -> Policy:
         """Return a copy of the network that `act` asks."""

@@ -131,9 +131,9 @@ class EvenUpdatesTrainer(OffPolicyTrainer):
     training that goes on later takes the same gradient steps as one that was never cut off. No progress bar is shown.
 
     Args:
-        algorithm: that is trained.
-        params: of the trainer.
-        learning_starts: steps before the first collection.
+        algorithm: algorithm that is trained.
+        params: parameters of the trainer.
+        learning_starts: environment steps before the first collection.
     """
 
     def __init__(

@@ -14,7 +14,7 @@ from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.hyperparameters import Parameters
-from armscan.agents.policy import Policy
+from armscan.agents.policy import Policy, batch_of
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
 from armscan.agents.tianshou_envs import TianshouVectorEnv
@@ -140,7 +140,7 @@ class TianshouLearner:
         """Return the policy's action, shape (n_free,)."""
         policy = self._algorithm.policy
         with torch.no_grad():
-            result = policy(Batch(obs=_batch_of_one(observation), info=Batch()))
+            result = policy(Batch(obs=batch_of([observation]), info=Batch()))
         return np.asarray(policy.map_action(result.act.cpu().numpy())[0])
 
     def policy(self) -> Policy:
@@ -230,9 +230,3 @@ def load_into(module: torch.nn.Module, weights: dict[str, Any]) -> None:
 def _entropy_optimiser(algorithm: Any) -> torch.optim.Optimizer | None:
     """Return the optimiser of a learned entropy coefficient, which Tianshou leaves out of an algorithm's state."""
     return getattr(getattr(algorithm, "alpha", None), "_optim", None)
-
-
-def _batch_of_one(observation: Observed) -> Any:
-    if isinstance(observation, dict):
-        return Batch({name: part[None] for name, part in observation.items()})
-    return observation[None]

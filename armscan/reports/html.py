@@ -63,7 +63,11 @@ def write_page(folder: Path, title: str, parts: Sequence[str], tables: Mapping[s
     Raises:
         InvalidValueError: if it would replace what is no report's.
     """
-    _check_replaceable(folder, [REPORT_FILE, *(f"{name}.csv" for name in tables)])
+    for name in () if _is_report(folder / REPORT_FILE) else (REPORT_FILE, *(f"{name}.csv" for name in tables)):
+        if (folder / name).exists():
+            raise InvalidValueError(
+                f"the report would replace {folder / name}, but that is no report's: name another folder with --out"
+            )
     folder.mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():
         _write_csv(folder / f"{name}.csv", rows)
@@ -72,17 +76,6 @@ def write_page(folder: Path, title: str, parts: Sequence[str], tables: Mapping[s
     file = folder / REPORT_FILE
     file.write_text(PAGE.format(title=html.escape(title), plotly=get_plotlyjs(), body=body))
     return file
-
-
-def _check_replaceable(folder: Path, names: Sequence[str]) -> None:
-    """Raise `InvalidValueError` where files of these names are there that are no report's."""
-    if _is_report(folder / REPORT_FILE):
-        return
-    for name in names:
-        if (folder / name).exists():
-            raise InvalidValueError(
-                f"the report would replace {folder / name}, but that is no report's: name another folder with --out"
-            )
 
 
 def _is_report(file: Path) -> bool:

@@ -140,11 +140,11 @@ def mixed_data(
     Args:
         path: the folder.
         n_volumes: how many of its volumes, the first by name; None for all.
-        n_training: phantoms to train on beside them, which may be 0.
-        n_validation: as in `phantom_data`, like what follows.
-        n_test: likewise.
-        first_seed: likewise.
-        cache_dir: likewise.
+        n_training: number of phantoms to train on beside them, which may be 0.
+        n_validation: number of phantoms that choose the checkpoint.
+        n_test: number of phantoms to judge on.
+        first_seed: seed of the first of the training phantoms.
+        cache_dir: folder where phantoms are kept; the user's cache folder where it is None.
 
     Raises:
         InvalidValueError: if a number is out of range.
@@ -152,10 +152,9 @@ def mixed_data(
     n_beside = check_int("data.n_training", n_training, at_least=0)
     phantoms = phantom_data(max(n_beside, 1), n_validation, n_test, first_seed, cache_dir)
     volumes = open_dataset(check_path("data.path", path)).volumes
-    count = len(volumes) if n_volumes is None else check_int("data.n_volumes", n_volumes, at_least=1)
-    if count > len(volumes):
-        raise InvalidValueError(f"data.n_volumes is {n_volumes}, but {path} has {len(volumes)} volumes")
-    chosen = {name: volumes[name] for name in sorted(volumes)[:count]}
+    if n_volumes is not None:
+        check_int("data.n_volumes", n_volumes, at_least=1, at_most=len(volumes))
+    chosen = {name: volumes[name] for name in sorted(volumes)[:n_volumes]}
     return Split({**chosen, **(phantoms.training if n_beside else {})}, phantoms.validation, phantoms.test)
 
 

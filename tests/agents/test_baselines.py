@@ -140,5 +140,5 @@ def test_exhaustive_refuses_what_it_cannot_sweep(phantom, arguments, projection,
 
 def test_exhaustive_refuses_more_planes_than_anyone_looks_at(phantom):
     agent = agent_of(Exhaustive(swept=None, step_mm=0.01, step_deg=0.01), phantom, "zy")
-    with pytest.raises(InvalidValueError, match=r"step_mm is 0\.01 .* planes of ty, but .* at most 1000000"):
+    with pytest.raises(InvalidValueError, match=r"step_mm is 0\.01 .* planes of rz and ty, but .* at most 1000000"):
         agent.begin(seed=0, bounds=BOUNDS)
