@@ -1,21 +1,21 @@
-"""Optuna's dashboard of the studies in ARMSCAN_STORAGE, with the options of its own program.
+"""Optuna's dashboard of the studies in ARMSCAN_STORAGE: `dashboard.py ADDRESS:PORT`.
 
-That one refuses a database without tables, as it is before the first worker has come. Here they are made first, with
-the lock that workers make them with, too.
+It answers browsers that ask for a host in DASHBOARD_HOSTS. Optuna's own program answers any, and refuses a database
+without tables, as it is before the first worker has come.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-
-from sqlalchemy import make_url
+import threading
+from pathlib import Path
 
 from armscan.sweeps.storage.storage import open_storage
+from armscan.ui.servers import start_dashboard
 
-PROGRAM = "optuna-dashboard"
-
-uri = os.environ["ARMSCAN_STORAGE"]
-open_storage(uri, where="ARMSCAN_STORAGE", retry=True)
-address = make_url(uri).set(drivername="postgresql+psycopg")
-os.execvp(PROGRAM, [PROGRAM, str(address), *sys.argv[1:]])
+storage = open_storage(os.environ["ARMSCAN_STORAGE"], where="ARMSCAN_STORAGE", retry=True)
+hosts = os.environ["DASHBOARD_HOSTS"].split(",")
+host, port = sys.argv[1].split(":")
+print(start_dashboard(storage, Path("optuna.artifacts"), int(port), host=host, allowed_hosts=hosts), flush=True)
+threading.Event().wait()

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from socketserver import ThreadingMixIn
 from threading import Thread
@@ -19,6 +19,7 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from armscan.config.credentials import TRACKING_PASSWORD, database_url, mask_passwords
 from armscan.errors import InvalidValueError, TrackingError
+from armscan.ui.host_check import HostCheck
 from armscan.utils.processes import child_command, on_parent_exit
 
 if TYPE_CHECKING:
@@ -56,7 +57,9 @@ def check_port(option: str, port: int) -> None:
         raise InvalidValueError(f"{option} is {port}, but {HOST}:{port} cannot be used ({reason})") from error
 
 
-def start_dashboard(storage: Storage, artifacts: Path, port: int) -> str:
+def start_dashboard(
+    storage: Storage, artifacts: Path, port: int, *, host: str = HOST, allowed_hosts: Sequence[str] = ()
+) -> str:
     """Serve Optuna's dashboard for the rest of this process; return its address.
 
     Its own program would open a journal without the lock that workers use.
@@ -64,15 +67,19 @@ def start_dashboard(storage: Storage, artifacts: Path, port: int) -> str:
     Args:
         storage: the storage of the studies.
         artifacts: the folder of the plots that it shows.
-        port: the port on 127.0.0.1.
+        port: the port of the address.
+        host: the address to listen on, default: the loopback address.
+        allowed_hosts: the names and ports, `NAME:PORT`, by which browsers may ask for it; `*` stands for any port.
+            Default: `127.0.0.1` and `localhost` with the port.
     """
     from optuna.artifacts import FileSystemArtifactStore
     from optuna_dashboard import wsgi
 
     application = wsgi(storage.optuna, artifact_store=FileSystemArtifactStore(artifacts))
-    server = make_server(HOST, port, application, server_class=_Threaded, handler_class=_Quiet)
+    checked = HostCheck(application, allowed_hosts or (f"{HOST}:{port}", f"localhost:{port}"))
+    server = make_server(host, port, checked, server_class=_Threaded, handler_class=_Quiet)
     Thread(target=server.serve_forever, daemon=True).start()
-    return f"http://{HOST}:{port}"
+    return f"http://{host}:{port}"
 
 
 @contextlib.contextmanager

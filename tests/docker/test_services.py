@@ -123,10 +123,12 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     for name in ("mlflow", "dashboard"):
         containers.wait_until_healthy(name)
     mlflow, dashboard = (f"http://127.0.0.1:{containers.ports[name]}" for name in ("mlflow", "dashboard"))
-    # As workers call it, as a browser does, and as a page of somebody else's would.
-    port = containers.ports["mlflow"]
-    for host, status in ((f"mlflow:{port}", 200), (f"localhost:{port}", 200), (f"elsewhere:{port}", 403)):
-        assert asked(f"{mlflow}/ajax-api/2.0/mlflow/experiments/search?max_results=1", Host=host)[0] == status, host
+    # As others here call it, as a browser does, and as a page of somebody else's would.
+    asked_for = {"mlflow": f"{mlflow}/ajax-api/2.0/mlflow/experiments/search?max_results=1"}
+    asked_for["dashboard"] = f"{dashboard}/api/studies"
+    for name, url in asked_for.items():
+        for host, status in ((name, 200), ("localhost", 200), ("elsewhere", 403)):
+            assert asked(url, Host=f"{host}:{containers.ports[name]}")[0] == status, (name, host)
 
     n_before = n_connections(postgres_there)
     assert not containers.is_healthy("worker")

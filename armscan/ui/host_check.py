@@ -1,0 +1,46 @@
+"""Who may ask a server of this machine: only pages of its own address."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+if TYPE_CHECKING:
+    from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
+
+# Of requests that browsers send for another page without asking the server first.
+FROM_ELSEWHERE = ("cross-site", "same-site")
+SAFE_METHODS = ("GET", "HEAD")
+
+
+class HostCheck:
+    """A WSGI application that refuses requests for other hosts, and those of other pages.
+
+    Without it, any web page could read and delete studies: by DNS rebinding, its own name leads to this machine.
+    MLflow's server has the same check.
+
+    Args:
+        application: application to protect.
+        hosts: allowed values of the header Host, `NAME:PORT`; `*` stands for any port.
+    """
+
+    def __init__(self, application: WSGIApplication, hosts: Sequence[str]) -> None:
+        self._application, self._hosts = application, tuple(hosts)
+
+    def __call__(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
+        """Answer a request; 403 if it is refused."""
+        if self._is_allowed(environ):
+            return self._application(environ, start_response)
+        body = f"403: this server answers only {', '.join(self._hosts)}, and only pages of its own\n".encode()
+        start_response("403 Forbidden", [("Content-Type", "text/plain"), ("Content-Length", str(len(body)))])
+        return [body]
+
+    def _is_allowed(self, environ: WSGIEnvironment) -> bool:
+        named = [environ.get("HTTP_HOST", "")]
+        if "HTTP_ORIGIN" in environ:
+            named.append(urlsplit(environ["HTTP_ORIGIN"]).netloc)
+        is_safe = environ["REQUEST_METHOD"] in SAFE_METHODS
+        is_from_elsewhere = not is_safe and environ.get("HTTP_SEC_FETCH_SITE") in FROM_ELSEWHERE
+        return not is_from_elsewhere and all(any(fnmatchcase(name, host) for host in self._hosts) for name in named)
