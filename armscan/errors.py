@@ -5,7 +5,11 @@ Each message is one line that names the value received, what is allowed, and whe
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
+
+# What steers a terminal, turns the direction of a text, or is only half a character.
+CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 class ArmscanError(Exception):
@@ -13,7 +17,7 @@ class ArmscanError(Exception):
 
     def __str__(self) -> str:
         """One line, also where a received value, such as an array, is written in several."""
-        return " ".join(line.strip() for line in super().__str__().splitlines())
+        return printable(" ".join(line.strip() for line in super().__str__().splitlines()))
 
 
 class InvalidValueError(ArmscanError, ValueError):
@@ -109,3 +113,14 @@ def listed(allowed: Iterable[object]) -> str:
     """Return the allowed values as they are written in a message: 'a, b or c'."""
     names = [str(value) for value in allowed]
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + f" or {names[-1]}"
+
+
+def few(names: Iterable[object], most: int = 4) -> str:
+    """Return the first few of what may be many, as they are written in a message: 'a, b, c, d and 96 more'."""
+    texts = [str(name) for name in names]
+    return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "")
+
+
+def printable(text: str) -> str:
+    """Return a text that is safe to show in a terminal: control characters are spelled out."""
+    return CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from armscan.errors import ManifestError, listed
+from armscan.errors import ManifestError, few, listed
 from armscan.utils.validation import check_choice, check_path
 from armscan.volumes.manifest import MANIFEST_NAMES, find_manifest, read_manifest, volume_entries, volume_files
 from armscan.volumes.reading import ReadingOptions, read_stored
@@ -105,7 +105,7 @@ def _split_of(splits: Splits, subjects: Mapping[str, str], used: Mapping[str, ob
     split_of = {subject: split for split in SPLITS for subject in getattr(splits, split)}
     if unknown := [subject for subject in split_of if subject not in subjects.values()]:
         raise ManifestError(
-            f"{where} names {listed(unknown)}, but the subjects are {listed(dict.fromkeys(subjects.values()))}"
+            f"{where} names {few(unknown)}, but the subjects are {few(dict.fromkeys(subjects.values()))}"
         )
     if left_out := [name for name in used if subjects[name] not in split_of]:
         raise ManifestError(

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import InvalidValueError, VolumeError, listed
+from armscan.errors import InvalidValueError, VolumeError, few, listed
 from armscan.utils.validation import check_choice
 
 LABEL_NAMES = {0: "background", 1: "bones", 2: "tendons", 3: "artery", 4: "nerve"}
@@ -186,8 +186,7 @@ def check_landmarks(found: tuple[Found, ...], labels: LabelMap, where: str) -> N
 
 def shown(sources: Iterable[Source]) -> str:
     """Return values or names as they are written in a message, the first few of them."""
-    names = [repr(source) for source in sources]
-    return ", ".join(names[:MAX_SHOWN]) + (f", ... ({len(names)} in all)" if len(names) > MAX_SHOWN else "")
+    return few(map(repr, sources), MAX_SHOWN)
 
 
 def check_whole(values: NDArray[np.generic], where: str) -> NDArray[np.integer[Any]]:

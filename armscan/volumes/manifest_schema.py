@@ -7,13 +7,19 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from armscan.errors import InvalidValueError, ManifestError, listed
+from armscan.errors import InvalidValueError, ManifestError, listed, printable
 from armscan.utils.validation import check_float, check_numbers
 from armscan.volumes.labelmap import LabelMap
 from armscan.volumes.orientation import Crop, check_axes, check_crop, check_orientation
 from armscan.volumes.plane import ManipulatorAction
+
+
+def _printable(text: str) -> str:
+    if printable(text) != text:
+        raise InvalidValueError(f"holds {text!r}, but a text must be without control characters")
+    return text
 
 
 def _subjects(value: Any) -> tuple[str, ...]:
@@ -29,6 +35,7 @@ Translation = Annotated[
     tuple[float, ...], BeforeValidator(partial(check_numbers, "translation", length=2, meaning="(tx, ty) in mm"))
 ]
 Score = Annotated[float, BeforeValidator(partial(check_float, "score", at_least=-1.0, at_most=0.0))]
+Text = Annotated[str, AfterValidator(_printable)]
 Axes = Annotated[str, BeforeValidator(check_axes)]
 Orientation = Annotated[str | None, BeforeValidator(check_orientation)]
 Labels = Annotated[LabelMap, BeforeValidator(LabelMap.from_mapping)]
@@ -48,8 +55,8 @@ class VolumeEntry(_Strict):
     rotation: Rotation | None = None
     translation: Translation | None = None
     score: Score | None = None
-    subject: str | None = Field(default=None, min_length=1, description="a text that is not empty (quote numbers)")
-    exclude: bool | Annotated[str, Field(min_length=1)] = Field(default=False, description="true, false or the reason")
+    subject: Text | None = Field(default=None, min_length=1, description="a text that is not empty (quote numbers)")
+    exclude: bool | Annotated[Text, Field(min_length=1)] = Field(default=False, description="true, false or the reason")
     labels: Labels | None = None
     orientation: Orientation = None
     axes: Axes = "xyz"
@@ -98,7 +105,7 @@ class Manifest(_Strict):
     overlap: Overlap = Field(default="refuse", description=OVERLAP_MEANING)
     spacing: Literal["own", "finest"] = Field(default="own", description="own or finest")
     splits: Splits | None = Field(default=None, description="lists of subjects under train, validation and test")
-    volumes: dict[str, VolumeEntry] | None = Field(default=None, description="entries by the names of the files")
+    volumes: dict[Text, VolumeEntry] | None = Field(default=None, description="entries by the names of the files")
 
     def setting(self, entry: VolumeEntry, key: str) -> Any:
         """Return what holds for a volume: its own value where its entry has the key, else the one for all."""

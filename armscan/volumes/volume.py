@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import InvalidValueError, VolumeError
+from armscan.errors import InvalidValueError, VolumeError, printable
 from armscan.utils.validation import check_int, check_numbers
 from armscan.volumes.labelmap import ALLOWED_LABELS, LABEL_NAMES, LANDMARK_LABELS, check_whole, shown
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
@@ -52,6 +52,10 @@ class LabelVolume:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise VolumeError(f"the name of a volume is {self.name!r}, but it must be a text")
+        if printable(self.name) != self.name:
+            raise VolumeError(
+                f"the name of a volume is {self.name!r}, but it must be a text without control characters"
+            )
         object.__setattr__(self, "labels", _checked_labels(self.labels, self.name))
         object.__setattr__(self, "spacing", _checked_spacing(self.spacing, self.name))
         object.__setattr__(self, "origin", _checked_mm("origin", self.origin, self.name))

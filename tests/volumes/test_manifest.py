@@ -87,7 +87,7 @@ def test_manifest_splits_by_subject(folder, write_labelmap):
     [
         ({"train": ["S1"], "test": ["S2", "S1"]}, r"splits has the subject 'S1' in train and in test"),
         ({"train": ["S1"], "test": ["S2", "S2"]}, r"splits has the subject 'S2' in test and in test"),
-        ({"train": ["S1"], "test": ["S3"]}, r"splits names S3, but the subjects are S1 or S2"),
+        ({"train": ["S1"], "test": ["S3"]}, r"splits names S3, but the subjects are S1, S2"),
         ({"train": ["S1"]}, r"splits does not name 'S2', the subject of b\.nrrd"),
         ({"train": []}, r"splits: a split is \[\], but it must be a list of at least one subject"),
         ({"train": [1]}, r"splits: a split is \[1\], but it must be a list of at least one subject"),
@@ -201,7 +201,7 @@ def test_record_planes_makes_what_is_missing(folder, contents):
 @pytest.mark.parametrize(
     ("planes", "error", "message"),
     [
-        ({"c.nii": (ACTION, 0.0)}, ManifestError, r"a plane is given for c\.nii, but the folder holds a\.nii\.gz or b"),
+        ({"c.nii": (ACTION, 0.0)}, ManifestError, r"a plane is given for c\.nii, but the folder holds a\.nii\.gz, b"),
         ({"a.nii.gz": ACTION}, InvalidValueError, r"the plane of 'a\.nii\.gz' is ManipulatorAction.*, but"),
         ({"a.nii.gz": (ACTION, math.nan)}, InvalidValueError, r"the score of 'a\.nii\.gz' is nan, but"),
         ({"a.nii.gz": (ACTION, 0.5)}, InvalidValueError, r"the score of 'a\.nii\.gz' is 0\.5, but"),

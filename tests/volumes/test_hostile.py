@@ -1,0 +1,214 @@
+"""Files that were made to harm: refused at once, in one line, with little memory."""
+
+import gzip
+import json
+import struct
+import time
+import tracemalloc
+import zlib
+
+import numpy as np
+import pytest
+
+from armscan.errors import ArmscanError, ManifestError, VolumeError
+from armscan.volumes import LabelVolume, open_dataset, read_volume
+from tests.conftest import make_tiny_volume
+
+HUGE = 1600
+MOST_SECONDS, MOST_BYTES = 2.0, 16 << 20
+MHA = (
+    "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = {compressed}\n"
+    "{size}ElementSpacing = 1 1 1\nDimSize = {n} {n} {n}\nElementType = MET_UCHAR\nElementDataFile = {file}\n"
+)
+NRRD = (
+    "NRRD0004\ntype: uchar\ndimension: 3\nspace: left-posterior-superior\nsizes: {n} {n} {n}\n"
+    "space directions: (1,0,0) (0,1,0) (0,0,1)\nkinds: domain domain domain\nencoding: {encoding}\n"
+    "space origin: (0,0,0)\n{more}\n"
+)
+
+
+def nifti(n, begin=352.0, magic=b"n+1\0", place=0.0):
+    """Returns the header of a NIfTI file of n x n x n bytes."""
+    header = bytearray(352)
+    struct.pack_into("<i", header, 0, 348)
+    struct.pack_into("<8h", header, 40, 3, n, n, n, 1, 1, 1, 1)
+    struct.pack_into("<2h", header, 70, 2, 8)
+    struct.pack_into("<8f", header, 76, *[1.0] * 8)
+    struct.pack_into("<f", header, 108, begin)
+    struct.pack_into("<12f", header, 280, *[place, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0])
+    struct.pack_into("<2h", header, 252, 0, 1)
+    header[344:348] = magic
+    return bytes(header)
+
+
+def mha(n, voxels, *, compressed=False, file="LOCAL"):
+    size = f"CompressedDataSize = {len(voxels)}\n" if compressed else ""
+    return MHA.format(n=n, compressed=compressed, size=size, file=file).encode() + voxels
+
+
+def nrrd(n, voxels=b"", *, encoding="raw", more=""):
+    return NRRD.format(n=n, encoding=encoding, more=more).encode() + voxels
+
+
+@pytest.fixture
+def refusal(tmp_path, capfd):
+    """Returns the one line in which a file is refused, quickly, with little memory, and with nothing printed beside."""
+
+    def refused(name, contents, beside=()):
+        for other, others in {**dict(beside), name: contents}.items():
+            (tmp_path / other).write_bytes(others)
+        # Loaded before the clock runs.
+        import SimpleITK  # noqa: F401
+
+        tracemalloc.start()
+        began = time.monotonic()
+        with pytest.raises(VolumeError) as caught:
+            read_volume(tmp_path / name)
+        took, (_, most) = time.monotonic() - began, tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert took < MOST_SECONDS
+        assert most < MOST_BYTES
+        assert capfd.readouterr() == ("", "")
+        assert len(str(caught.value).splitlines()) == 1
+        return str(caught.value)
+
+    return refused
+
+
+SMALL = bytes(500)
+DECLARED = {
+    "a.nii": nifti(HUGE) + SMALL,
+    "a.nii.gz": gzip.compress(nifti(HUGE) + SMALL),
+    "a.mha": mha(HUGE, SMALL),
+    "z.mha": mha(HUGE, zlib.compress(SMALL), compressed=True),
+    "a.nrrd": nrrd(HUGE, SMALL),
+    "z.nrrd": nrrd(HUGE, gzip.compress(SMALL), encoding="gzip"),
+    "a.mhd": mha(HUGE, b"", file="a.raw"),
+    "d.nrrd": nrrd(HUGE, more="data file: a.raw\n"),
+}
+
+
+@pytest.mark.parametrize("name", DECLARED)
+def test_a_small_file_that_declares_a_large_image_is_refused_at_once(refusal, name):
+    # In NIfTI with the header before them.
+    assert str(HUGE**3 + 352 * (".nii" in name)) in refusal(name, DECLARED[name], {"a.raw": SMALL})
+
+
+BOMB = bytes(64 << 20)
+BOMBS = {
+    "a.nii.gz": gzip.compress(nifti(10) + BOMB),
+    "a.mha": mha(10, zlib.compress(BOMB), compressed=True),
+    "a.nrrd": nrrd(10, gzip.compress(BOMB), encoding="gzip"),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_stream_is_inflated_no_further_than_declared(refusal, name):
+    assert "the file is damaged: it holds more than" in refusal(name, BOMBS[name])
+
+
+VOXELS = np.ascontiguousarray(make_tiny_volume().labels[:10, :10, :10].T).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        (nifti(10, begin=0.0), "the header ends at byte 352, but its voxels begin at byte 0"),
+        (nifti(10, begin=348.0), "the header ends at byte 352, but its voxels begin at byte 348"),
+        (nifti(10, begin=352.5), "the header ends at byte 352, but its voxels begin at byte 352.5"),
+        (nifti(10, begin=float("nan")), "its voxels begin at byte nan"),
+        (nifti(10, magic=b"ni1\0"), "of a pair of files (.hdr and .img), which is not read"),
+        (nifti(10, magic=bytes(4)), "of a pair of files (.hdr and .img), which is not read"),
+        (nifti(10, place=float("nan")), "its place in the world (qform, sform) holds a NaN"),
+        (nifti(10, place=float("inf")), "its place in the world (qform, sform) holds a NaN"),
+    ],
+)
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
+def test_nifti_headers_that_would_be_mended_or_printed_about_are_refused(refusal, name, header, message):
+    contents = header + VOXELS
+    assert message in refusal(name, gzip.compress(contents) if name.endswith("gz") else contents)
+
+
+@pytest.mark.parametrize(
+    ("name", "contents", "message"),
+    [
+        ("a.nrrd", nrrd(10, VOXELS, encoding="ascii"), "the encoding is 'ascii'"),
+        ("a.nrrd", nrrd(10, VOXELS, encoding="hex"), "the encoding is 'hex'"),
+        ("a.nrrd", nrrd(10, VOXELS, encoding="bzip2"), "the encoding is 'bzip2'"),
+        ("a.nrrd", nrrd(10, VOXELS, more="byte skip: -1\n"), "with skips of -1 or 0"),
+        ("a.nrrd", nrrd(10, more="data file: LIST\n"), "there is none of that name"),
+        ("a.mha", mha(10, VOXELS).replace(b"BinaryData = True", b"BinaryData = False"), "BinaryData is False"),
+        ("a.mhd", mha(10, b"", file="a.%03d 1 10 1"), "there is none of that name"),
+        ("a.mha", mha(10, VOXELS).replace(b"NDims", b"HeaderSize = 5\nNDims"), "HeaderSize is 5"),
+        ("a.mha", mha(10, VOXELS + b"1"), "the file is damaged: it holds more than 1000 bytes"),
+        ("a.nrrd", nrrd(10, VOXELS + b"1"), "the file is damaged: it holds more than 1000 bytes"),
+    ],
+)
+def test_voxels_that_cannot_be_checked_are_refused(refusal, name, contents, message):
+    assert message in refusal(name, contents)
+
+
+def damaged_manifest(folder, name, text):
+    """Returns the line in which a manifest is refused, and how long that takes."""
+    (folder / name).write_text(text)
+    began = time.monotonic()
+    with pytest.raises(ManifestError) as caught:
+        open_dataset(folder)
+    assert len(str(caught.value).splitlines()) == 1
+    return str(caught.value), time.monotonic() - began
+
+
+@pytest.mark.parametrize("name", ["manifest.yaml", "manifest.json"])
+def test_a_manifest_of_many_missing_files_names_four_of_them(write_labelmap, tmp_path, name):
+    write_labelmap("a.nii.gz")
+    entries = {
+        f"missing_{number:05d}.nii.gz": {"subject": f"S{number}", "rotation": [0, 0]} for number in range(10_000)
+    }
+    for entry in entries.values():
+        entry["translation"] = [0, 1]
+    message, took = damaged_manifest(tmp_path, name, json.dumps({"volumes": entries}, indent=1))
+    assert "missing_00003.nii.gz and 9996 more" in message
+    assert took < 10.0
+
+
+@pytest.mark.parametrize("depth", [900, 3000, 100_000])
+@pytest.mark.parametrize(
+    ("name", "opens", "closes"),
+    [
+        ("manifest.yaml", "[", "]"),
+        ("manifest.yaml", "{a: ", "}"),
+        ("manifest.yaml", "- ", ""),
+        ("manifest.json", "[", "]"),
+        ("manifest.json", '{"volumes": ', "}"),
+    ],
+)
+def test_a_manifest_that_is_nested_deeply_is_refused_at_once(write_labelmap, tmp_path, name, opens, closes, depth):
+    write_labelmap("a.nii.gz")
+    _, took = damaged_manifest(tmp_path, name, opens * depth + "1" + closes * depth)
+    assert took < MOST_SECONDS
+
+
+def test_a_manifest_that_repeats_itself_without_end_is_refused_at_once(write_labelmap, tmp_path):
+    write_labelmap("a.nii.gz")
+    laughs = "\n".join(f"  l{n}: &l{n} [{', '.join([f'*l{n - 1}'] * 10)}]" for n in range(1, 12))
+    text = f"labels:\n  l0: &l0 [1]\n{laughs}\n"
+    assert damaged_manifest(tmp_path, "manifest.yaml", text)[1] < MOST_SECONDS
+    text = f"volumes:\n  l0: &l0 [1]\n{laughs}\n  a.nii.gz: {{labels: {{bones: *l11, tendons: [1], artery: [2]}}}}"
+    assert damaged_manifest(tmp_path, "manifest.yaml", text)[1] < MOST_SECONDS
+
+
+@pytest.mark.parametrize(
+    "name", ["\x1b[31mred\x1b[0m", "bell\a", "over\rwritten", "two\nlines", "\u202eback", "\x9b1m"]
+)
+def test_control_characters_of_names_are_spelled_out(write_labelmap, tmp_path, name):
+    with pytest.raises(VolumeError, match="must be a text without control characters") as caught:
+        LabelVolume(make_tiny_volume().labels, (1.0, 1.0, 1.0), name)
+    messages = [str(caught.value), str(ArmscanError(f"{name} is wrong"))]
+    with pytest.raises(VolumeError) as caught:
+        read_volume(tmp_path / f"{name}.nii")
+    messages.append(str(caught.value))
+    write_labelmap(f"{name}.nrrd")
+    for entries in ({}, {f"{name}.nrrd": {}}, {"a.nrrd": {"subject": name}}, {"a.nrrd": {"exclude": name}}):
+        write_labelmap("a.nrrd")
+        messages.append(damaged_manifest(tmp_path, "manifest.json", json.dumps({"volumes": entries}))[0])
+    assert all(message.isprintable() for message in messages)
