@@ -16,7 +16,6 @@ import click
 from armscan.cli.options import FILE_PATH, CommaSeparated, Moment, UriParam, examples, tracking_option, trust_option
 
 if TYPE_CHECKING:
-    from armscan.runs.query import Selection
     from armscan.tracking import TrackingStore
 
 STATUSES = ("finished", "failed", "killed", "running")
@@ -65,21 +64,21 @@ def runs() -> None:
 @click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), default="table", help="Output format.")
 @click.option("--children", is_flag=True, help="List children below their parents, not collapsed into them.")
 @tracking_option()
-def list_runs(form: str, children: bool, tracking: str, **selected: Any) -> None:
+def list_runs(form: str, children: bool, tracking: str, sort: str, limit: int | None, **selected: Any) -> None:
     """List runs, the newest first.
 
     docs/runs.md explains the columns.
     """
-    from armscan.runs import collapse, expand, find, sort_rows, write_entries
+    from armscan.runs.query import find
+    from armscan.runs.rows import collapse, sort_rows
+    from armscan.runs.tables import write_rows
 
     with _open(tracking) as client:
-        selection = _selection(**selected)
-        found = find(client, selection)
-        entries = sort_rows(collapse(client, found), selection.sort, is_down=selection.is_down)[: selection.limit]
-        if not entries and form == "table":
+        rows = sort_rows(collapse(client, find(client, **selected)), sort, limit)
+        if not rows and form == "table":
             print(f"no run of {client.uri} is selected")
         else:
-            write_entries(expand(entries, found) if children else entries, form)
+            write_rows([each for row in rows for each in row.unfolded()] if children else rows, form)
 
 
 @runs.command(epilog=examples("runs show 3bf2"))
@@ -90,7 +89,7 @@ def show(run: str, tracking: str) -> None:
 
     RUN is an MLflow run ID or its first four or more characters.
     """
-    from armscan.runs import show as show_run
+    from armscan.runs.show import show as show_run
     from armscan.tracking import find_run
 
     with _open(tracking) as client:
@@ -104,7 +103,7 @@ def show(run: str, tracking: str) -> None:
 @_with_selection
 @click.option("--apply", is_flag=True, help="Remove; without it, nothing is touched.")
 @tracking_option()
-def prune(what: str, apply: bool, tracking: str, **selected: Any) -> int:
+def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, **selected: Any) -> int:
     """Remove checkpoints or folders of ended runs.
 
     checkpoints: from their folders. folders: all of their files on this machine. What is in the store stays: MLflow
@@ -112,13 +111,14 @@ def prune(what: str, apply: bool, tracking: str, **selected: Any) -> int:
     """
     from rich.filesize import decimal
 
-    from armscan.runs import RunRow, find, plan, print_plan, sort_rows
+    from armscan.runs.prune import plan
+    from armscan.runs.query import find
+    from armscan.runs.rows import RunRow, sort_rows
+    from armscan.runs.tables import print_plan
 
     with _open(tracking) as client:
-        selection = _selection(**selected)
-        entries = [RunRow(client, run) for run in find(client, selection)]
-        meant = sort_rows(entries, selection.sort, is_down=selection.is_down)[: selection.limit]
-        cases = plan(client, [entry.run for entry in meant], what)
+        rows = [RunRow(client, run) for run in find(client, **selected)]
+        cases = plan(client, [row.run for row in sort_rows(rows, sort, limit)], what)
         if apply:
             return remove_planned(client, cases, what)
         print_plan(cases)
@@ -202,31 +202,12 @@ def _open(uri: str) -> Iterator[TrackingStore]:
         yield client
 
 
-def _selection(
-    status: Sequence[str] | None,
-    agent: tuple[str, ...] | None,
-    obs: tuple[str, ...] | None,
-    projection: str | None,
-    sort: str,
-    **others: Any,
-) -> Selection:
-    from armscan.runs.query import Selection, projection_params
-
-    return Selection(
-        statuses=frozenset(each.upper() for each in status or ()),
-        choices={f"choice.{group}": names for group, names in (("agent", agent), ("obs", obs)) if names},
-        projections=projection_params(projection) if projection else (),
-        sort=sort.removeprefix("-"),
-        is_down=sort.startswith("-"),
-        **others,
-    )
-
-
 def remove_planned(client: TrackingStore, cases: Sequence[Any], what: str) -> int:
     """Remove what is planned, run by run, and print how each went; return the exit code."""
     from rich.filesize import decimal
 
-    from armscan.runs import RunSkippedError, remove
+    from armscan.runs.prune import remove
+    from armscan.runs.run_folder import RunSkippedError
     from armscan.tracking.client import reason_in
 
     freed, n_removed, n_failed = 0, 0, 0

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import contextlib
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
-from typing import Self
 
 from mlflow.entities import Run
 from mlflow.exceptions import MlflowException
@@ -20,35 +19,14 @@ from armscan.tracking import TrackingStore
 from armscan.tracking.sync import ENDED
 
 PARENT_TAG = "mlflow.parentRunId"
-Children = Mapping[str, Sequence[Run]]
-
-
-@dataclass(frozen=True)
-class Size:
-    """Bytes on disks.
-
-    Args:
-        in_folder: bytes of the runs' own files in their folders on this machine.
-        in_store: bytes of their artifacts; None if a store does not tell.
-    """
-
-    in_folder: int
-    in_store: int | None
-
-    @classmethod
-    def of(cls, client: TrackingStore, runs: Sequence[Run]) -> Self:
-        """Measure runs of a store."""
-        in_folder, in_store = 0, [artifacts_of(client, run) for run in runs]
-        for run in runs:
-            with contextlib.suppress(RunSkippedError):
-                in_folder += sum(OwnFolder.of(run).files().values())
-        known = [sum(files.values()) for files in in_store if files is not None]
-        return cls(in_folder, sum(known) if len(known) == len(in_store) else None)
-
-    @property
-    def n_bytes(self) -> int:
-        """All that is known."""
-        return self.in_folder + (self.in_store or 0)
+# What rows are sorted by.
+SORTS = {
+    "started": "started",
+    "duration": "duration_s",
+    "success": "success_rate",
+    "steps": "mean_steps",
+    "size": "n_bytes",
+}
 
 
 def artifacts_of(client: TrackingStore, run: Run) -> dict[str, int] | None:
@@ -76,26 +54,49 @@ class RunRow:
     Args:
         client: the run's store, asked for sizes when they are needed.
         run: the run.
-        below: the runs that it has called forth, and theirs, as far as they are meant.
-        depth: 0 where it stands by itself, 1 for a child that is shown below its parent, and so on.
-        is_unfolded: whether those below have lines of their own.
+        children: rows of the runs that it has called forth, as far as they are meant, the earliest first. Default:
+            none.
+        depth: 0 where it stands by itself, 1 for a child that is shown below its parent, and so on. Default: 0.
+        is_folded: whether its sizes include those of the runs below it. Default: true.
     """
 
     client: TrackingStore = field(repr=False)
     run: Run
-    below: tuple[Run, ...] = ()
+    children: tuple[RunRow, ...] = ()
     depth: int = 0
-    is_unfolded: bool = True
+    is_folded: bool = True
+
+    @property
+    def below(self) -> list[RunRow]:
+        """Rows of its children, and of theirs."""
+        return [row for child in self.children for row in (child, *child.below)]
 
     @cached_property
-    def size(self) -> Size:
-        """Of the run, and of those that are folded into it."""
-        return Size.of(self.client, [self.run, *(() if self.is_unfolded else self.below)])
+    def in_folder(self) -> int:
+        """Bytes of its own files in its folder on this machine."""
+        n_bytes = sum(child.in_folder for child in self.children) if self.is_folded else 0
+        with contextlib.suppress(RunSkippedError):
+            n_bytes += sum(OwnFolder.of(self.run).files().values())
+        return n_bytes
+
+    @cached_property
+    def in_store(self) -> int | None:
+        """Bytes of its artifacts; None if a store does not tell."""
+        artifacts = artifacts_of(self.client, self.run)
+        parts = [None if artifacts is None else sum(artifacts.values())]
+        parts += [child.in_store for child in self.children if self.is_folded]
+        known = [part for part in parts if part is not None]
+        return sum(known) if len(known) == len(parts) else None
+
+    @property
+    def n_bytes(self) -> int:
+        """All bytes that are known."""
+        return self.in_folder + (self.in_store or 0)
 
     @property
     def started(self) -> datetime:
-        """When it was started."""
-        return started(self.run)
+        """When it was started, in local time."""
+        return datetime.fromtimestamp(self.run.info.start_time / 1000).astimezone()
 
     @property
     def duration_s(self) -> float | None:
@@ -106,74 +107,45 @@ class RunRow:
 
     @property
     def success_rate(self) -> float | None:
-        """On the test volumes; None where it was not judged."""
+        """Success rate on the test volumes; None where it was not evaluated."""
         return self.run.data.metrics.get("test_volumes/success_rate")
 
     @property
     def mean_steps(self) -> float | None:
-        """Mean steps on the test volumes; None where it was not judged."""
+        """Mean steps on the test volumes; None where it was not evaluated."""
         return self.run.data.metrics.get("test_volumes/mean_steps")
 
-    def value_of(self, sort: str) -> float | None:
-        """Return what it is sorted by, `started`, `duration`, `success`, `steps` or `size`; None where it has none."""
-        if sort == "size":
-            # A server is asked for each run's size.
-            return self.size.n_bytes
-        values = {"duration": self.duration_s, "success": self.success_rate, "steps": self.mean_steps}
-        return values.get(sort, self.started.timestamp())
-
-
-def started(run: Run) -> datetime:
-    """Return when a run was started, in local time."""
-    return datetime.fromtimestamp(run.info.start_time / 1000).astimezone()
+    def unfolded(self, depth: int = 0) -> Iterator[RunRow]:
+        """Yield the row and those below it, each below its parent."""
+        yield replace(self, depth=depth, is_folded=False)
+        for child in self.children:
+            yield from child.unfolded(depth + 1)
 
 
 def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
-    """Return runs without those whose parent is among them, which are folded into it."""
-    children, tops = _family(runs)
-    return [RunRow(client, run, tuple(_beneath(run, children)), is_unfolded=False) for run in tops]
-
-
-def expand(entries: Sequence[RunRow], runs: Sequence[Run]) -> list[RunRow]:
-    """Return entries with those below them, each below its parent, the earliest first.
-
-    Args:
-        entries: as `collapse` returns them, in any order.
-        runs: the runs that they were folded from.
-    """
-    children, _ = _family(runs)
-
-    def lines(client: TrackingStore, run: Run, depth: int) -> Iterator[RunRow]:
-        yield RunRow(client, run, tuple(_beneath(run, children)), depth)
-        for child in children[run.info.run_id]:
-            yield from lines(client, child, depth + 1)
-
-    return [line for entry in entries for line in lines(entry.client, entry.run, 0)]
-
-
-def sort_rows(entries: Sequence[RunRow], sort: str, *, is_down: bool) -> list[RunRow]:
-    """Return entries sorted by what `RunRow.value_of` takes; those without come last, whatever the direction."""
-    values = {entry.run.info.run_id: entry.value_of(sort) for entry in entries}
-    known = [entry for entry in entries if values[entry.run.info.run_id] is not None]
-    known.sort(key=lambda entry: values[entry.run.info.run_id] or 0.0, reverse=is_down)
-    return known + [entry for entry in entries if values[entry.run.info.run_id] is None]
-
-
-def _family(runs: Sequence[Run]) -> tuple[Children, list[Run]]:
-    """Return the children of each run by its id, and the runs whose parent is not among them."""
+    """Return rows of the runs whose parent is not among them, the others folded into them."""
     ids = {run.info.run_id for run in runs}
     children: dict[str, list[Run]] = defaultdict(list)
-    tops = []
     for run in sorted(runs, key=lambda run: run.info.start_time):
-        parent = run.data.tags.get(PARENT_TAG)
-        if parent is not None and parent in ids and parent != run.info.run_id:
-            children[parent].append(run)
-        else:
-            tops.append(run)
-    return children, tops
+        parent = run.data.tags.get(PARENT_TAG, "")
+        children[parent if parent in ids and parent != run.info.run_id else ""].append(run)
+
+    def rows(parent: str) -> tuple[RunRow, ...]:
+        return tuple(RunRow(client, run, rows(run.info.run_id)) for run in children[parent])
+
+    return list(rows(""))
 
 
-def _beneath(run: Run, children: Children) -> Iterator[Run]:
-    for child in children[run.info.run_id]:
-        yield child
-        yield from _beneath(child, children)
+def sort_rows(rows: Sequence[RunRow], sort: str, limit: int | None = None) -> list[RunRow]:
+    """Return rows in an order; those without a value come last, whatever the direction.
+
+    Args:
+        rows: the rows.
+        sort: one of `SORTS`, with - before it for the greatest first.
+        limit: number of rows at most. Default: None, all.
+    """
+    # A server is asked for each run's size: once.
+    values = [(getattr(row, SORTS[sort.removeprefix("-")]), row) for row in rows]
+    known = [each for each in values if each[0] is not None]
+    known.sort(key=lambda each: each[0], reverse=sort.startswith("-"))
+    return [row for _, row in (*known, *(each for each in values if each[0] is None))][:limit]

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any
 
+from mlflow.entities import Run
 from rich.console import Console
 from rich.filesize import decimal
 from rich.table import Table
@@ -16,7 +17,7 @@ from rich.text import Text
 
 from armscan.experiment.console import ID_CHARS
 from armscan.runs.prune import PruneItem
-from armscan.runs.rows import PARENT_TAG, RunRow, started
+from armscan.runs.rows import PARENT_TAG, RunRow
 
 MISSING = "-"
 # Of a name, which a multirun's words may be.
@@ -34,47 +35,48 @@ def format_duration(seconds: float | None) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def format_time(moment: datetime) -> str:
-    """Return when it was: the day, or the time where it was today."""
+def format_start(run: Run) -> str:
+    """Return when a run was started: the day, or the time where it was today."""
+    moment = datetime.fromtimestamp(run.info.start_time / 1000).astimezone()
     is_today = moment.date() == datetime.now().astimezone().date()
     return f"{moment:%H:%M}" if is_today else f"{moment:%Y-%m-%d}"
 
 
-def write_entries(entries: Sequence[RunRow], form: str) -> None:
+def write_rows(rows: Sequence[RunRow], form: str) -> None:
     """Print runs.
 
     Args:
-        entries: the lines, in their order.
+        rows: the rows, in their order.
         form: `table`, `csv` or `json`.
     """
     if form == "table":
-        Console().print(_table(entries))
+        Console().print(_table(rows))
         return
-    rows = [_row(entry) for entry in entries]
+    values = [_values(row) for row in rows]
     if form == "json":
-        print(json.dumps(rows, indent=1))
+        print(json.dumps(values, indent=1))
         return
     writer = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows(values)
 
 
-def _table(entries: Sequence[RunRow]) -> Table:
+def _table(rows: Sequence[RunRow]) -> Table:
     """Return a table that fits 80 columns: names have what is left, in as many lines as they need."""
     table = narrow_table("id", "name", "status", "started", "took>", "success>", "steps>", "size>", "below>")
-    for entry in entries:
-        success, steps = entry.success_rate, entry.mean_steps
-        size = decimal(entry.size.n_bytes) + ("" if entry.size.in_store is not None else "+?")
+    for row in rows:
+        success, steps = row.success_rate, row.mean_steps
+        size = decimal(row.n_bytes) + ("" if row.in_store is not None else "+?")
         table.add_row(
-            entry.run.info.run_id[:ID_CHARS],
-            Text("  " * entry.depth + shortened(entry.run.info.run_name)),
-            entry.run.info.status.lower(),
-            format_time(entry.started),
-            format_duration(entry.duration_s),
+            row.run.info.run_id[:ID_CHARS],
+            Text("  " * row.depth + shortened(row.run.info.run_name)),
+            row.run.info.status.lower(),
+            format_start(row.run),
+            format_duration(row.duration_s),
             MISSING if success is None else f"{success:.0%}",
             MISSING if steps is None else f"{steps:.1f}",
             size,
-            str(len(entry.below) or ""),
+            str(len(row.below) or ""),
         )
     return table
 
@@ -104,13 +106,13 @@ COLUMNS = (
 )
 
 
-def _row(entry: RunRow) -> dict[str, Any]:
-    info, tags = entry.run.info, entry.run.data.tags
+def _values(row: RunRow) -> dict[str, Any]:
+    info, tags = row.run.info, row.run.data.tags
     values = (
         *(info.run_id, info.run_name, info.status, info.experiment_id, tags.get(PARENT_TAG)),
-        *(entry.started.isoformat(timespec="seconds"), entry.duration_s, entry.success_rate, entry.mean_steps),
-        *(entry.size.n_bytes, entry.size.in_folder, entry.size.in_store, len(entry.below)),
-        *(tags.get("choice.agent"), tags.get("choice.obs"), entry.run.data.params.get("projection")),
+        *(row.started.isoformat(timespec="seconds"), row.duration_s, row.success_rate, row.mean_steps),
+        *(row.n_bytes, row.in_folder, row.in_store, len(row.below)),
+        *(tags.get("choice.agent"), tags.get("choice.obs"), row.run.data.params.get("projection")),
         *(tags.get("folder"), tags.get("host")),
     )
     return dict(zip(COLUMNS, values, strict=True))
@@ -120,6 +122,6 @@ def print_plan(cases: Sequence[PruneItem]) -> None:
     """Print what would be removed, and why the rest would not."""
     for case in cases:
         info = case.run.info
-        named = f"{shortened(info.run_name)}, {info.status.lower()}, of {format_time(started(case.run))}"
+        named = f"{shortened(info.run_name)}, {info.status.lower()}, of {format_start(case.run)}"
         what = f"frees {decimal(case.n_bytes)}: {named}" if case.left is None else f"stays: {case.left}"
         Console().print(Text(f"{info.run_id[:ID_CHARS]} {what}"), soft_wrap=True)
