@@ -8,16 +8,17 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import psutil
 
 from armscan.utils.files import atomic_write
 
 POLL_S = 0.5
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -47,35 +48,61 @@ def process_start(pid: int) -> str:
         # On Linux, the seconds since boot; psutil adds the time of the boot, which moves with the clock.
         since_s = psutil.boot_time() if psutil.LINUX else 0.0
         return "" if process.status() == psutil.STATUS_ZOMBIE else f"{process.create_time() - since_s:.2f}"
-    except psutil.Error:
+    # Also for what is no process ID.
+    except (psutil.Error, TypeError, ValueError):
         return ""
+
+
+def _boot_and_pid_namespace() -> tuple[str, str]:
+    """Return what tells the process IDs of this process from those of others with its host name."""
+    if not psutil.LINUX:
+        return "any", "any"
+    try:
+        # Processes are looked up in /proc, which may be that of another namespace.
+        is_own = str(Path("/proc/self").readlink()) == str(os.getpid())
+        return BOOT_ID.read_text().strip(), str(Path("/proc/self/ns/pid").readlink()) if is_own else ""
+    except OSError:
+        return "", ""
 
 
 @dataclass(frozen=True)
 class ProcessInfo:
     """A process, so that others can tell whether it is still alive.
 
+    Containers and machines may share a host name; a process ID means something only in one boot and PID namespace.
+
     Args:
         host: the machine that it runs on.
         pid: its ID there.
-        started: when it was started, see `process_start`.
+        started: when it was started, see `process_start`; empty if no process is meant.
         directory: the directory that it works in; empty if nobody has to know.
+        boot: the ID of the machine's boot; empty if it is not known, as in what earlier versions have written.
+        pid_namespace: the PID namespace that its ID is of; empty if it is not known.
     """
 
     host: str
     pid: int
     started: str
     directory: str = ""
+    boot: str = ""
+    pid_namespace: str = ""
 
     @classmethod
     def current(cls, directory: str = "") -> Self:
         """Return the current process."""
-        return cls(socket.gethostname(), os.getpid(), process_start(os.getpid()), directory)
+        pid = os.getpid()
+        return cls(socket.gethostname(), pid, process_start(pid), directory, *_boot_and_pid_namespace())
 
     @classmethod
     def read(cls, file: Path) -> Self:
         """Return the process that a file describes."""
-        return cls(**json.loads(file.read_text()))
+        return cls.of(json.loads(file.read_text()))
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Self:
+        """Return the process that a mapping describes, whatever else is in it; of an earlier version, too."""
+        nobody: dict[str, Any] = {"host": "", "pid": 0, "started": ""}
+        return cls(**nobody | {each.name: values[each.name] for each in fields(cls) if each.name in values})
 
     def write(self, file: Path) -> None:
         """Write it to a file."""
@@ -83,13 +110,19 @@ class ProcessInfo:
 
     @property
     def is_here(self) -> bool:
-        """Whether it is a process of this machine, of which it is known whether it is alive."""
-        return self.host == socket.gethostname()
+        """Whether it is a process that this one sees, of which it is known whether it is alive."""
+        own = (socket.gethostname(), *_boot_and_pid_namespace())
+        return all(own) and own == (self.host, self.boot, self.pid_namespace)
 
     @property
     def is_alive(self) -> bool:
-        """Whether it has not ended; a process of another machine is taken to be alive."""
-        return not self.is_here or process_start(self.pid) == self.started
+        """Whether it has not ended; a process that is not seen from here is taken to be alive."""
+        return not self.is_here or process_start(self.pid) == self.started != ""
+
+    @property
+    def is_current(self) -> bool:
+        """Whether it is the current process."""
+        return self.is_here and self.pid == os.getpid()
 
 
 def on_parent_exit(action: Callable[[], object]) -> None:

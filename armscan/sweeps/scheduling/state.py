@@ -22,7 +22,7 @@ KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED)
 # Of a study: trials whose failures are ignored.
 RESET_FAILURES = "forgiven"
 # In a lease: the worker that holds the trial.
-HOLDER = ("worker", "host", "pid", "started")
+HOLDER = ("worker", "host", "pid", "started", "boot", "pid_namespace")
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 # So many failures before any trial reported are the fault of the configuration.
 FAILURES_AT_ONCE = 3

@@ -46,7 +46,7 @@ class LivenessCheck:
     def is_dead(self, trial: FrozenTrial) -> bool:
         """Whether the worker of a running trial has ended, or has not renewed its lease for long."""
         lease = trial.user_attrs.get(LEASE, {})
-        holder = ProcessInfo(lease.get("host", ""), lease.get("pid", 0), str(lease.get("started")))
+        holder = ProcessInfo.of(lease)
         if holder.is_here:
             return not holder.is_alive
         heartbeat = lease.get("worker"), lease.get("beat")

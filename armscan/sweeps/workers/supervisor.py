@@ -36,7 +36,7 @@ SOON_S = 60.0
 
 
 def local_workers(folder: Path) -> list[ProcessInfo]:
-    """Return the workers of a start that are alive on this machine."""
+    """Return the workers of a start that are alive on this machine, and that this process sees."""
     workers = [ProcessInfo.read(file) for file in folder.glob(WORKER_FILES)]
     return [each for each in workers if each.is_here and each.is_alive]
 
@@ -54,7 +54,7 @@ def run_worker(words: Sequence[str], number: int, folder: Path) -> None:
         SystemExit: see `Notice.follow`.
     """
     launcher = _launcher_of(folder)
-    if os.getpid() != launcher.pid:
+    if not launcher.is_current:
         # A Ctrl-C reaches all processes of a terminal, but it is the launcher that asks the workers to leave.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     study_input = pickle.dumps((list(words), number, folder))

@@ -5,6 +5,7 @@ import os
 import random
 import signal
 import time
+from dataclasses import asdict
 
 import optuna
 import pytest
@@ -13,7 +14,7 @@ from optuna.trial import TrialState
 from armscan.sweeps.scheduling.state import ATTEMPT, FAILURE, LEASE, RETRIED, RETRY_OF, StudyState
 from armscan.sweeps.workers import heartbeat as lease_module
 from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
-from armscan.utils.processes import process_start
+from armscan.utils.processes import ProcessInfo, process_start
 from tests.support.waiting import wait_until
 from tests.sweeps.conftest import fail
 
@@ -152,7 +153,7 @@ def work(make_scheduler, n_trials):
         LivenessCheck(),
         random.Random(os.getpid()),
     )
-    lease = {"host": os.uname().nodename, "pid": os.getpid(), "started": process_start(os.getpid())}
+    lease = asdict(ProcessInfo.current())
     while scheduler.end(scheduler.state()) is None:
         scheduler.reclaim(liveness.is_dead)
         trial = scheduler.claim(lease)
@@ -219,7 +220,7 @@ def test_witness_knows_a_process_that_is_gone_and_one_that_has_its_number(make_s
     scheduler, liveness = make_scheduler(), LivenessCheck()
     process = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
     process.start()
-    here = {"host": os.uname().nodename, "pid": process.pid, "started": process_start(process.pid)}
+    here = asdict(ProcessInfo.current()) | {"pid": process.pid, "started": process_start(process.pid)}
     scheduler.claim(here)
     assert not liveness.is_dead(scheduler.state().running[0])
     scheduler.renew(_trial(scheduler), here | {"started": "1"})
@@ -260,7 +261,7 @@ def test_keepers_of_many_trials_take_turns_in_looking_after_them(make_scheduler,
     monkeypatch.setattr(lease_module, "MAX_CHECKERS", 2)
     heartbeat = Heartbeat(scheduler, "a", is_told_to_leave=lambda: False, leave=lambda: None, on_death=pytest.fail)
     heartbeat.claim()
-    alive = {"host": os.uname().nodename, "pid": os.getpid(), "started": process_start(os.getpid())}
+    alive = asdict(ProcessInfo.current())
     for _ in range(4):
         scheduler.claim(alive | {"worker": "b"})
     state = scheduler.state

@@ -6,6 +6,7 @@ import random
 import sqlite3
 import threading
 import time
+from dataclasses import asdict
 
 import optuna
 import pytest
@@ -23,7 +24,7 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.workers import heartbeat as lease
 from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
 from armscan.utils import retry
-from armscan.utils.processes import process_start
+from armscan.utils.processes import ProcessInfo
 from tests.support.waiting import HANG_S, wait_until
 
 
@@ -166,7 +167,7 @@ def test_what_was_decided_where_something_went_wrong_is_not_there(open_scheduler
 
 def work(open_scheduler, n_trials):
     scheduler, liveness, chance = open_scheduler(n_trials=n_trials), LivenessCheck(), random.Random(os.getpid())
-    holder = {"host": os.uname().nodename, "pid": os.getpid(), "started": process_start(os.getpid())}
+    holder = asdict(ProcessInfo.current())
     outcome = None
     while outcome is not None or scheduler.end(scheduler.state()) is None:
         scheduler.reclaim(liveness.is_dead)
