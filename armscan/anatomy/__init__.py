@@ -1,10 +1,8 @@
 """What is seen in a slice: tissues, their clusters, and the rewards computed from them."""
 
-from armscan.anatomy.dice import tissue_dice
-from armscan.anatomy.landmarks import Clusters, Landmarks, TissueClusters
+from armscan.anatomy.landmarks import Clusters, Landmarks, TissueClusters, tissue_dice
 from armscan.anatomy.plane_search import FoundPlane, PlaneScorer, find_optimal_plane
 from armscan.anatomy.rewards import (
-    OTHER_PUBLISHED_TARGETS,
     PUBLISHED_TARGETS,
     AgreementReward,
     LandmarkReward,
@@ -14,11 +12,8 @@ from armscan.anatomy.rewards import (
 )
 from armscan.anatomy.scanner import Scanner
 from armscan.anatomy.tissues import (
-    ARTERY,
-    BONES,
     METRIC_TISSUES,
     PIXEL_TISSUES,
-    TENDONS,
     USUAL_PIXEL_MM,
     MetricTissue,
     PixelTissue,
@@ -28,13 +23,9 @@ from armscan.anatomy.tissues import (
 )
 
 __all__ = [
-    "ARTERY",
-    "BONES",
     "METRIC_TISSUES",
-    "OTHER_PUBLISHED_TARGETS",
     "PIXEL_TISSUES",
     "PUBLISHED_TARGETS",
-    "TENDONS",
     "USUAL_PIXEL_MM",
     "AgreementReward",
     "Clusters",

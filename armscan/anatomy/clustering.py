@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 IntArray = NDArray[np.int64]
 RunArray = NDArray[np.int32]
+# First and last column of each run, and the number of the first run of each row.
+Runs = tuple[RunArray, RunArray, IntArray]
 Pixels = NDArray[np.uint8]
 
 
@@ -65,32 +67,27 @@ def _find_core(mask: Pixels, stride: int, half_widths: IntArray, min_samples: in
                 for i in range(n_pixels):
                     shifted[i] += window[i]
     core = np.empty(n_pixels, dtype=np.uint8)
-    counted = counts[reach * stride :][:n_pixels]
     for i in range(n_pixels):
-        core[i] = inside[i] & np.uint8(counted[i] >= min_samples)
+        core[i] = inside[i] & np.uint8(counts[reach * stride + i] >= min_samples)
     return core
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _find_runs(core: Pixels, n_cols: int, longest: int) -> tuple[RunArray, RunArray, IntArray]:
-    """Return the first and last column of each run of core pixels, and the number of the first run of each row."""
+def _find_runs(core: Pixels, n_cols: int, are_joined: bool) -> Runs:
+    """Return the runs of core pixels; each pixel is a run of its own where neighbours in a row are not joined."""
     n_rows = core.shape[0]
-    capacity = n_rows * (n_cols // 2 + 1 if longest > 1 else n_cols)
+    capacity = n_rows * (n_cols // 2 + 1 if are_joined else n_cols)
     starts, stops = np.empty(capacity, dtype=np.int32), np.empty(capacity, dtype=np.int32)
     first_run = np.zeros(n_rows + 1, dtype=np.int64)
     n_runs = 0
     for row in range(n_rows):
         line = core[row]
-        col = 0
-        while col < n_cols:
+        for col in range(n_cols):
             if line[col]:
-                start = col
-                while col < n_cols and line[col] and col - start < longest:
-                    col += 1
-                starts[n_runs], stops[n_runs] = start, col - 1
-                n_runs += 1
-            else:
-                col += 1
+                if not are_joined or col == 0 or not line[col - 1]:
+                    starts[n_runs] = col
+                    n_runs += 1
+                stops[n_runs - 1] = col
         first_run[row + 1] = n_runs
     return starts[:n_runs], stops[:n_runs], first_run
 
@@ -104,8 +101,9 @@ def _find_root(parents: IntArray, run: int) -> int:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _number_runs(starts: RunArray, stops: RunArray, first_run: IntArray, half_widths: IntArray) -> tuple[RunArray, int]:
+def _number_runs(runs: Runs, half_widths: IntArray) -> tuple[RunArray, int]:
     """Return the cluster of each run, from 0 in the order of the clusters' first runs, and how many there are."""
+    starts, stops, first_run = runs
     n_rows, n_runs = first_run.size - 1, starts.size
     parents = np.arange(n_runs)
     for row in range(n_rows):
@@ -122,27 +120,18 @@ def _number_runs(starts: RunArray, stops: RunArray, first_run: IntArray, half_wi
     numbers = np.empty(n_runs, dtype=np.int32)
     n_clusters = 0
     for run in range(n_runs):
-        root = _find_root(parents, run)
-        if root == run:
+        if parents[run] == run:
             numbers[run] = n_clusters
             n_clusters += 1
         else:
-            numbers[run] = numbers[root]
+            numbers[run] = numbers[parents[run]]
     return numbers, n_clusters
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _reached(
-    shape: tuple[int, int],
-    starts: RunArray,
-    stops: RunArray,
-    first_run: IntArray,
-    numbers: RunArray,
-    half_widths: IntArray,
-    n_clusters: int,
-) -> RunArray:
+def _reached(shape: tuple[int, int], runs: Runs, numbers: RunArray, half_widths: IntArray, n_clusters: int) -> RunArray:
     """Return for each pixel the lowest cluster with a core pixel within eps, `n_clusters` where there is none."""
-    n_rows, n_cols = shape
+    (n_rows, n_cols), (starts, stops, first_run) = shape, runs
     reached = np.full(shape, np.int32(n_clusters))
     reach = half_widths.size - 1
     for row in range(n_rows):
@@ -193,18 +182,16 @@ def _cluster(
     flat = np.zeros((n_rows + 2 * reach) * stride + 2 * pad, dtype=np.uint8)
     mask = flat[reach * stride + pad :][: n_rows * stride].reshape((n_rows, stride))
     for row in range(n_rows):
-        line = slice_xz[row_first + row, col_first:col_stop]
-        for col in range(n_cols):
-            mask[row, col] = line[col] == label
+        mask[row, :n_cols] = slice_xz[row_first + row, col_first:col_stop] == label
     if count_disc_pixels(half_widths) < 2**8:
         flat_core = _find_core(flat, stride, half_widths, min_samples, np.uint8(0))
     else:
         flat_core = _find_core(flat, stride, half_widths, min_samples, np.uint32(0))
     core = flat_core.reshape((n_rows, stride))
     # Below an eps of one column not even the next pixel is a neighbour, and every run is a single pixel.
-    starts, stops, first_run = _find_runs(core, n_cols, n_cols if pad >= 1 else 1)
-    numbers, n_clusters = _number_runs(starts, stops, first_run, half_widths)
-    clusters = _reached((n_rows, n_cols), starts, stops, first_run, numbers, half_widths, n_clusters)
+    runs = _find_runs(core, n_cols, pad >= 1)
+    numbers, n_clusters = _number_runs(runs, half_widths)
+    clusters = _reached((n_rows, n_cols), runs, numbers, half_widths, n_clusters)
     sums = np.zeros((n_clusters + 1, 3), dtype=np.int64)
     for row in range(n_rows):
         for col in range(n_cols):
@@ -216,7 +203,6 @@ def _cluster(
     return row_first, col_first, mask[:, :n_cols], clusters, sums
 
 
-@numba.njit(cache=True, nogil=True)
 def cluster_label(
     slice_xz: Pixels, label: int, half_widths: IntArray, min_samples: int
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], IntArray]:
@@ -233,14 +219,12 @@ def cluster_label(
         the lowest-numbered cluster within eps; 0 for noise and background), the mean pixel coordinate of each
         cluster, shape (n_clusters, 2), and its number of pixels, shape (n_clusters,).
     """
-    row_first, col_first, mask, clusters, sums = _cluster(slice_xz, label, half_widths, min_samples)
-    n_clusters = sums.shape[0] - 1
+    first_row, first_col, mask, clusters, sums = _cluster(slice_xz, label, half_widths, min_samples)
+    sums = sums[:-1]
     image = np.zeros(slice_xz.shape, dtype=np.int32)
-    for row in range(mask.shape[0]):
-        for col in range(mask.shape[1]):
-            if mask[row, col] and clusters[row, col] < n_clusters:
-                image[row_first + row, col_first + col] = clusters[row, col] + 1
-    return image, sums[:n_clusters, 1:] / sums[:n_clusters, :1], sums[:n_clusters, 0].copy()
+    box = image[first_row:, first_col:][: mask.shape[0], : mask.shape[1]]
+    box[:] = np.where((mask > 0) & (clusters < len(sums)), clusters + 1, 0)
+    return image, sums[:, 1:] / sums[:, :1], sums[:, 0].copy()
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -257,15 +241,10 @@ def summarise_label(
         summary: filled with the number of clusters, the number of pixels in them, and the mean of their centres,
             (across, depth) in pixels, 0 where there is none; shape (4,).
     """
-    sums = _cluster(slice_xz, label, half_widths, min_samples)[4]
-    n_clusters = sums.shape[0] - 1
+    sums = _cluster(slice_xz, label, half_widths, min_samples)[4][:-1]
     summary[:] = 0.0
-    summary[0] = n_clusters
-    for number in range(n_clusters):
-        n_pixels = sums[number, 0]
-        summary[1] += n_pixels
-        summary[2] += sums[number, 1] / n_pixels
-        summary[3] += sums[number, 2] / n_pixels
-    if n_clusters > 0:
-        summary[2] /= n_clusters
-        summary[3] /= n_clusters
+    summary[0] = len(sums)
+    for of_cluster in sums:
+        summary[1] += of_cluster[0]
+        summary[2:] += of_cluster[1:] / of_cluster[0]
+    summary[2:] /= max(1, len(sums))

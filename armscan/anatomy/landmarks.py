@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.anatomy.clustering import cluster_label
-from armscan.anatomy.tissues import ARTERY, BONES, TENDONS, USUAL_PIXEL_MM, Tissue, check_tissue
+from armscan.anatomy.tissues import PIXEL_TISSUES, USUAL_PIXEL_MM, Tissues, check_tissues
 from armscan.errors import InvalidValueError
+from armscan.volumes import LABEL_NAMES, LANDMARK_LABELS
 
 Landmarks = NDArray[np.float64]
 """Summary of a slice, shape (3, 4): a row for bones, tendons and artery, each with the number of clusters, the number
@@ -44,18 +45,6 @@ class Clusters:
         """Mean of the clusters' centres, (across, depth) in pixels; zeros where there is no cluster."""
         return self.centres.mean(axis=0) if len(self) else np.zeros(2)
 
-    @classmethod
-    def of_tissue(
-        cls, slice_xz: NDArray[np.uint8], tissue: Tissue, pixel_mm: tuple[float, float] = USUAL_PIXEL_MM
-    ) -> Self:
-        """Clusters the pixels of one tissue.
-
-        Raises:
-            InvalidValueError: if the slice is not a 2-D array of integers, or the tissue is none.
-        """
-        neighbourhood = check_tissue("tissue", tissue).neighbourhood(pixel_mm)
-        return cls(*cluster_label(_checked_slice(slice_xz), tissue.label, *neighbourhood))
-
 
 @dataclass(frozen=True, eq=False)
 class TissueClusters:
@@ -69,26 +58,22 @@ class TissueClusters:
     def from_slice(
         cls,
         slice_xz: NDArray[Any],
-        *,
-        bones: Tissue = BONES,
-        tendons: Tissue = TENDONS,
-        artery: Tissue = ARTERY,
+        tissues: str | Tissues = PIXEL_TISSUES,
         pixel_mm: tuple[float, float] = USUAL_PIXEL_MM,
     ) -> Self:
         """Clusters a slice of labels, indexed [across, depth].
 
         Args:
             slice_xz: integer labels.
-            bones: how bones are clustered.
-            tendons: how tendons are.
-            artery: how the artery is.
+            tissues: `pixels`, `metric`, or how each tissue is clustered.
             pixel_mm: size of a pixel, (across, depth), for tissues that are clustered by millimetres.
 
         Raises:
-            InvalidValueError: if the slice is not a 2-D array of integers.
+            InvalidValueError: if the slice is not a 2-D array of integers, or the tissues or the size are none.
         """
         slice_xz = _checked_slice(slice_xz)
-        return cls(*(Clusters.of_tissue(slice_xz, tissue, pixel_mm) for tissue in (bones, tendons, artery)))
+        rules = [(tissue.label, *tissue.neighbourhood(pixel_mm)) for tissue in check_tissues(tissues)]
+        return cls(*(Clusters(*cluster_label(slice_xz, *rule)) for rule in rules))
 
     def each(self) -> tuple[Clusters, Clusters, Clusters]:
         """Return the tissues in their fixed order: bones, tendons, artery."""
@@ -103,6 +88,24 @@ class TissueClusters:
     def landmarks(self) -> Landmarks:
         """The summary that rewards are computed from, shape (3, 4)."""
         return np.array([[len(tissue), tissue.n_points, *tissue.mean_centre] for tissue in self.each()])
+
+
+def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) -> dict[str, float]:
+    """Return the Dice coefficient of each landmark tissue in two slices of one shape, by its name.
+
+    It is twice the pixels that both have of the tissue, over the pixels that either has: 1 where they are the same, 0
+    where none is shared. Where neither slice shows the tissue, they agree: 1.
+
+    Args:
+        slice_xz: labels, indexed [across, depth].
+        reference_xz: likewise.
+    """
+    dice = {}
+    for label in LANDMARK_LABELS:
+        mask, reference = slice_xz == label, reference_xz == label
+        total = int(mask.sum() + reference.sum())
+        dice[LABEL_NAMES[label]] = 2.0 * int((mask & reference).sum()) / total if total else 1.0
+    return dice
 
 
 def _checked_slice(slice_xz: Any) -> NDArray[Any]:

@@ -41,14 +41,12 @@ class FoundPlane:
         score: its reward, in [-1, 0].
         counts: clusters of bones, tendons and artery that it shows.
         spread: how far the planes that score best reach, end to end: (rz, rx) in degrees, along the arm in mm.
-        n_planes: how many planes were scored.
     """
 
     action: ManipulatorAction
     score: float
     counts: tuple[int, int, int]
     spread: tuple[float, float, float]
-    n_planes: int
 
 
 @dataclass(frozen=True)
@@ -182,7 +180,7 @@ def find_optimal_plane(
     plane = max(planes, key=lambda plane: judge.seen(plane)[0] >= fine_rewards.max() - SAME_REWARD)
     score, counts = judge.seen(plane)
     spread_rz, spread_rx, spread_along = (float(width) for width in np.ptp(region, axis=0) * fine.steps)
-    return FoundPlane(plane, score, counts, (spread_rz, spread_rx, spread_along), rewards.size + fine_rewards.size)
+    return FoundPlane(plane, score, counts, (spread_rz, spread_rx, spread_along))
 
 
 def largest_best_region(rewards: FloatArray) -> NDArray[np.int64]:

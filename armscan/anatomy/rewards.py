@@ -9,16 +9,14 @@ from typing import NamedTuple, Protocol, Self
 import numpy as np
 
 from armscan.anatomy.landmarks import Landmarks, TissueClusters
-from armscan.anatomy.tissues import PIXEL_TISSUES, USUAL_PIXEL_MM, Tissues
+from armscan.anatomy.tissues import N_TISSUES, PIXEL_TISSUES, USUAL_PIXEL_MM, Tissues
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.utils.validation import check_float, check_ints
 from armscan.volumes.volume import LabelVolume
 
 PUBLISHED_TARGETS = (4, 3, 1)
-OTHER_PUBLISHED_TARGETS = (7, 5, 1)
 # Multiplying by it, where a division would do, gives the published figures to the last bit.
 THIRD = 1 / 3
-N_TISSUES = 3
 
 
 class Reward(Protocol):
@@ -163,7 +161,7 @@ class AgreementReward:
         if volume.optimal_action is None:
             raise OptimalPlaneError(f"{volume.name}: has no labelled optimal plane, which the reward is fitted to")
         slice_xz = volume.slice(volume.optimal_action)
-        clusters = TissueClusters.from_slice(slice_xz, **tissues._asdict(), pixel_mm=volume.pixel_mm)
+        clusters = TissueClusters.from_slice(slice_xz, tissues, volume.pixel_mm)
         features = _features(clusters.landmarks, volume.pixel_mm)
         known = [feature for feature in features if feature is not None]
         if len(known) < len(features):

@@ -9,12 +9,11 @@ import numpy as np
 
 from armscan.anatomy.clustering import IntArray, Pixels, summarise_label
 from armscan.anatomy.landmarks import Landmarks
-from armscan.anatomy.tissues import Tissues
+from armscan.anatomy.tissues import N_TISSUES, Tissues
 from armscan.volumes.plane import FloatArray
 from armscan.volumes.slicing import sample_plane
 from armscan.volumes.volume import LabelVolume
 
-Spacing = tuple[float, float, float]
 # Parts that many planes are taken in, so that where one core is busy with other work, the others take more of them.
 N_CHUNKS = 16
 
@@ -22,31 +21,32 @@ N_CHUNKS = 16
 @numba.njit(cache=True, nogil=True)
 def _look(
     labels_xyz: Pixels,
-    spacing_mm: Spacing,
+    which: int,
     matrix: FloatArray,
     offset_mm: FloatArray,
+    spacings_mm: FloatArray,
     tissue_labels: IntArray,
     half_widths: IntArray,
     min_samples: IntArray,
     slice_xz: Pixels,
     landmarks: Landmarks,
 ) -> None:
-    """Fill a slice and its summary; `half_widths` has a row for each tissue, ended by -1."""
-    sample_plane(labels_xyz, spacing_mm, matrix, offset_mm, slice_xz)
+    """Fill a slice and its summary; `half_widths` has for each volume a row a tissue, ended by -1."""
+    s_x, s_y, s_z = spacings_mm[which]
+    sample_plane(labels_xyz, (s_x, s_y, s_z), matrix, offset_mm, slice_xz)
     for tissue in range(tissue_labels.size):
-        n_widths = np.sum(half_widths[tissue] >= 0)
-        summarise_label(
-            slice_xz, tissue_labels[tissue], half_widths[tissue, :n_widths], min_samples[tissue], landmarks[tissue]
-        )
+        widths = half_widths[which, tissue]
+        widths = widths[: np.sum(widths >= 0)]
+        summarise_label(slice_xz, tissue_labels[tissue], widths, min_samples[which, tissue], landmarks[tissue])
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _look_all(
     volumes: Sequence[Pixels],
     which: IntArray,
-    spacings_mm: FloatArray,
     matrices: FloatArray,
     offsets_mm: FloatArray,
+    spacings_mm: FloatArray,
     tissue_labels: IntArray,
     half_widths: IntArray,
     min_samples: IntArray,
@@ -54,21 +54,12 @@ def _look_all(
     landmarks: FloatArray,
 ) -> None:
     """As `_look`, for the planes i of the volumes `which[i]`; row i of `slices` begins with the pixels of slice i."""
+    rules = spacings_mm, tissue_labels, half_widths, min_samples
     for i in numba.prange(which.size):
         labels_xyz = volumes[which[i]]
-        s_x, s_y, s_z = spacings_mm[which[i]]
         n_across, n_depth = labels_xyz.shape[0], labels_xyz.shape[2]
-        _look(
-            labels_xyz,
-            (s_x, s_y, s_z),
-            matrices[i],
-            offsets_mm[i],
-            tissue_labels,
-            half_widths[which[i]],
-            min_samples[which[i]],
-            slices[i, : n_across * n_depth].reshape((n_across, n_depth)),
-            landmarks[i],
-        )
+        slice_xz = slices[i, : n_across * n_depth].reshape((n_across, n_depth))
+        _look(labels_xyz, which[i], matrices[i], offsets_mm[i], *rules, slice_xz, landmarks[i])
 
 
 class Scanner:
@@ -82,15 +73,18 @@ class Scanner:
     def __init__(self, volumes: Sequence[LabelVolume], tissues: Tissues) -> None:
         self.volumes = tuple(volumes)
         self._shapes = [volume.slice_shape for volume in self.volumes]
-        self._spacings = [volume.spacing for volume in self.volumes]
-        self._tissue_labels = np.array([tissue.label for tissue in tissues])
         rules = [[tissue.neighbourhood(volume.pixel_mm) for tissue in tissues] for volume in self.volumes]
         longest = max(len(rule.half_widths) for each in rules for rule in each)
-        self._half_widths = np.full((len(rules), len(tissues), longest), -1, dtype=np.int64)
-        self._min_samples = np.array([[rule.min_samples for rule in each] for each in rules])
+        half_widths = np.full((len(rules), len(tissues), longest), -1, dtype=np.int64)
         for volume, each in enumerate(rules):
             for tissue, rule in enumerate(each):
-                self._half_widths[volume, tissue, : len(rule.half_widths)] = rule.half_widths
+                half_widths[volume, tissue, : len(rule.half_widths)] = rule.half_widths
+        self._rules = (
+            np.array([volume.spacing for volume in self.volumes]),
+            np.array([tissue.label for tissue in tissues]),
+            half_widths,
+            np.array([[rule.min_samples for rule in each] for each in rules]),
+        )
         self._typed_volumes: numba.typed.List | None = None
 
     def look(self, which: int, matrix: FloatArray, offset_mm: FloatArray) -> tuple[Pixels, Landmarks]:
@@ -105,18 +99,8 @@ class Scanner:
             The slice, indexed [across, depth], and the summary of its clusters.
         """
         slice_xz = np.empty(self._shapes[which], dtype=np.uint8)
-        landmarks = np.empty((len(self._tissue_labels), 4))
-        _look(
-            self.volumes[which].labels,
-            self._spacings[which],
-            matrix,
-            offset_mm,
-            self._tissue_labels,
-            self._half_widths[which],
-            self._min_samples[which],
-            slice_xz,
-            landmarks,
-        )
+        landmarks = np.empty((N_TISSUES, 4))
+        _look(self.volumes[which].labels, which, matrix, offset_mm, *self._rules, slice_xz, landmarks)
         return slice_xz, landmarks
 
     def look_all(
@@ -136,20 +120,9 @@ class Scanner:
             self._typed_volumes = numba.typed.List([volume.labels for volume in self.volumes])
         shapes = [self._shapes[i] for i in which]
         slices = np.empty((len(which), max(n_across * n_depth for n_across, n_depth in shapes)), dtype=np.uint8)
-        landmarks = np.empty((len(which), len(self._tissue_labels), 4))
+        landmarks = np.empty((len(which), N_TISSUES, 4))
         with numba.parallel_chunksize(max(1, len(which) // N_CHUNKS)):
-            _look_all(
-                self._typed_volumes,
-                which,
-                np.array(self._spacings),
-                matrices,
-                offsets_mm,
-                self._tissue_labels,
-                self._half_widths,
-                self._min_samples,
-                slices,
-                landmarks,
-            )
+            _look_all(self._typed_volumes, which, matrices, offsets_mm, *self._rules, slices, landmarks)
         return [
             row[: n_across * n_depth].reshape(n_across, n_depth)
             for row, (n_across, n_depth) in zip(slices, shapes, strict=True)

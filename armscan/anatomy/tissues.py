@@ -11,6 +11,7 @@ from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_float, check_int, check_numbers
 
 USUAL_PIXEL_MM = (0.27, 0.55)
+N_TISSUES = 3
 # A pixel at exactly eps is a neighbour, also where its spacing was kept as a 32-bit float.
 ROUNDING = 1.0 + 1e-6
 LARGEST_EPS_PX = 1000.0
@@ -103,10 +104,11 @@ class Tissues(NamedTuple):
 
 
 # Tuned to pixels of about 0.27 mm across and 0.55 mm in depth.
-BONES = PixelTissue(label=1, eps_px=4.1, min_samples=46)
-TENDONS = PixelTissue(label=2, eps_px=3.0, min_samples=18)
-ARTERY = PixelTissue(label=3, eps_px=1.1, min_samples=4)
-PIXEL_TISSUES = Tissues(BONES, TENDONS, ARTERY)
+PIXEL_TISSUES = Tissues(
+    PixelTissue(label=1, eps_px=4.1, min_samples=46),
+    PixelTissue(label=2, eps_px=3.0, min_samples=18),
+    PixelTissue(label=3, eps_px=1.1, min_samples=4),
+)
 
 # Finds what the pixel mode finds at its own spacing, and the same at others, for pixels of up to about 0.55 mm.
 METRIC_TISSUES = Tissues(
@@ -130,13 +132,7 @@ def check_tissues(clustering: str | Tissues) -> Tissues:
             f"clustering is {clustering!r}, but it must be {' or '.join(CLUSTERINGS)}, or an armscan.anatomy.Tissues"
         )
     for name, tissue in clustering._asdict().items():
-        check_tissue(name, tissue)
+        has_parts = hasattr(tissue, "label") and callable(getattr(tissue, "neighbourhood", None))
+        if isinstance(tissue, type) or not has_parts:
+            raise InvalidValueError(f"{name} is {tissue!r}, but it must be a PixelTissue, a MetricTissue or the like")
     return clustering
-
-
-def check_tissue(name: str, tissue: Tissue) -> Tissue:
-    """Return `tissue` if it has what `Tissue` has."""
-    has_parts = hasattr(tissue, "label") and callable(getattr(tissue, "neighbourhood", None))
-    if isinstance(tissue, type) or not has_parts:
-        raise InvalidValueError(f"{name} is {tissue!r}, but it must be a PixelTissue, a MetricTissue or the like")
-    return tissue

@@ -66,7 +66,7 @@ class View:
     @cached_property
     def clusters(self) -> TissueClusters:
         """The clusters themselves, found again when they are asked for."""
-        return TissueClusters.from_slice(self.slice_xz, **self.tissues._asdict(), pixel_mm=self.geometry.pixel_mm)
+        return TissueClusters.from_slice(self.slice_xz, self.tissues, self.geometry.pixel_mm)
 
 
 class Observation(Protocol):

@@ -6,15 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from armscan.anatomy import (
-    BONES,
     METRIC_TISSUES,
+    PIXEL_TISSUES,
     AgreementReward,
-    Clusters,
     LandmarkReward,
     MetricTissue,
     PixelTissue,
     TissueClusters,
-    Tissues,
     check_tissues,
     landmark_reward,
 )
@@ -24,13 +22,17 @@ from tests.support.junk import SETTINGS, junk, refuses
 SLICE = np.ones((9, 7), np.uint8)
 
 
+def clusters_by(tendons):
+    return TissueClusters.from_slice(SLICE, PIXEL_TISSUES._replace(tendons=tendons))
+
+
 @pytest.mark.parametrize("changed", ["label", "eps_px", "min_samples"])
 @SETTINGS
 @given(junk)
 def test_pixel_tissue_with_junk(changed, value):
     tissue = refuses(lambda: PixelTissue(**{"label": 1, "eps_px": 2.0, "min_samples": 3} | {changed: value}))
     if tissue is not None:
-        assert len(Clusters.of_tissue(SLICE, tissue)) <= SLICE.size
+        assert len(clusters_by(tissue).tendons) <= SLICE.size
 
 
 @pytest.mark.parametrize("changed", ["label", "eps_mm", "density"])
@@ -39,30 +41,29 @@ def test_pixel_tissue_with_junk(changed, value):
 def test_metric_tissue_with_junk(changed, value):
     tissue = refuses(lambda: MetricTissue(**{"label": 1, "eps_mm": 2.0, "density": 0.5} | {changed: value}))
     if tissue is not None:
-        refuses(lambda: Clusters.of_tissue(SLICE, tissue))
+        refuses(lambda: clusters_by(tissue))
 
 
 @SETTINGS
 @given(junk | st.tuples(*[st.floats(0.005, 1e308) | st.floats(0, 1e-6)] * 2))
 def test_pixel_size_of_junk(pixel_mm):
     refuses(lambda: METRIC_TISSUES.bones.neighbourhood(pixel_mm))
-    refuses(lambda: TissueClusters.from_slice(SLICE, **METRIC_TISSUES._asdict(), pixel_mm=pixel_mm))
+    refuses(lambda: TissueClusters.from_slice(SLICE, METRIC_TISSUES, pixel_mm))
 
 
 @SETTINGS
 @given(junk)
 def test_clusters_of_junk(slice_xz):
     refuses(lambda: TissueClusters.from_slice(slice_xz))
-    refuses(lambda: Clusters.of_tissue(slice_xz, BONES))
 
 
 @SETTINGS
 @given(junk)
 def test_clusters_by_junk(tissue):
-    refuses(lambda: TissueClusters.from_slice(SLICE, tendons=tissue))
-    refuses(lambda: Clusters.of_tissue(SLICE, tissue))
+    refuses(lambda: clusters_by(tissue))
+    refuses(lambda: TissueClusters.from_slice(SLICE, tissue))
     refuses(lambda: check_tissues(tissue))
-    refuses(lambda: check_tissues(Tissues(BONES, tissue, BONES)))
+    refuses(lambda: check_tissues(PIXEL_TISSUES._replace(tendons=tissue)))
 
 
 @pytest.mark.parametrize("shape", [(0, 5), (5, 0), (0, 0), (1, 1)])

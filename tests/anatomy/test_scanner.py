@@ -32,7 +32,7 @@ def test_scanner_sees_what_slices_and_clusters_show(volumes, tissues):
     for place, plane in zip(*drawn_planes(volumes, 40), strict=True):
         slice_xz, landmarks = scanner.look(place, plane.matrix, plane.offset_mm)
         np.testing.assert_array_equal(slice_xz, volumes[place].slice(plane))
-        clusters = TissueClusters.from_slice(slice_xz, **tissues._asdict(), pixel_mm=volumes[place].pixel_mm)
+        clusters = TissueClusters.from_slice(slice_xz, tissues, volumes[place].pixel_mm)
         np.testing.assert_array_equal(landmarks, clusters.landmarks)
         n_clusters += landmarks[:, 0].sum()
     assert n_clusters > 50

@@ -42,7 +42,7 @@ def test_metric_clusters_score_labelled_planes_at_every_spacing(dataset):
             finer = labelled.repeat(across, axis=0).repeat(depth, axis=1)
             seen.append((finer, (across_mm / across, depth_mm / depth)))
         for slice_xz, pixel_mm in seen:
-            clusters = TissueClusters.from_slice(slice_xz, **METRIC_TISSUES._asdict(), pixel_mm=pixel_mm)
+            clusters = TissueClusters.from_slice(slice_xz, METRIC_TISSUES, pixel_mm)
             assert landmark_reward(clusters) > -0.05, (volume.name, pixel_mm, clusters.counts)
 
 

@@ -308,7 +308,7 @@ def test_env_clusters_by_millimetres(wrist, clustering):
     env.reset(seed=0)
     info = env.step(env.scene.optimum_normalised)[4]
     view = env.episode.view
-    metric = TissueClusters.from_slice(env.slice_xz, **METRIC_TISSUES._asdict(), pixel_mm=wrist.pixel_mm)
+    metric = TissueClusters.from_slice(env.slice_xz, METRIC_TISSUES, wrist.pixel_mm)
     np.testing.assert_array_equal(view.landmarks, metric.landmarks)
     assert (view.landmarks != TissueClusters.from_slice(env.slice_xz).landmarks).any()
     assert view.clusters.counts == metric.counts == tuple(info["counts"])
