@@ -22,9 +22,9 @@ from armscan.sweeps.results.summary import final_results, shown_of, values_of
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, StudyState
 from armscan.sweeps.space.overrides import overrides_of
-from armscan.sweeps.study.finalists import best_trials
 from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.settings import StudySettings
+from armscan.sweeps.study.study import best_trials
 from armscan.utils.retry import no_retry
 
 REFRESH_S = 2.0

@@ -3,20 +3,32 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import optuna
+from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
+from optuna.visualization import (
+    plot_intermediate_values,
+    plot_optimization_history,
+    plot_parallel_coordinate,
+    plot_pareto_front,
+    plot_slice,
+)
+from plotly import graph_objects
 
-from armscan.reports.html import table, video_address, write_page
-from armscan.sweeps.results.charts import charts, importances
+from armscan.reports.html import chart, table, video_address, write_page
 from armscan.sweeps.results.summary import ConfigResult, final_results, shown_of, values_of
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINALIST, METRICS, RETRIED, RETRY_OF, StudyState
 from armscan.sweeps.space.overrides import overrides_of
-from armscan.sweeps.study.finalists import best_trials
+from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import FOLDER, RUN
+
+MIN_TRIALS_FOR_IMPORTANCE = 4
 
 
 def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folder: Path) -> Path:
@@ -50,7 +62,7 @@ def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folde
             for result in found
             for name, (mean, low, high) in result.means.items()
         ],
-        "importances": importances(study, objectives),
+        "importances": _importances(study, objectives),
     }
     parts = [
         _summary(study, trials, objectives),
@@ -58,7 +70,7 @@ def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folde
         "interquartile means over seeds and volumes, of success rates means, and 95 % intervals.</p>",
         table(_result_rows(found, trials)) if found else "<p>No final evaluation yet.</p>",
         _videos(final_trials),
-        *charts(study, objectives, tables["importances"]),
+        *_charts(study, objectives, tables["importances"]),
         "<h2>How trials have ended</h2>",
         table(tables["endings"]) if trials else "<p>No trial has been begun.</p>",
         "<h2>Failures</h2>",
@@ -139,3 +151,52 @@ def _result_rows(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -
         }
         for result in found
     ]
+
+
+def _importances(study: optuna.Study, objectives: Sequence[str]) -> list[dict[str, Any]]:
+    """Return which share of the differences between trials each key explains; none where too few have finished."""
+    # PED-ANOVA: Watanabe et al. 2023, arXiv:2304.10255.
+    rows: list[dict[str, Any]] = []
+    if len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) < MIN_TRIALS_FOR_IMPORTANCE:
+        return rows
+    for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):
+        # Low is good for the evaluator.
+        sign = -1.0 if direction == StudyDirection.MAXIMIZE else 1.0
+        target = _value(number, sign) if len(objectives) > 1 else None
+        with warnings.catch_warnings():
+            # That low is good.
+            warnings.simplefilter("ignore")
+            shares = get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), target=target)
+        rows += [{"objective": objective, "key": key, "importance": share} for key, share in shares.items()]
+    return rows
+
+
+def _charts(study: optuna.Study, objectives: Sequence[str], shares: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the charts with their headings, as HTML."""
+    if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+        yield "<p>No trial has run to its end yet.</p>"
+        return
+    if len(objectives) > 1:
+        figure = plot_pareto_front(study, target_names=list(objectives))
+        yield _titled("Trials that no other is better than", figure)
+    for number, objective in enumerate(objectives):
+        several = f": {objective}" if len(objectives) > 1 else ""
+        of_this: dict[str, Any] = {"target": _value(number), "target_name": objective}
+        yield _titled(f"History{several}", plot_optimization_history(study, **of_this))
+        if rows := [row for row in shares if row["objective"] == objective]:
+            bars = graph_objects.Bar(
+                x=[row["importance"] for row in rows], y=[row["key"] for row in rows], orientation="h"
+            )
+            yield _titled(f"Importance of each key{several}", graph_objects.Figure(bars))
+        yield _titled(f"Parallel coordinates{several}", plot_parallel_coordinate(study, **of_this))
+        yield _titled(f"Slices of the space{several}", plot_slice(study, **of_this))
+    if len(objectives) == 1:
+        yield _titled("Reports while training, pruned trials too", plot_intermediate_values(study))
+
+
+def _titled(heading: str, figure: graph_objects.Figure) -> str:
+    return f"<h2>{heading}</h2>{chart(figure)}"
+
+
+def _value(number: int, sign: float = 1.0) -> Callable[[FrozenTrial], float]:
+    return lambda trial: sign * trial.values[number]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,16 @@ from omegaconf.errors import OmegaConfBaseException
 from optuna.pruners import BasePruner
 from optuna.samplers import BaseSampler
 
+from armscan.config.compose import compose
+from armscan.config.defaults import to_plain
 from armscan.config.error_messages import one_line_message
+from armscan.config.sources import SWEEP
 from armscan.errors import ArmscanError, InvalidValueError, StudyError, listed
-from armscan.sweeps.space.overrides import overrides_of
+from armscan.sweeps.space.overrides import Value, overrides_of
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.tasks.attempt import composed, study_section
-from armscan.sweeps.tasks.base import Task
+from armscan.sweeps.tasks.attempt import Task, composed, of_run
 
 TASK_MEMBERS = ("metrics", "final_metric", "check", "run", "evaluate")
 
@@ -31,8 +34,15 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
     Raises:
         InvalidValueError: if something is not allowed.
     """
-    # The command sets `worker` for each worker.
-    section = {key: value for key, value in study_section(words).items() if key != "worker"}
+    config = compose(words, return_hydra_config=True)
+    if config.get(SWEEP) is not None:
+        raise InvalidValueError(
+            f"what {SWEEP}= names is a section {SWEEP} of the configuration, and not all of it: its file must begin "
+            "with the line '# @package _global_'"
+        )
+    section = to_plain(config.study) if config.get("study") is not None else {}
+    # The command sets it for each worker.
+    section.pop("worker", None)
     if not section:
         raise InvalidValueError("there is no study in the configuration: give sweep=NAME of a file with one")
     if "space" in section:
@@ -49,37 +59,36 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
         there = next(each for each in (path, *path.parents) if each.exists())
         if not there.is_dir():
             raise StudyError(f"study.{name} is {folder!r}, but {str(there)!r} is no folder")
-    task: Task = _made("task", settings.task)
+    task: Task = _made("task", settings.task, object)
     if missing := [name for name in TASK_MEMBERS if not hasattr(task, name)]:
         raise InvalidValueError(f"study.task is {settings.task['_target_']}, which has no {missing[0]}, as a task must")
     for name in settings.objectives:
         if name not in task.metrics:
             raise InvalidValueError(f"study.objectives names {name!r}, but a trial returns only {listed(task.metrics)}")
-    return settings, task, composed(words)[0]
+    return settings, task, of_run(config)[0]
 
 
 def make_sampler(described: Mapping[str, Any], seed: int) -> BaseSampler:
     """Return an Optuna sampler; raises `InvalidValueError` if `study.sampler` describes none."""
-    sampler = _made("sampler", described, seed=seed)
-    if not isinstance(sampler, BaseSampler):
-        raise InvalidValueError(f"study.sampler is {described['_target_']}, but it must be a sampler of Optuna")
+    sampler: BaseSampler = _made("sampler", described, BaseSampler, seed=seed)
     return sampler
 
 
 def make_pruner(described: Mapping[str, Any]) -> BasePruner:
     """Return an Optuna pruner; raises `InvalidValueError` if `study.pruner` describes none."""
-    pruner = _made("pruner", described)
-    if not isinstance(pruner, BasePruner):
-        raise InvalidValueError(f"study.pruner is {described['_target_']}, but it must be a pruner of Optuna")
+    pruner: BasePruner = _made("pruner", described, BasePruner)
     return pruner
 
 
-def _made(name: str, described: Mapping[str, Any], **arguments: Any) -> Any:
+def _made(name: str, described: Mapping[str, Any], kind: type[Any], **arguments: Any) -> Any:
     try:
-        return instantiate(described, **arguments)
+        made = instantiate(described, **arguments)
     except InstantiationException as error:
         reason = " ".join(str(error.__cause__ or error).split())
         raise InvalidValueError(f"study.{name} cannot be made: {reason}") from error
+    if not isinstance(made, kind):
+        raise InvalidValueError(f"study.{name} is {described['_target_']}, but it must be a {name} of Optuna")
+    return made
 
 
 def check_space(settings: StudySettings, task: Task, words: Sequence[str], config: DictConfig) -> None:
@@ -96,14 +105,24 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
     Raises:
         InvalidValueError: if a key is unknown, or a value not allowed.
     """
-    task.check(config)
     tried = list(settings.space.extremes())
-    # What one of them changes, the last, may leave no place for another.
-    tried += [settings.space.completed(chosen) for chosen in tried if "." not in list(chosen)[-1]]
-    for chosen in tried:
-        overrides = overrides_of(chosen)
-        try:
-            task.check(composed([*words, *overrides])[0])
-        except (ArmscanError, HydraException, OmegaConfBaseException, ValueError) as error:
-            line = one_line_message(error) or str(error)
-            raise InvalidValueError(f"study.space: {' '.join(overrides)} is not allowed: {line}") from error
+    # Of groups, or at the top: what the last of the values changes may leave no place for another.
+    whole = [chosen for chosen in tried if "." not in list(chosen)[-1]]
+    for chosen in whole:
+        # Before an agent is built, because the first of a process compiles for many seconds.
+        with _named(chosen):
+            composed([*words, *overrides_of(chosen)])
+    task.check(config)
+    for chosen in (*tried, *map(settings.space.completed, whole)):
+        with _named(chosen):
+            task.check(composed([*words, *overrides_of(chosen)])[0])
+
+
+@contextmanager
+def _named(chosen: Mapping[str, Value]) -> Iterator[None]:
+    """Say in an error which values are not allowed."""
+    try:
+        yield
+    except (ArmscanError, HydraException, OmegaConfBaseException, ValueError) as error:
+        line = one_line_message(error) or str(error)
+        raise InvalidValueError(f"study.space: {' '.join(overrides_of(chosen))} is not allowed: {line}") from error

@@ -21,8 +21,7 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX, StudySettings
 from armscan.sweeps.study.study import STUDY_RUN, make_study
-from armscan.sweeps.tasks.attempt import Attempt, trial_folder
-from armscan.sweeps.tasks.base import Task
+from armscan.sweeps.tasks.attempt import Attempt, Task, trial_folder
 from armscan.tracking import TrackingStore, abandon, open_store, source_tags
 from armscan.tracking.run import FAILURE_TAG
 from armscan.utils.retry import RETRY_S

@@ -1,4 +1,4 @@
-"""One attempt at a trial: what it tries, what it reports, and what ties it to its tracked run and its folder."""
+"""What a trial can do, and an attempt at it: what it tries and reports, its tracked run and its folder."""
 
 from __future__ import annotations
 
@@ -6,21 +6,24 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
+from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import optuna
-from omegaconf import DictConfig, open_dict
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf, open_dict
 from optuna.trial import Trial
 
 from armscan.config.compose import compose
 from armscan.config.defaults import CLUSTER, to_plain
-from armscan.config.sources import SWEEP
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.scheduling.outcome import PendingWrites
 from armscan.sweeps.scheduling.state import ENV_STEPS, RETRY_OF, SEEDS
 from armscan.tracking import TrackedRun
+from armscan.training import Split
+from armscan.utils.validation import check_float
 
 # User attributes of a trial.
 RUN, FOLDER, CONFIG_SHA256 = "mlflow_run", "folder", "config_sha256"
@@ -136,6 +139,38 @@ class Attempt:
         return self.trial.should_prune()
 
 
+class Task(Protocol):
+    """What the trials of a study do; `study.task._target_` names its class, which needs no arguments."""
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """The names of the metrics that `run` returns, which a study may have as objectives."""
+
+    @property
+    def final_metric(self) -> str:
+        """Of the metrics that `evaluate` returns, the name of the one that says most."""
+
+    def check(self, config: DictConfig) -> None:
+        """Check that a trial with this configuration could begin; called for many before the first trial.
+
+        Raises:
+            ArmscanError: if it could not.
+        """
+
+    def run(self, attempt: Attempt) -> dict[str, float]:
+        """Run a trial, or resume one, and return its metrics.
+
+        Raises:
+            optuna.TrialPruned: if the trial is not worth going on with.
+        """
+
+    def evaluate(self, attempt: Attempt) -> dict[str, float]:
+        """Run one of the best configurations with a seed that did not choose it, and returns the metrics of the test.
+
+        Their names begin with `test/`.
+        """
+
+
 def trial_folder(study_folder: Path, number: int) -> Path:
     """Return the folder of a trial."""
     return study_folder / "trials" / f"{number:0{TRIAL_DIGITS}}"
@@ -143,7 +178,11 @@ def trial_folder(study_folder: Path, number: int) -> Path:
 
 def composed(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
     """Return the configuration of a run, without the section of the study, and what was chosen of each group."""
-    config = compose(words, return_hydra_config=True)
+    return of_run(compose(words, return_hydra_config=True))
+
+
+def of_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
+    """Take from a composed configuration what is not of a run; returns it, and what was chosen of each group."""
     choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
     with open_dict(config):
         # Where runs are tracked is the same whatever said so.
@@ -153,23 +192,40 @@ def composed(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
     return config, choices
 
 
-def study_section(words: Sequence[str]) -> dict[str, Any]:
-    """Return the section `study` of a configuration as plain values.
-
-    Raises:
-        InvalidValueError: if the file of the study does not say that it is for the whole configuration.
-    """
-    config = compose(words)
-    if config.get(SWEEP) is not None:
-        raise InvalidValueError(
-            f"what {SWEEP}= names is a section {SWEEP} of the configuration, and not all of it: its file must begin "
-            "with the line '# @package _global_'"
-        )
-    section = config.get("study")
-    return to_plain(section) if section is not None else {}
-
-
 def config_sha256(config: Mapping[str, Any]) -> str:
     """Return a sum of a configuration's values, but for the seed, which the runs of one trial differ by."""
     values = {key: value for key, value in config.items() if key != "seed"}
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def volumes_of(config: DictConfig) -> Split:
+    """Return the volumes of a configuration, which stay in memory until those of another are asked for."""
+    return _volumes(OmegaConf.to_yaml(config.data, resolve=True))
+
+
+@lru_cache(maxsize=1)
+def _volumes(data: str) -> Split:
+    volumes: Split = instantiate(OmegaConf.create(data), _convert_="object")
+    return volumes
+
+
+def check_metrics(metrics: Any, objectives: Sequence[str]) -> dict[str, float]:
+    """Return what a task has returned.
+
+    Args:
+        metrics: by name; those that are no objectives may be NaN.
+        objectives: the names of those that must be there, and finite.
+
+    Raises:
+        InvalidValueError: if it is anything else.
+    """
+    if not isinstance(metrics, Mapping):
+        raise InvalidValueError(f"the task has returned {metrics!r}, but it must be metrics by their names")
+    if missing := [name for name in objectives if name not in metrics]:
+        raise InvalidValueError(f"the task has not returned {missing[0]}, but only {listed(list(metrics))}")
+    for name, value in metrics.items():
+        if name in objectives:
+            check_float(f"what the task has returned as {name}", value)
+        elif not isinstance(value, Real):
+            raise InvalidValueError(f"what the task has returned as {name} is {value!r}, but it must be a number")
+    return {str(name): float(value) for name, value in metrics.items()}

@@ -13,8 +13,7 @@ from armscan.anatomy import PlaneScorer
 from armscan.anatomy.tissues import Tissues, check_tissues
 from armscan.errors import InvalidValueError
 from armscan.experiment.build import check_keys
-from armscan.sweeps.tasks.attempt import Attempt
-from armscan.sweeps.tasks.base import VolumesInMemory
+from armscan.sweeps.tasks.attempt import Attempt, volumes_of
 from armscan.volumes import LabelVolume
 from armscan.volumes.plane import ManipulatorAction
 
@@ -28,9 +27,6 @@ class LandmarksTask:
 
     What is searched are keys of `env.clustering`, written in full.
     """
-
-    def __init__(self) -> None:
-        self._volumes = VolumesInMemory()
 
     @property
     def metrics(self) -> tuple[str, ...]:
@@ -50,17 +46,17 @@ class LandmarksTask:
                 f"env.clustering is {config.env.clustering!r}, but this study searches its parts: write it in full"
             )
         self._tissues(config)
-        self._volumes.of(config)
+        volumes_of(config)
 
     def run(self, attempt: Attempt) -> dict[str, float]:
         """Look at the training volumes. See `Task.run`."""
         config, _ = attempt.config(attempt.seeds[0])
-        return self._run_task(config, self._volumes.of(config).training)
+        return self._run_task(config, volumes_of(config).training)
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
         """Look at the test volumes. See `Task.evaluate`."""
         config, _ = attempt.config(attempt.seeds[0])
-        metrics = self._run_task(config, self._volumes.of(config).test)
+        metrics = self._run_task(config, volumes_of(config).test)
         return {f"test/{name}": value for name, value in metrics.items()}
 
     def _run_task(self, config: DictConfig, volumes: Mapping[str, LabelVolume]) -> dict[str, float]:

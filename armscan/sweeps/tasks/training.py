@@ -21,8 +21,7 @@ from armscan.experiment.runner import VIDEO_SEED, final_evaluations, train_agent
 from armscan.policies.build import save_policy
 from armscan.stats.aggregation import interquartile_mean
 from armscan.sweeps.scheduling.state import ENV_STEPS
-from armscan.sweeps.tasks.attempt import Attempt
-from armscan.sweeps.tasks.base import VolumesInMemory
+from armscan.sweeps.tasks.attempt import Attempt, volumes_of
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
 from armscan.training import TEST, EpochReport, Evaluation, record_episode, resume_from_checkpoint
 from armscan.utils.files import (
@@ -81,9 +80,6 @@ class Reporter:
 class TrainingTask:
     """The task of training an agent, with each of a trial's seeds."""
 
-    def __init__(self) -> None:
-        self._volumes = VolumesInMemory()
-
     @property
     def metrics(self) -> tuple[str, ...]:
         """Those of the best validation, and those of the training."""
@@ -97,7 +93,7 @@ class TrainingTask:
     def check(self, config: DictConfig) -> None:
         """See `Task.check`."""
         check_keys(config)
-        experiment = build_experiment(config, self._volumes.of(config))
+        experiment = build_experiment(config, volumes_of(config))
         if not isinstance(experiment.agent, Learner):
             raise InvalidValueError(
                 f"agent is {config.agent.get('_target_')!r}, but the trials of this study need one that learns"

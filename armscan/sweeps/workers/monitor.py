@@ -10,8 +10,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 
 from armscan.errors import StorageAwayError
-from armscan.sweeps.study.finalists import missing_final_trials
 from armscan.sweeps.study.open import OpenedStudy
+from armscan.sweeps.study.study import missing_final_trials
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.utils.retry import no_retry
 

@@ -23,10 +23,18 @@ from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_O
 from armscan.sweeps.space.overrides import overrides_of
 from armscan.sweeps.study.components import make_sampler, read_settings
 from armscan.sweeps.study.dashboard import note_run, show_picture
-from armscan.sweeps.study.finalists import enqueue_final_trials
 from armscan.sweeps.study.open import Phase, open_for_work
-from armscan.sweeps.tasks.attempt import CONFIG_SHA256, FOLDER, RUN, Attempt, composed, config_sha256, trial_folder
-from armscan.sweeps.tasks.base import check_metrics
+from armscan.sweeps.study.study import enqueue_final_trials
+from armscan.sweeps.tasks.attempt import (
+    CONFIG_SHA256,
+    FOLDER,
+    RUN,
+    Attempt,
+    check_metrics,
+    composed,
+    config_sha256,
+    trial_folder,
+)
 from armscan.sweeps.workers.heartbeat import Heartbeat, LimitReachedError
 from armscan.tracking import TrackedRun
 from armscan.tracking.run import SHORT_WAIT_S

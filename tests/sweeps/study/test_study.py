@@ -8,9 +8,8 @@ from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
 from armscan.sweeps.study.components import read_settings
-from armscan.sweeps.study.finalists import enqueue_final_trials
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
-from armscan.sweeps.study.study import make_study
+from armscan.sweeps.study.study import enqueue_final_trials, make_study
 
 FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
 

@@ -11,7 +11,7 @@ from optuna.trial import TrialState
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, Limits
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.finalists import missing_final_trials
+from armscan.sweeps.study.study import missing_final_trials
 from armscan.sweeps.workers import monitor as module
 from armscan.sweeps.workers.monitor import StudyMonitor
 from tests.support.waiting import HANG_S

@@ -12,8 +12,8 @@ from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.finalists import best_trials
 from armscan.sweeps.study.open import Phase
+from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
 from armscan.tracking import open_store
