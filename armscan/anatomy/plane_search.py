@@ -40,13 +40,14 @@ class FoundPlane:
         action: the plane, its origin (tx, ty) within the volume.
         score: its reward, in [-1, 0].
         counts: clusters of bones, tendons and artery that it shows.
-        spread: how far the planes that score best reach, end to end: (rz, rx) in degrees, along the arm in mm.
+        spread: how far the planes that score best reach, end to end: (rz, rx) in degrees, along the arm in mm;
+            None for a plane that a person drew.
     """
 
     action: ManipulatorAction
     score: float
     counts: tuple[int, int, int]
-    spread: tuple[float, float, float]
+    spread: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)

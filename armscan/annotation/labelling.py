@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image
 
-from armscan.anatomy import LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
+from armscan.anatomy import FoundPlane, LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
 from armscan.envs.rendering import Beside, draw_plane, view_of
 from armscan.errors import InvalidValueError, OptimalPlaneError, listed
 from armscan.utils.files import atomic_write
@@ -52,30 +51,12 @@ class LabellingOptions:
     volume: str | None = None
 
 
-@dataclass(frozen=True)
-class Labelled:
-    """A plane that is now in the manifest.
-
-    Args:
-        volume: that it was found or drawn for, with the plane that it had before.
-        action: the plane.
-        score: its reward.
-        counts: clusters of bones, tendons and artery that it shows.
-        spread: as `FoundPlane`'s, None where a person drew the plane.
-    """
-
-    volume: LabelVolume
-    action: ManipulatorAction
-    score: float
-    counts: tuple[int, int, int]
-    spread: tuple[float, float, float] | None = None
-
-
-def label(request: LabellingOptions) -> tuple[list[Labelled], list[OptimalPlaneError]]:
+def label(request: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane]], list[OptimalPlaneError]]:
     """Find or read a plane for each volume, draw it and write it into the manifest, volume by volume.
 
     Returns:
-        The planes that were written into the manifest, and for which volumes none was found.
+        The volumes, with the plane that each had before, and the planes that are now in the manifest; and for which
+        volumes none was found.
 
     Raises:
         ArmscanError: if the request or a file cannot be used.
@@ -84,22 +65,25 @@ def label(request: LabellingOptions) -> tuple[list[Labelled], list[OptimalPlaneE
     volumes = _wanted(request, dataset)
     if request.markups and request.markup is None:
         _write_known_markups(request, dataset.volumes, set(volumes))
-    labelled: list[Labelled] = []
+    labelled: list[tuple[LabelVolume, FoundPlane]] = []
     failures: list[OptimalPlaneError] = []
     for number, (name, volume) in enumerate(volumes.items(), 1):
         print(f"{number}/{len(volumes)}  {name}", flush=True)
         try:
-            plane = _found(request, volume) if request.markup is None else _drawn(request, volume, request.markup)
+            if request.markup is not None:
+                plane = _drawn(request.markup, volume, request.tissues)
+            else:
+                plane = find_optimal_plane(volume, success_threshold=SUCCESS_THRESHOLD, clustering=request.tissues)
         except OptimalPlaneError as error:
             failures.append(error)
             continue
         # The manifest last: no plane stands there that nobody can look at.
         _make_folder(request.pictures)
-        _write_picture(request.pictures / f"{name}.png", plane, request.tissues)
+        _write_picture(request.pictures / f"{name}.png", volume, plane.action, request.tissues)
         if request.markups:
             write_markup(request.pictures / f"{name}{MARKUP_SUFFIX}", volume, plane.action)
         record_planes(request.data, {name: (plane.action, plane.score)})
-        labelled.append(plane)
+        labelled.append((volume, plane))
     return labelled, failures
 
 
@@ -117,15 +101,9 @@ def _wanted(request: LabellingOptions, dataset: Dataset) -> dict[str, LabelVolum
     return {name: volume for name, volume in wanted.items() if volume.optimal_action is None}
 
 
-def _found(request: LabellingOptions, volume: LabelVolume) -> Labelled:
-    found = find_optimal_plane(volume, success_threshold=SUCCESS_THRESHOLD, clustering=request.tissues)
-    return Labelled(volume, found.action, found.score, found.counts, found.spread)
-
-
-def _drawn(request: LabellingOptions, volume: LabelVolume, markup: Path) -> Labelled:
+def _drawn(markup: Path, volume: LabelVolume, tissues: Tissues) -> FoundPlane:
     action = read_markup(markup, volume)
-    score, counts = PlaneScorer(volume, LandmarkReward(), request.tissues).seen(action)
-    return Labelled(volume, action, score, counts)
+    return FoundPlane(action, *PlaneScorer(volume, LandmarkReward(), tissues).seen(action))
 
 
 def _write_known_markups(request: LabellingOptions, volumes: dict[str, LabelVolume], to_label: set[str]) -> None:
@@ -146,14 +124,11 @@ def _make_folder(folder: Path) -> None:
         ) from error
 
 
-def _write_picture(path: Path, plane: Labelled, tissues: Tissues) -> None:
+def _write_picture(path: Path, volume: LabelVolume, action: ManipulatorAction, tissues: Tissues) -> None:
     """Draw the slice, and the plane from two sides; beside it the plane that the volume had before, if any."""
-    volume = plane.volume
     beside = None if volume.optimal_action is None else Beside(volume.optimal_action, "former plane")
-    drawn = draw_plane(volume, plane.action, view_of(volume, plane.action, tissues=tissues), beside=beside)
-    picture = io.BytesIO()
-    Image.fromarray(drawn).save(picture, "PNG")
+    picture = Image.fromarray(draw_plane(volume, action, view_of(volume, action, tissues=tissues), beside=beside))
     try:
-        atomic_write(path, lambda file: file.write(picture.getvalue()))
+        atomic_write(path, lambda file: picture.save(file, "PNG"))
     except OSError as error:
         raise InvalidValueError(f"{path}: the picture cannot be written ({error.strerror or error})") from error

@@ -15,8 +15,9 @@ from rich.text import Text
 from armscan.cli.options import FILE_PATH, CommaSeparated, clustering_option, examples
 
 if TYPE_CHECKING:
-    from armscan.annotation.labelling import Labelled, LabellingOptions
-    from armscan.volumes import Dataset
+    from armscan.anatomy import FoundPlane
+    from armscan.annotation.labelling import LabellingOptions
+    from armscan.volumes import Dataset, LabelVolume
     from armscan.volumes.summary import VolumeReport
 
 # Folder of pictures within the folder of the data.
@@ -170,7 +171,7 @@ def _grid(shape: Sequence[int], spacing: Sequence[float]) -> str:
     return f"{voxels} voxels of {steps} mm"
 
 
-def _print_planes(options: LabellingOptions, labelled: Sequence[Labelled]) -> None:
+def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolume, FoundPlane]]) -> None:
     """Print a table of the planes, and what the person who checks them can do next."""
     from rich.console import Console
 
@@ -181,10 +182,10 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[Labelled]) -> No
     headings = ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "as good over\n°, °, mm")
     columns = (Column("volume", overflow="fold"), *(Column(heading, justify="right") for heading in headings))
     table = Table(*columns, title="planes written into the manifest", title_justify="left")
-    for plane in labelled:
+    for volume, plane in labelled:
         rz, rx, tx, ty = plane.action.to_array()
         table.add_row(
-            Text(plane.volume.name),
+            Text(volume.name),
             f"{plane.score:.3f}",
             ", ".join(map(str, plane.counts)),
             f"{rz:.1f}, {rx:.1f}",
@@ -192,10 +193,10 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[Labelled]) -> No
             "-" if plane.spread is None else "{:.0f}, {:.0f}, {:.0f}".format(*plane.spread),
         )
     Console().print(table)
-    for plane in labelled:
+    for volume, plane in labelled:
         if plane.score <= -SUCCESS_THRESHOLD:
             wanted = f"an environment wants more than {-SUCCESS_THRESHOLD:g}"
-            print(f"note: {plane.volume.name} scores {plane.score:.3f}, and {wanted}")
+            print(f"note: {volume.name} scores {plane.score:.3f}, and {wanted}")
     print(f"look at   {options.pictures}")
     print("accept    nothing is left to do")
     print(

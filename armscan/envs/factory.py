@@ -10,11 +10,10 @@ from gymnasium.vector import VectorEnv
 
 from armscan.anatomy import PUBLISHED_TARGETS, check_tissues
 from armscan.envs.env import ArmscanEnv
-from armscan.envs.history import boxes_of, check_exclusions
+from armscan.envs.history import MOST_KEPT, boxes_of, check_exclusions
 from armscan.envs.rules import Rules, Volumes, check_reward
 from armscan.envs.vector_env import ArmscanVectorEnv
 from armscan.envs.wrappers import (
-    MOST_KEPT,
     BestActionMemory,
     Env,
     FrameStack,
@@ -25,7 +24,7 @@ from armscan.errors import InvalidValueError, listed
 from armscan.utils.validation import check_bool, check_int
 from armscan.volumes import LabelVolume
 
-AnyEnv = TypeVar("AnyEnv")
+AnyEnv = TypeVar("AnyEnv", bound=Env | VectorEnv[Any, Any, Any])
 
 
 class EnvFactory:
@@ -80,58 +79,42 @@ def make_armscan_env(
         stack_memory: whether the memory is stacked with the rest; otherwise it is added after the stack.
         **kwargs: the other arguments of `ArmscanEnv`.
     """
-    env: Env = ArmscanEnv(volumes, **kwargs)
-    return _wrapped(env, FrameStack, BestActionMemory, stack, stack_exclude, memory, stack_memory)
+    return _wrapped(ArmscanEnv(volumes, **kwargs), stack, stack_exclude, memory, stack_memory)
 
 
-def make_armscan_vector_env(
-    num_envs: int = 1,
-    volumes: Volumes = None,
-    *,
-    stack: int = 1,
-    stack_exclude: Sequence[str] = (),
-    memory: int = 0,
-    stack_memory: bool = False,
-    **kwargs: Any,
-) -> VectorEnv[Any, Any, Any]:
+def make_armscan_vector_env(num_envs: int = 1, volumes: Volumes = None, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
     """Make many environments with their wrappers; what `gymnasium.make_vec("armscan/Armscan-v0", ...)` calls.
 
     Args:
         num_envs: how many.
         volumes: as in `ArmscanEnv`.
-        stack: as in `make_armscan_env`.
-        stack_exclude: likewise.
-        memory: likewise.
-        stack_memory: likewise.
-        **kwargs: the other arguments of `ArmscanVectorEnv`.
+        **kwargs: the arguments of `make_armscan_env` for wrappers, and the other arguments of `ArmscanVectorEnv`.
     """
-    env: VectorEnv[Any, Any, Any] = ArmscanVectorEnv(num_envs, volumes, **kwargs)
-    return _wrapped(env, VectorFrameStack, VectorBestActionMemory, stack, stack_exclude, memory, stack_memory)
+    wrappers = {name: kwargs.pop(name) for name in _keywords(make_armscan_env) if name in kwargs}
+    return _wrapped(ArmscanVectorEnv(num_envs, volumes, **kwargs), **wrappers)
 
 
 def _wrapped(
-    env: AnyEnv,
-    stack_frames: Callable[..., AnyEnv],
-    keep_best: Callable[..., AnyEnv],
-    stack: int,
-    stack_exclude: Sequence[str],
-    memory: int,
-    stack_memory: bool,
+    bare: AnyEnv, stack: int = 1, stack_exclude: Sequence[str] = (), memory: int = 0, stack_memory: bool = False
 ) -> AnyEnv:
     """Return an environment, or many, with the wrappers that are asked for."""
+    env: Any = bare
+    is_vector = isinstance(env, VectorEnv)
     is_stacked = check_int("stack", stack, at_least=1, at_most=MOST_KEPT) > 1
     has_memory = check_int("memory", memory, at_least=0, at_most=MOST_KEPT) > 0
+    keep_best = VectorBestActionMemory if is_vector else BestActionMemory
     check_bool("stack_memory", stack_memory)
     if has_memory and stack_memory:
         env = keep_best(env, memory)
     if is_stacked:
-        env = stack_frames(env, stack, exclude=stack_exclude)
+        env = (VectorFrameStack if is_vector else FrameStack)(env, stack, exclude=stack_exclude)
     if has_memory and not stack_memory:
         env = keep_best(env, memory)
     if not is_stacked:
-        space = "single_observation_space" if isinstance(env, VectorEnv) else "observation_space"
-        check_exclusions(stack_exclude, boxes_of(getattr(env, space), "FrameStack"))
-    return env
+        space = env.single_observation_space if is_vector else env.observation_space
+        check_exclusions(stack_exclude, boxes_of(space, "FrameStack"))
+    wrapped: AnyEnv = env
+    return wrapped
 
 
 def _keywords(maker: Callable[..., Any]) -> list[str]:

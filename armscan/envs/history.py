@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 
 from armscan.envs.spaces import MultiBoxSpace, Parts, flat_space
 from armscan.errors import InvalidValueError, listed
+from armscan.utils.validation import check_int
 
 FLAT = ""
 """The name that a flat observation goes by among parts."""
 
 MEMORY = "memory"
+# Observations of a stack, and pairs of a memory.
+MOST_KEPT = 1000
 Mask = NDArray[np.bool_]
 
 
@@ -86,16 +89,16 @@ class FrameHistory:
 
     Args:
         boxes: space of each part of one environment.
-        size: how many observations are kept.
+        size: how many observations are kept, from 1 to 1000.
         excluded: parts that are not stacked.
         n_envs: environments of the batch.
 
     Raises:
-        InvalidValueError: if a part to leave out does not exist.
+        InvalidValueError: if the size is out of bounds, or a part to leave out does not exist.
     """
 
     def __init__(self, boxes: Mapping[str, spaces.Box], size: int, excluded: Collection[str], n_envs: int) -> None:
-        self._size = size
+        self._size = size = check_int("stack", size, at_least=1, at_most=MOST_KEPT)
         excluded = check_exclusions(excluded, boxes)
         stacked = {name: box for name, box in boxes.items() if name not in excluded}
         # Every frame is written twice, `size` apart, so that the last ones always lie in one piece.
@@ -139,17 +142,19 @@ class BestPairs:
 
     Args:
         boxes: space of each part of one environment.
-        size: how many pairs are kept.
-        n_free: components of an action.
+        size: how many pairs are kept, from 1 to 1000.
+        action_space: the free components of an action.
         n_envs: environments of the batch.
 
     Raises:
-        InvalidValueError: if there is a part called `memory` already.
+        InvalidValueError: if the size is out of bounds, or there is a part called `memory` already.
     """
 
-    def __init__(self, boxes: dict[str, spaces.Box], size: int, n_free: int, n_envs: int) -> None:
+    def __init__(self, boxes: dict[str, spaces.Box], size: int, action_space: spaces.Space[Any], n_envs: int) -> None:
+        check_int("memory", size, at_least=1, at_most=MOST_KEPT)
         if MEMORY in boxes:
             raise InvalidValueError(f"the observation already has a part {MEMORY!r}, which BestActionMemory adds")
+        n_free = int(np.prod(action_space.shape or ()))
         self.pairs = np.zeros((n_envs, size, n_free + 1), dtype=np.float32)
         low, high = [-1.0] * (n_free + 1), [1.0] * n_free + [0.0]
         box = spaces.Box(np.tile(low, size).astype(np.float32), np.tile(high, size).astype(np.float32))

@@ -36,7 +36,7 @@ class MergedObservation:
     ) -> None:
         if isinstance(observations, str) or not isinstance(observations, Sequence) or not observations:
             raise InvalidValueError(f"observations is {observations!r}, but it must be a list of at least one")
-        checked = [check_observation(observation, targets) for observation in observations]
+        checked = [_observation(observation, targets) for observation in observations]
         self.observations: tuple[Observation, ...] = tuple(
             member
             for each in checked
@@ -74,18 +74,25 @@ NAMED_OBSERVATIONS: dict[str, type[Observation]] = {
 }
 
 
-def check_observation(
+def with_action_reward(
     observation: str | Observation | Sequence[str | Observation], targets: Sequence[int] = PUBLISHED_TARGETS
 ) -> Observation:
-    """Return an observation given as such, by name, or as a list of those that are merged.
+    """Return an observation with action and reward, which are part of every one.
 
     Args:
-        observation: likewise.
+        observation: as such, by name, or as a list of those that are merged.
         targets: what `cluster`, given by name, divides its counts by.
 
     Raises:
         InvalidValueError: if there is no observation of that name, or it is no observation.
     """
+    merged = MergedObservation([observation], targets=targets)  # type: ignore[list-item]
+    if any(isinstance(member, ActionRewardObservation) for member in merged.observations):
+        return merged
+    return MergedObservation([*merged.observations, ActionRewardObservation()])
+
+
+def _observation(observation: str | Observation | Sequence[str | Observation], targets: Sequence[int]) -> Observation:
     if isinstance(observation, str) and observation in NAMED_OBSERVATIONS:
         return ClusterObservation(targets=targets) if observation == "cluster" else NAMED_OBSERVATIONS[observation]()
     if isinstance(observation, list | tuple):
@@ -97,13 +104,3 @@ def check_observation(
             "object with the methods of Observation"
         )
     return observation  # type: ignore[return-value]
-
-
-def with_action_reward(
-    observation: str | Observation | Sequence[str | Observation], targets: Sequence[int] = PUBLISHED_TARGETS
-) -> Observation:
-    """Return the observation, as `check_observation` does, with action and reward, which are part of every one."""
-    merged = MergedObservation([check_observation(observation, targets)])
-    if any(isinstance(member, ActionRewardObservation) for member in merged.observations):
-        return merged
-    return MergedObservation([*merged.observations, ActionRewardObservation()])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -39,14 +39,6 @@ Ink = tuple[int, int, int]
 Size = tuple[int, int]
 # From the palm, (along, across, 3), and the side, (along, depth, 3): drawn once a volume, and forgotten with it.
 _SIDES: WeakKeyDictionary[LabelVolume, tuple[Inks, Inks]] = WeakKeyDictionary()
-
-
-class OutlinedPlane(NamedTuple):
-    """A plane to draw in the volume, in the frame of the moved volume."""
-
-    action: ManipulatorAction
-    ink: Ink
-    width: int
 
 
 @lru_cache
@@ -105,7 +97,7 @@ def _outlines(codes: NDArray[np.int32]) -> NDArray[np.bool_]:
 def side_panels(
     volume: LabelVolume,
     transform: RigidTransform | None,
-    planes: Sequence[OutlinedPlane],
+    planes: Sequence[tuple[ManipulatorAction, Ink, int]],
     rooms: tuple[Size, Size],
 ) -> tuple[Image.Image, Image.Image]:
     """Draw the volume as it was read from the palm (frontal) and from the side (sagittal), fingers up, in one scale.
@@ -113,7 +105,8 @@ def side_panels(
     Args:
         volume: the volume.
         transform: how it is moved in the episode, None where it is as it is.
-        planes: what is outlined in it, the last one on top.
+        planes: what is outlined in it, in the frame of the moved volume, each with its colour and the width of its
+            line in pixels; the last one on top.
         rooms: (width, height) that either picture fits into, its proportions kept.
     """
     if volume not in _SIDES:
@@ -126,12 +119,12 @@ def side_panels(
         Image.fromarray(_resized(inks, _size(size_mm, scale)))
         for inks, size_mm in zip(_SIDES[volume], sizes_mm, strict=True)
     )
-    for plane in planes:
-        corners_mm = _corners_mm(volume, transform, plane.action)
+    for action, ink, line_width in planes:
+        corners_mm = _corners_mm(volume, transform, action)
         for picture, axes in ((frontal, [0, 1]), (sagittal, [2, 1])):
             corners = corners_mm[:, axes] * picture.size / np.array(volume.size_mm)[axes]
             outline = [(x, y) for x, y in (*corners, corners[0])]
-            ImageDraw.Draw(picture).line(outline, fill=plane.ink, width=plane.width)
+            ImageDraw.Draw(picture).line(outline, fill=ink, width=line_width)
     return frontal, sagittal
 
 

@@ -19,7 +19,6 @@ from armscan.envs.panels import (
     OPTIMUM_INK,
     PLANE_INK,
     TISSUE_INKS,
-    OutlinedPlane,
     font,
     reward_panel,
     side_panels,
@@ -98,8 +97,8 @@ def draw_plane(
     """
     picture = Image.new("RGB", (WIDTH, HEIGHT), BACKGROUND)
     draw = ImageDraw.Draw(picture)
-    planes = [] if beside is None else [OutlinedPlane(beside.action, OPTIMUM_INK, 1)]
-    planes.append(OutlinedPlane(plane, PLANE_INK, 2))
+    planes = [] if beside is None else [(beside.action, OPTIMUM_INK, 1)]
+    planes.append((plane, PLANE_INK, 2))
     frontal, sagittal = side_panels(volume, transform, planes, (_room(FRONTAL_BOX), _room(SAGITTAL_BOX)))
     for box, title, panel in (
         (SLICE_BOX, "slice, palm up", slice_panel(view, _room(SLICE_BOX))),

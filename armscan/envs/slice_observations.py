@@ -29,10 +29,6 @@ class _FramedSlice:
     A slice is cropped about its middle to `crop`; for an odd surplus the larger half goes from the low side. Then,
     where `shape` is given, it is reduced (or repeated) to that shape: pixel i of m stands for the pixels from i n / m
     to (i + 1) n / m of the n there were, and shows the highest value among them, so that thin structures stay visible.
-
-    Args:
-        crop: (across, depth) in pixels, each from 1 to 4096; None for the smallest slice of all volumes.
-        shape: (across, depth) of what is observed, likewise; None to leave what was cropped as it is.
     """
 
     def __init__(self, *, crop: Sequence[int] | None = None, shape: Sequence[int] | None = None) -> None:

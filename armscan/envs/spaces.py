@@ -41,12 +41,7 @@ class MultiBoxSpace(spaces.Dict):
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """The boxes' shapes by name."""
-        return {name: box.shape for name, box in self.boxes.items()}
-
-    @property
-    def boxes(self) -> dict[str, spaces.Box]:
-        """The boxes by name, in the space's order, which is that of the alphabet."""
-        return self.spaces  # type: ignore[return-value]
+        return {name: box.shape for name, box in self.spaces.items()}  # type: ignore[misc]
 
 
 def in_order(parts: Parts, boxes: Mapping[str, spaces.Box], leading: tuple[int, ...] = ()) -> Parts:

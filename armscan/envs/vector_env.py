@@ -185,10 +185,7 @@ def reset_each(
 
 
 def _checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    allowed = (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
-    found = [known for known in allowed if isinstance(mode, str | AutoresetMode) and mode in (known, known.value)]
-    if not found:
-        raise InvalidValueError(
-            f"autoreset_mode is {mode!r}, but it must be {' or '.join(known.value for known in allowed)}"
-        )
-    return found[0]
+    for known in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
+        if isinstance(mode, str | AutoresetMode) and mode in (known, known.value):
+            return known
+    raise InvalidValueError(f"autoreset_mode is {mode!r}, but it must be NextStep or Disabled")

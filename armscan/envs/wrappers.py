@@ -19,12 +19,9 @@ from armscan.envs.history import BestPairs, FrameHistory, Remembered, boxes_of, 
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import VectorStep, reset_each
 from armscan.errors import InvalidValueError
-from armscan.utils.validation import check_int
 from armscan.volumes.plane import FloatArray
 
 Env = gym.Env[Any, FloatArray]
-# Observations of a stack, and pairs of a memory.
-MOST_KEPT = 1000
 # Of the one environment that is wrapped.
 ALL = np.array([True])
 
@@ -74,8 +71,7 @@ class FrameStack(_Remembering):
 
     def __init__(self, env: Env, stack: int, *, exclude: Collection[str] = ()) -> None:
         boxes = boxes_of(_checked(env, gym.Env).observation_space, "FrameStack")
-        history = FrameHistory(boxes, check_int("stack", stack, at_least=1, at_most=MOST_KEPT), exclude, 1)
-        super().__init__(env, history, stack=stack, exclude=exclude)
+        super().__init__(env, FrameHistory(boxes, stack, exclude, 1), stack=stack, exclude=exclude)
 
 
 class BestActionMemory(_Remembering):
@@ -94,8 +90,7 @@ class BestActionMemory(_Remembering):
 
     def __init__(self, env: Env, memory: int) -> None:
         boxes = boxes_of(_checked(env, gym.Env).observation_space, "BestActionMemory")
-        size = check_int("memory", memory, at_least=1, at_most=MOST_KEPT)
-        super().__init__(env, BestPairs(boxes, size, _n_free(env.action_space), 1), memory=memory)
+        super().__init__(env, BestPairs(boxes, memory, env.action_space, 1), memory=memory)
 
 
 class _VectorRemembering(VectorWrapper):
@@ -140,8 +135,7 @@ class VectorFrameStack(_VectorRemembering):
 
     def __init__(self, env: VectorEnv[Any, Any, Any], stack: int, *, exclude: Collection[str] = ()) -> None:
         boxes = boxes_of(_checked(env, VectorEnv).single_observation_space, "VectorFrameStack")
-        size = check_int("stack", stack, at_least=1, at_most=MOST_KEPT)
-        super().__init__(env, FrameHistory(boxes, size, exclude, env.num_envs))
+        super().__init__(env, FrameHistory(boxes, stack, exclude, env.num_envs))
 
 
 class VectorBestActionMemory(_VectorRemembering):
@@ -154,8 +148,7 @@ class VectorBestActionMemory(_VectorRemembering):
 
     def __init__(self, env: VectorEnv[Any, Any, Any], memory: int) -> None:
         boxes = boxes_of(_checked(env, VectorEnv).single_observation_space, "VectorBestActionMemory")
-        size = check_int("memory", memory, at_least=1, at_most=MOST_KEPT)
-        super().__init__(env, BestPairs(boxes, size, _n_free(env.single_action_space), env.num_envs))
+        super().__init__(env, BestPairs(boxes, memory, env.single_action_space, env.num_envs))
 
 
 def _checked(env: Any, kind: type[Any]) -> Any:
@@ -163,10 +156,6 @@ def _checked(env: Any, kind: type[Any]) -> Any:
     if not isinstance(env, kind):
         raise InvalidValueError(f"env is {env!r}, but it must be a gymnasium {kind.__name__}")
     return env
-
-
-def _n_free(action_space: gym.Space[Any]) -> int:
-    return int(np.prod(action_space.shape or ()))
 
 
 def _batch_of_one(observation: Observed, info: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -29,7 +29,7 @@ def test_multi_box_space_is_a_dict_of_boxes_that_knows_their_shapes(space):
     assert list(space) == ["action", "reward", "slice"]
     assert space.shape == [(2,), (1,), (3, 2)]
     assert space.shapes == {"action": (2,), "reward": (1,), "slice": (3, 2)}
-    assert space.boxes == boxes()
+    assert space.spaces == boxes()
     assert space["slice"].shape == (3, 2)
 
 
