@@ -64,7 +64,7 @@ class LandmarkReward:
         return float(max(-1.0, 0.0 - (off_target / sum(self.targets) + missing / 3 + (not in_place)) * THIRD))
 
 
-class AgreementReward:
+class AgreementReward(LandmarkReward):
     """The mean of the published reward and of how well sizes and positions agree with the labelled planes.
 
     The published reward is 0 up to 10 mm and 15 degrees away from a labelled plane. This one also looks at seven
@@ -94,7 +94,7 @@ class AgreementReward:
         slack: float = 0.1,
         slack_mm: float = 0.5,
     ) -> None:
-        self.published = LandmarkReward(targets)
+        super().__init__(targets)
         self.area_tolerance = check_float("area_tolerance", area_tolerance, at_least=0.001, at_most=1000.0)
         self.distance_tolerance_mm = check_float(
             "distance_tolerance_mm", distance_tolerance_mm, at_least=0.001, at_most=1000.0
@@ -102,11 +102,6 @@ class AgreementReward:
         self.slack = check_float("slack", slack, at_least=0.0, at_most=1.0)
         self.slack_mm = check_float("slack_mm", slack_mm, at_least=0.0, at_most=1000.0)
         self._ranges: list[Range] | None = None
-
-    @property
-    def targets(self) -> tuple[int, int, int]:
-        """Of the published reward."""
-        return self.published.targets
 
     def fitted_to(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Self:
         """See `Reward.fitted_to`.
@@ -141,7 +136,7 @@ class AgreementReward:
         costs = 0.0
         for feature, range_ in zip(_features(landmarks, pixel_mm), self._ranges, strict=True):
             costs += 1.0 if feature is None else range_.cost(feature)
-        return 0.5 * (self.published.score(landmarks, pixel_mm) - costs / len(self._ranges))
+        return 0.5 * (super().score(landmarks, pixel_mm) - costs / len(self._ranges))
 
     def _range(self, lowest: float, highest: float, *, is_area: bool) -> Range:
         if is_area:

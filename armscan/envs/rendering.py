@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from armscan.anatomy import PIXEL_TISSUES, LandmarkReward, Reward, Scanner, Tissues
 from armscan.envs.episode import Episode
-from armscan.envs.observations import View
+from armscan.envs.observations import SliceGeometry, View
 from armscan.envs.panels import (
     BACKGROUND,
     FAINT_INK,
@@ -24,7 +24,6 @@ from armscan.envs.panels import (
     side_panels,
     slice_panel,
 )
-from armscan.envs.scene import slice_geometry
 from armscan.volumes import LABEL_NAMES, LabelVolume
 from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance
 
@@ -139,7 +138,7 @@ def view_of(
         slice_xz=slice_xz,
         landmarks=landmarks,
         tissues=tissues,
-        geometry=slice_geometry(volume),
+        geometry=SliceGeometry(volume.slice_shape, volume.pixel_mm),
         smallest_shape=volume.slice_shape,
         action=np.zeros(0),
         reward=reward.score(landmarks, volume.pixel_mm),

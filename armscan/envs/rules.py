@@ -22,8 +22,8 @@ from armscan.anatomy import (
 )
 from armscan.envs.actions import ActionBounds, free_components
 from armscan.envs.observation_registry import with_action_reward
-from armscan.envs.observations import Observation, View, observe_all, smallest_shape
-from armscan.envs.scene import RandomTransform, Scene, SceneSampler, slice_geometry
+from armscan.envs.observations import Observation, SliceGeometry, View, observe_all, smallest_shape
+from armscan.envs.scene import RandomTransform, Scene, SceneSampler
 from armscan.envs.spaces import MultiBoxSpace, Parts, flat_space, flatten, in_order
 from armscan.errors import InvalidValueError, OptimalPlaneError, listed
 from armscan.utils.validation import check_bool, check_choice, check_float, check_int, check_numbers
@@ -81,7 +81,9 @@ class Rules:
         self._check_optimal_planes()
         self.free = free_components(projection)
         self.action_space = spaces.Box(-1.0, 1.0, (len(self.free),), np.float32)
-        self._geometries = {name: slice_geometry(volume) for name, volume in self.volumes.items()}
+        self._geometries = {
+            volume.name: SliceGeometry(volume.slice_shape, volume.pixel_mm) for volume in self.volumes.values()
+        }
         self._smallest_shape = smallest_shape(list(self._geometries.values()))
         self._observation = with_action_reward(observation, getattr(self.reward, "targets", PUBLISHED_TARGETS))
         self._boxes = boxes = self._observation.spaces(list(self._geometries.values()), len(self.free))

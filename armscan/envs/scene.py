@@ -8,7 +8,6 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from armscan.envs.actions import ActionBounds
-from armscan.envs.observations import SliceGeometry
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.utils.validation import check_choice, check_float
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, plane_distance, shift_into
@@ -152,8 +151,3 @@ class SceneSampler:
 
 # Checked once, not at every reset.
 _bounds = lru_cache(ActionBounds)
-
-
-def slice_geometry(volume: LabelVolume) -> SliceGeometry:
-    """Return the geometry of a volume's slices."""
-    return SliceGeometry(volume.slice_shape, volume.pixel_mm)
