@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
@@ -40,7 +43,7 @@ def _look(
         summarise_label(slice_xz, tissue_labels[tissue], widths, min_samples[which, tissue], landmarks[tissue])
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _look_all(
     volumes: Sequence[Pixels],
     which: IntArray,
@@ -55,11 +58,20 @@ def _look_all(
 ) -> None:
     """As `_look`, for the planes i of the volumes `which[i]`; row i of `slices` begins with the pixels of slice i."""
     rules = spacings_mm, tissue_labels, half_widths, min_samples
-    for i in numba.prange(which.size):
+    for i in range(which.size):
         labels_xyz = volumes[which[i]]
         n_across, n_depth = labels_xyz.shape[0], labels_xyz.shape[2]
         slice_xz = slices[i, : n_across * n_depth].reshape((n_across, n_depth))
         _look(labels_xyz, which[i], matrices[i], offsets_mm[i], *rules, slice_xz, landmarks[i])
+
+
+@functools.cache
+def _threads(pid: int, n_threads: int) -> ThreadPoolExecutor:
+    """Return the threads of a process; a fork has none of its parent's.
+
+    Numba's own would kill a fork that looks: GNU's OpenMP cannot be used on both sides of one.
+    """
+    return ThreadPoolExecutor(n_threads, thread_name_prefix=f"scanner-{pid}")
 
 
 class Scanner:
@@ -106,7 +118,7 @@ class Scanner:
     def look_all(
         self, which: IntArray, matrices: FloatArray, offsets_mm: FloatArray
     ) -> tuple[list[Pixels], FloatArray]:
-        """Look at n planes in one compiled call, on as many threads as `numba.get_num_threads()` says.
+        """Look at n planes on as many threads as NUMBA_NUM_THREADS says, default: one a core.
 
         Args:
             which: place of each plane's volume, shape (n,).
@@ -116,13 +128,20 @@ class Scanner:
         Returns:
             The slices, and the summaries of their clusters, shape (n, 3, 4): bit for bit what `look` gives.
         """
-        if self._typed_volumes is None:
-            self._typed_volumes = numba.typed.List([volume.labels for volume in self.volumes])
+        volumes = self._typed_volumes = self._typed_volumes or numba.typed.List([each.labels for each in self.volumes])
         shapes = [self._shapes[i] for i in which]
         slices = np.empty((len(which), max(n_across * n_depth for n_across, n_depth in shapes)), dtype=np.uint8)
         landmarks = np.empty((len(which), N_TISSUES, 4))
-        with numba.parallel_chunksize(max(1, len(which) // N_CHUNKS)):
-            _look_all(self._typed_volumes, which, matrices, offsets_mm, *self._rules, slices, landmarks)
+
+        def look_from(start: int, stop: int) -> None:
+            planes = (which[start:stop], matrices[start:stop], offsets_mm[start:stop])
+            _look_all(volumes, *planes, *self._rules, slices[start:stop], landmarks[start:stop])
+
+        if (n_threads := int(os.environ.get("NUMBA_NUM_THREADS") or os.cpu_count() or 1)) == 1:
+            look_from(0, len(which))
+        else:
+            bounds = range(0, len(which), max(1, len(which) // N_CHUNKS))
+            list(_threads(os.getpid(), n_threads).map(look_from, bounds, [*bounds[1:], len(which)]))
         return [
             row[: n_across * n_depth].reshape(n_across, n_depth)
             for row, (n_across, n_depth) in zip(slices, shapes, strict=True)

@@ -3,7 +3,8 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from torch.utils.data import DataLoader, Dataset
 
 import armscan
 from armscan.envs import ArmscanVectorEnv
@@ -128,3 +129,53 @@ def test_vector_env_gives_every_key_of_info_a_mask_of_its_own(phantom):
     infos = envs.reset(seed=0)[1]
     infos["_reward"][:] = False
     assert infos["_volume"].all()
+
+
+def test_forks_of_a_process_that_has_looked_at_many_planes_go_on(volumes, monkeypatch):
+    """As Gymnasium's AsyncVectorEnv and PyTorch's DataLoader fork."""
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    here = ArmscanVectorEnv(num_envs=4, volumes=volumes)
+    seen, _ = here.reset(seed=0)
+
+    def make():
+        return Pair(volumes)
+
+    forks = AsyncVectorEnv([make, make], context="fork")
+    try:
+        for forked in forks.reset(seed=0)[0]:
+            np.testing.assert_array_equal(forked, seen[:2])
+        forks.step(forks.action_space.sample())
+    finally:
+        forks.close()
+    loaded = DataLoader(Looks(volumes), batch_size=None, num_workers=2, multiprocessing_context="fork")
+    for each in loaded:
+        np.testing.assert_array_equal(each, seen[:2])
+    np.testing.assert_array_equal(here.reset(seed=0)[0], seen)
+
+
+class Pair(gym.Env):
+    """Two environments at once, as one."""
+
+    def __init__(self, volumes):
+        self._envs = ArmscanVectorEnv(num_envs=2, volumes=volumes)
+        self.observation_space, self.action_space = self._envs.observation_space, self._envs.action_space
+
+    def reset(self, *, seed=None, options=None):
+        return self._envs.reset(seed=0)[0], {}
+
+    def step(self, action):
+        observations, rewards, *_ = self._envs.step(action)
+        return observations, float(rewards.sum()), False, False, {}
+
+
+class Looks(Dataset):
+    """What two environments see first."""
+
+    def __init__(self, volumes):
+        self._volumes = volumes
+
+    def __len__(self):
+        return 4
+
+    def __getitem__(self, number):
+        return ArmscanVectorEnv(num_envs=2, volumes=self._volumes).reset(seed=0)[0]
