@@ -1,18 +1,30 @@
-"""A study's journal file, the default storage: lines that are appended whole."""
+"""A study's journal file, the default storage: lines that are appended whole, each with the sum of all up to it."""
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
+import os
+import re
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock
 from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.storages.journal import BaseJournalBackend
+from optuna.storages.journal._storage import JournalOperation
 
 from armscan.errors import StudyError
 from armscan.utils.files import truncate_torn_line
 
 # How every line of a journal begins.
 BEGINNING = b'{"op_code"'
+# How a line ends: with the CRC-32 of the lines before it and of itself up to here. Optuna ignores the key.
+SUM = re.compile(rb',"sum":"([0-9a-f]{8})"\}\n$')
 
 
 def open_journal(path: Path, *, is_written: bool) -> JournalStorage:
@@ -24,51 +36,129 @@ def open_journal(path: Path, *, is_written: bool) -> JournalStorage:
 
     Raises:
         OSError: if no file can be used there.
-        StudyError: if the file is no journal, or is damaged before its last line.
+        StudyError: if the file is no journal, or if a line of it but the last was lost or changed.
     """
-    lock = JournalLock(path)
+    journal = JournalFile(path)
     if is_written:
         path.touch()
-        lock.touch()
+        journal.lock_file.touch()
     # Before the repair, which would damage any other file. A journal may be empty, or torn in its first line.
     with path.open("rb") as file:
         if not BEGINNING.startswith(file.read(len(BEGINNING))):
             raise StudyError("that file is no journal of Optuna")
     if is_written:
-        lock.acquire()
-        lock.release()
+        with journal.locked():
+            pass
     try:
-        return JournalStorage(JournalFileBackend(str(path), lock_obj=lock))
-    # What Optuna raises for a line that it cannot read, whichever way it is damaged.
+        return JournalStorage(journal)
+    # What is raised for a line that cannot be read, whichever way it is damaged.
     except (ValueError, KeyError, TypeError, AssertionError) as error:
         raise StudyError(f"that file is no journal of Optuna: {error}") from error
 
 
-class JournalLock(JournalFileOpenLock):
-    """The lock of a journal file; its holder finds whole lines.
-
-    The system frees it when a process dies; Optuna's own lock would block all others for 30 s. A line whose writer died
-    is truncated: Optuna would append the next to it, and could read neither.
+@dataclass(frozen=True)
+class Position:
+    """A position between two lines of a journal.
 
     Args:
-        journal: the file.
+        n_lines: number of lines before it.
+        end: number of bytes before it.
+        sum: sum of the lines before it.
     """
 
-    def __init__(self, journal: Path) -> None:
-        super().__init__(str(journal))
-        self._journal = journal
-        self._lock = FileLock(journal.with_name(f".{journal.name}.lock"))
+    n_lines: int = 0
+    end: int = 0
+    sum: int = 0
 
-    def touch(self) -> None:
-        """Create the lock file: one that cannot be created would be waited for for ever."""
-        Path(self._lock.lock_file).touch()
 
-    def acquire(self) -> bool:
-        """Wait for the lock."""
-        self._lock.acquire()
-        truncate_torn_line(self._journal)
-        return True
+class JournalFile(BaseJournalBackend):
+    """A journal file in which a line that was lost or changed is noticed where a line with a sum follows.
 
-    def release(self) -> None:
-        """Free it."""
-        self._lock.release()
+    What earlier versions or Optuna have appended has no sum of its own; the next sum counts it. Only lost last lines
+    remain unseen: they may never have been written.
+
+    Args:
+        path: of the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._read = path, Position()
+        self._n_studies = self._n_trials = 0
+        self.lock_file = path.with_name(f".{path.name}.lock")
+        self._lock = FileLock(self.lock_file)
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the lock of the file, which then ends with a whole line.
+
+        The system frees it when a process dies; Optuna's own lock would block all others for 30 s. A line whose writer
+        died is truncated: the next would be appended to it, and nobody could read either.
+        """
+        with self._lock:
+            truncate_torn_line(self._path)
+            yield
+
+    def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:
+        """See `BaseJournalBackend`.
+
+        Raises:
+            StudyError: if a line was lost or changed.
+        """
+        if log_number_from != self._read.n_lines:
+            self._read, self._n_studies, self._n_trials = Position(), 0, 0
+        for line, position in self._lines():
+            operation = json.loads(line)
+            self._check_references(operation, position.n_lines)
+            self._read = position
+            if position.n_lines > log_number_from:
+                yield operation
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """See `BaseJournalBackend`."""
+        with self.locked():
+            # Others may have appended some since.
+            total = [self._read, *(position for _, position in self._lines())][-1].sum
+            lines = []
+            for operation in logs:
+                line = json.dumps(operation, separators=(",", ":")).encode()[:-1]
+                total = zlib.crc32(line, total)
+                lines.append(b'%b,"sum":"%08x"}\n' % (line, total))
+            with self._path.open("ab") as file:
+                file.write(b"".join(lines))
+                file.flush()
+                os.fsync(file.fileno())
+
+    def _lines(self) -> Iterator[tuple[bytes, Position]]:
+        """Iterate over the whole lines that have not been read, each with the position behind it."""
+        position = self._read
+        with self._path.open("rb") as file:
+            if file.seek(0, os.SEEK_END) < position.end:
+                raise self._damaged(position.n_lines)
+            file.seek(position.end)
+            # At once: a torn line may be replaced meanwhile.
+            unread = file.read()
+        for line in io.BytesIO(unread):
+            # Somebody is writing it, or died over it.
+            if not line.endswith(b"\n"):
+                return
+            told = SUM.search(line)
+            total = zlib.crc32(line[: told.start()] if told else line, position.sum)
+            position = Position(position.n_lines + 1, position.end + len(line), total)
+            if told and int(told[1], 16) != total:
+                raise self._damaged(position.n_lines)
+            yield line, position
+
+    def _check_references(self, operation: dict[str, Any], number: int) -> None:
+        """Raise `StudyError` if an operation is on a study or a trial that no line before it has made."""
+        # Some of these lines may have made none, because two workers wrote them at once.
+        self._n_studies += operation["op_code"] == JournalOperation.CREATE_STUDY
+        is_known = operation.get("study_id", -1) < self._n_studies and operation.get("trial_id", -1) < self._n_trials
+        self._n_trials += operation["op_code"] == JournalOperation.CREATE_TRIAL
+        if not is_known:
+            raise self._damaged(number)
+
+    def _damaged(self, number: int) -> StudyError:
+        return StudyError(
+            f"{self._path.name} is damaged: lines at or before line {number} were lost or changed; put back a copy of "
+            "the whole file, or name another one"
+        )
