@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -27,6 +28,7 @@ Entry = dict[str, Any]
 Channel = Literal["figures", "files"]
 CHANNELS: tuple[Channel, ...] = ("files", "figures")
 DELIVERED, LOCK, SUFFIX = OUTBOX_SUFFIXES
+ID = re.compile(r"[\w-]{1,64}", re.ASCII)
 # Of a machine: links to the outboxes of runs that may have something to upload.
 NOTES_FOLDER = "undelivered"
 # The process that had the run before may still be ending.
@@ -40,10 +42,17 @@ class Address:
     Args:
         run_id: the run's ID.
         uri: address of its tracking store.
+
+    Raises:
+        TrackingError: if the ID is none; files are named after it.
     """
 
     run_id: str
     uri: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.run_id, str) or not ID.fullmatch(self.run_id):
+            raise TrackingError(f"{str(self.run_id)[:50]!r} is no ID of a run")
 
 
 class OutboxFile:
@@ -226,6 +235,7 @@ def now_ms() -> int:
 
 def file_of(folder: Path, run_id: str) -> Path:
     """Return the path of a run's outbox, which may not exist."""
+    run_id = Address(run_id, "").run_id
     return folder / OUTBOX_FOLDER / f"{run_id}{SUFFIX}"
 
 

@@ -103,13 +103,24 @@ class Parameter:
         return all(name in chosen and chosen[name] in values for name, values in self.when.items())
 
     def suggest(self, trial: BaseTrial) -> Value:
-        """Return the value of a trial."""
+        """Return the value of a trial.
+
+        Raises:
+            InvalidValueError: if the storage has another value for it than the space has.
+        """
         drawn: Any = self.distribution
-        if isinstance(drawn, CategoricalDistribution):
-            choice: Value = trial.suggest_categorical(self.name, drawn.choices)
-            return choice
-        suggest: Any = trial.suggest_int if isinstance(drawn, IntDistribution) else trial.suggest_float
-        number: float = suggest(self.name, drawn.low, drawn.high, log=drawn.log, step=drawn.step)
+        refused = f"{self.name} has a value in the study's storage that is not in study.space"
+        try:
+            if isinstance(drawn, CategoricalDistribution):
+                choice: Value = trial.suggest_categorical(self.name, drawn.choices)
+                return choice
+            suggest: Any = trial.suggest_int if isinstance(drawn, IntDistribution) else trial.suggest_float
+            number: float = suggest(self.name, drawn.low, drawn.high, log=drawn.log, step=drawn.step)
+        except (ValueError, TypeError) as error:
+            raise InvalidValueError(f"{refused}: {' '.join(str(error).split())}") from error
+        # Optuna takes whatever an enqueued trial has, and warns.
+        if type(number) not in (int, float) or not drawn._contains(number):
+            raise InvalidValueError(f"{refused}: {number!r}")
         return number
 
     @property
