@@ -125,7 +125,7 @@ def test_run_is_passed_on_untouched(monkeypatch):
 def test_evaluate_has_an_option_for_each_rule():
     options = {parameter.name for parameter in evaluate.params}
     assert CHANGES.keys() <= options
-    named = {*("run", "agent", "data", "phantoms", "episodes", "seed", "video", "out", "tracking")}
+    named = {*("run", "agent", "data", "phantoms", "episodes", "seed", "video", "out", "tracking", "trust")}
     assert options - CHANGES.keys() == named | {"tracking_experiment"}
 
 

@@ -47,7 +47,7 @@ def test_build_crops_images_of_all_splits_alike(phantom, overrides, monkeypatch)
     experiment = build_experiment(config_of_sizes(phantom, monkeypatch, *overrides))
     volumes = (experiment.split.training, experiment.split.validation, experiment.split.test)
     frames = [experiment.maker.one(each).unwrapped.rules._observation for each in volumes]
-    assert {frame.observations[0]._frame.crop for frame in frames} == {(336, 80)}
+    assert {frame.observations[0]._crop for frame in frames} == {(336, 80)}
     spaces = [experiment.maker.one(each).observation_space for each in volumes]
     assert spaces[0] == spaces[1] == spaces[2]
 
