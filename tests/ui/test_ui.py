@@ -21,7 +21,7 @@ from armscan.cli.main import main
 from armscan.config.credentials import STORAGE_PASSWORD, TRACKING_PASSWORD, database_url
 from armscan.sweeps.storage.database import tables_in
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.dashboard import LOCAL_UI
+from armscan.sweeps.study.open import LOCAL_UI
 from armscan.ui import servers
 from armscan.ui.servers import HOST
 from tests.support.postgres import PASSWORD

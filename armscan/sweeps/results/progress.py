@@ -19,11 +19,9 @@ from armscan.config.command_hints import armscan_command
 from armscan.errors import StorageAwayError
 from armscan.experiment.console import print_where_to_look
 from armscan.sweeps.results.summary import final_results, shown_of, values_of
-from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, StudyState
 from armscan.sweeps.space.overrides import overrides_of
 from armscan.sweeps.study.open import OpenedStudy, Phase
-from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import best_trials
 from armscan.utils.retry import no_retry
 
@@ -98,10 +96,11 @@ def _ended(opened: OpenedStudy) -> list[tuple[tuple[str, int], FrozenTrial, Phas
 
 def _table(opened: OpenedStudy) -> Table:
     """Return the running trials, below how the study stands."""
-    scheduler, final = opened.search.scheduler, opened.final_eval
-    state, final_state = scheduler.state(), final.scheduler.state() if final is not None else StudyState.of(())
+    final = opened.final_eval
+    state = opened.search.scheduler.state()
+    final_state = final.scheduler.state() if final is not None else StudyState.of(())
     # As wide as the terminal, whatever the table has.
-    table = Table("worker", title=Text(_summary(scheduler, state, opened.settings)), title_justify="left", expand=True)
+    table = Table("worker", title=Text(_summary(opened, state)), title_justify="left", expand=True)
     for heading in ("trial", "seed", "environment steps", "return"):
         table.add_column(heading, justify="right")
     if final_state.all:
@@ -115,14 +114,15 @@ def _table(opened: OpenedStudy) -> Table:
     return table
 
 
-def _summary(scheduler: TrialScheduler, state: StudyState, settings: StudySettings) -> str:
+def _summary(opened: OpenedStudy, state: StudyState) -> str:
     """Return how a study stands, in one line."""
+    settings = opened.settings
     n_pruned = sum(trial.state == TrialState.PRUNED for trial in state.finished)
     parts = [
         f"study {settings.name}: {len(state.finished)} of {settings.n_trials} trials done, {n_pruned} of them pruned",
         f"{len(state.running)} running, {len(state.failed)} failed, {len(state.retried)} retried",
     ]
-    if best := best_trials(scheduler.study, 1):
+    if best := best_trials(opened.search.scheduler.study, 1):
         parts.append(f"best {values_of(best[0], settings.objectives)} (trial {best[0].number})")
     durations = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
     if durations and len(state.finished) < settings.n_trials:
@@ -148,7 +148,7 @@ def print_result(opened: OpenedStudy) -> int:
     """Print what a study has found; returns the exit code."""
     scheduler, settings = opened.search.scheduler, opened.settings
     state = scheduler.state()
-    print(_summary(scheduler, state, settings))
+    print(_summary(opened, state))
     wrong = scheduler.broken(state)
     if wrong is None and scheduler.end(state) is None:
         wrong = (

@@ -10,8 +10,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 
 from armscan.config.legacy import renamed
 
-PLAIN_TEXT = re.compile(r"[A-Za-z_][\w./\-]*")
-OTHER_THAN_TEXTS = ("true", "false", "null", "nan", "inf")
+PLAIN_TEXT = re.compile(r"(?!(?i:true|false|null|nan|inf)$)[A-Za-z_][\w./\-]*")
 Value = bool | int | float | str | None
 
 
@@ -36,11 +35,7 @@ def written(value: Any) -> str:
         return f"[{','.join(map(written, value))}]"
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{key}:{written(each)}" for key, each in value.items()) + "}"
-    if isinstance(value, str) and not _is_plain(value):
+    # Neither that of a list, nor one in which nothing but a text is read.
+    if isinstance(value, str) and not value.startswith(("[", "{")) and not PLAIN_TEXT.fullmatch(value):
         return QuotedString(value, Quote.single).with_quotes()
     return str(value)
-
-
-def _is_plain(text: str) -> bool:
-    """Whether a text needs no quotes, because nothing but a text is read in it, or because it is that of a list."""
-    return text.startswith(("[", "{")) or (bool(PLAIN_TEXT.fullmatch(text)) and text.lower() not in OTHER_THAN_TEXTS)

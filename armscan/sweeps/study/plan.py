@@ -26,12 +26,11 @@ def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
         study: as far as it is; None where it has not been begun.
     """
     console = Console()
-    state = StudyState.of(study.get_trials(deepcopy=False)) if study is not None else None
-    table = Table(title=f"study {settings.name}: what is searched", title_justify="left")
-    for heading in ("key", "values", "where"):
-        table.add_column(heading)
+    state = StudyState.of(study.get_trials(deepcopy=False) if study is not None else ())
+    table = Table("key", "values", "where", title=f"study {settings.name}: what is searched", title_justify="left")
     for parameter in settings.space.parameters:
-        table.add_row(*map(Text, (parameter.name, _values(parameter), _conditions(parameter))))
+        needs = ", ".join(f"{name} is {' or '.join(map(str, values))}" for name, values in parameter.when.items())
+        table.add_row(*map(Text, (parameter.name, _values(parameter), needs)))
     console.print(table)
     objectives = ", ".join(f"{direction} {name}" for name, direction in settings.objectives.items())
     limits = [f"{settings.n_trials} trials"]
@@ -40,11 +39,10 @@ def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
     n_final = settings.final_eval.top_k * settings.final_eval.n_seeds
     console.print(f"objective  {objectives}, over the seeds {', '.join(map(str, settings.seeds))}")
     console.print(f"limits     {', '.join(limits)}; {settings.workers} workers; then {n_final} final trainings")
-    done = len(state.finished) if state else 0
-    others = {"failed": state.failed, "requeued": state.waiting} if state else {}
-    also = "".join(f", {len(trials)} {what}" for what, trials in others.items() if trials)
-    console.print(f"done       {done} trials{also}")
-    if not state or not done:
+    others = (("failed", state.failed), ("requeued", state.waiting))
+    also = "".join(f", {len(trials)} {what}" for what, trials in others if trials)
+    console.print(f"done       {(done := len(state.finished))} trials{also}")
+    if not done:
         console.print("cost       not known before the first trial has finished")
         return
     seconds = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
@@ -70,7 +68,3 @@ def _values(parameter: Parameter) -> str:
     how += ", log" if drawn.log else ""
     how += f", in steps of {drawn.step:g}" if drawn.step not in (None, 1) else ""
     return f"{drawn.low:g} to {drawn.high:g}{how}"
-
-
-def _conditions(parameter: Parameter) -> str:
-    return ", ".join(f"{name} is {' or '.join(map(str, values))}" for name, values in parameter.when.items())

@@ -23,15 +23,8 @@ from armscan.stats.aggregation import interquartile_mean
 from armscan.sweeps.scheduling.state import ENV_STEPS
 from armscan.sweeps.tasks.attempt import Attempt, volumes_of
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
-from armscan.training import TEST, EpochReport, Evaluation, record_episode, resume_from_checkpoint
-from armscan.utils.files import (
-    LAST_CHECKPOINT,
-    LEARNING_CURVE_FILE,
-    RUN_FILE,
-    VIDEO_FILE,
-    atomic_write,
-    folder_lock,
-)
+from armscan.training import TEST, Budget, EpochReport, Evaluation, record_episode, resume_from_checkpoint
+from armscan.utils.files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, RUN_FILE, VIDEO_FILE, atomic_write, folder_lock
 from armscan.utils.log import log
 from armscan.utils.retry import RETRY_S
 
@@ -41,40 +34,30 @@ Conclude = Callable[[Experiment, TrackedRun, Path], dict[str, float]]
 
 
 @dataclass
-class Reporter:
-    """A training callback that reports to the study.
-
-    Args:
-        attempt: at the trial.
-        seed: of the training.
-        grid: environment steps between two reports.
-        total: environment steps of a whole training.
-    """
+class _Reporter:
+    """A training callback that reports to the study, also what an attempt before has reported."""
 
     attempt: Attempt
     seed: int
-    grid: int
-    total: int
+    budget: Budget
     reports: list[EpochReport] = field(default_factory=list)
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Report again what an attempt before has reported."""
         for report in earlier:
             self.on_epoch(report)
 
     def on_epoch(self, report: EpochReport) -> None:
-        """Report an epoch.
-
-        Raises:
-            optuna.TrialPruned: if the trial is not worth going on with.
-        """
         self.reports.append(report)
-        metrics = report.evaluation.metrics()
-        at = {"n_env_steps": report.n_env_steps, "grid": self.grid, "total": self.total}
-        self.attempt.report(metrics, seed=self.seed, **at)
+        self.attempt.report(
+            report.evaluation.metrics(),
+            seed=self.seed,
+            n_env_steps=report.n_env_steps,
+            grid=self.budget.eval_every_env_steps,
+            total=self.budget.env_steps,
+        )
 
     def on_end(self) -> None:
-        """Has reported everything."""
+        pass
 
 
 class TrainingTask:
@@ -103,14 +86,14 @@ class TrainingTask:
         """Train with each seed; returns the interquartile means of the metrics over the seeds. See `Task.run`."""
         for seed in attempt.seeds:
             if seed not in attempt.seeds_done:
-                attempt.keep_seed(seed, trained(attempt, seed))
+                attempt.keep_seed(seed, _trained(attempt, seed))
         of_seeds = [attempt.seeds_done[seed] for seed in attempt.seeds]
         return {name: float(interquartile_mean([metrics[name] for metrics in of_seeds])) for name in of_seeds[0]}
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
         """Train, evaluate, record a video and keep the policy; returns the metrics of the test."""
         (seed,) = attempt.seeds
-        return trained(attempt, seed, _concluded)
+        return _trained(attempt, seed, _concluded)
 
 
 def _concluded(setup: Experiment, tracked: TrackedRun, folder: Path) -> dict[str, float]:
@@ -126,26 +109,13 @@ def _concluded(setup: Experiment, tracked: TrackedRun, folder: Path) -> dict[str
     return metrics
 
 
-def trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:
-    """Train with one seed, from the last checkpoint where there is one.
-
-    Args:
-        attempt: at the trial.
-        seed: one of its seeds.
-        conclude: what is done with the trained agent; returns further metrics.
-
-    Returns:
-        The metrics of the best validation, of the training, and those that `conclude` returns.
-
-    Raises:
-        optuna.TrialPruned: if the trial is not worth going on with.
-    """
+def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:
+    """Train with one seed, from the last checkpoint where there is one; returns metrics, also those of `conclude`."""
     config, choices = attempt.config(seed)
     setup = set_up(config)
     folder = attempt.folder / f"seed_{seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    budget = setup.budget
-    reporter = Reporter(attempt, seed, grid=budget.eval_every_env_steps, total=budget.env_steps)
+    reporter = _Reporter(attempt, seed, setup.budget)
     pruned, concluded = None, {}
     with folder_lock(folder):
         setup, tracked, earlier = _begun(attempt, seed, setup, config, choices, folder)

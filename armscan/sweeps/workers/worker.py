@@ -22,8 +22,7 @@ from armscan.sweeps.scheduling.outcome import TrialOutcome
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF
 from armscan.sweeps.space.overrides import overrides_of
 from armscan.sweeps.study.components import make_sampler, read_settings
-from armscan.sweeps.study.dashboard import note_run, show_picture
-from armscan.sweeps.study.open import Phase, open_for_work
+from armscan.sweeps.study.open import Phase, note_run, open_for_work, show_picture
 from armscan.sweeps.study.study import enqueue_final_trials
 from armscan.sweeps.tasks.attempt import (
     CONFIG_SHA256,
