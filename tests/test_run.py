@@ -159,7 +159,8 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     assert f"resume all with: python -m armscan.run resume={parent.info.run_id}\n" in ended.stderr
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    again = armscan_run(f"resume={parent.info.run_id}", f"tracking.uri=sqlite:///{tmp_path}/mlruns.db", cwd=elsewhere)
+    words = [f"resume={parent.info.run_id}", "--trust", f"tracking.uri=sqlite:///{tmp_path}/mlruns.db"]
+    again = armscan_run(*words, cwd=elsewhere)
     assert not list(elsewhere.iterdir())
     assert again.returncode == 1
     # What has finished is not run again; what failed is.

@@ -74,6 +74,8 @@ def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
     """
     for word in words:
         key, _, value = word.lstrip("+~").partition("=")
+        # Hydra takes the value in quotes, too.
+        value = value.strip("'\"")
         # A server is sent this user's password.
         is_elsewhere = key.startswith("tracking.") and "://" in value and not value.startswith(("sqlite:", uri))
         if is_elsewhere or TARGET in word or INTERPOLATION in word or key.startswith(("hydra", "-")):

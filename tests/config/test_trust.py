@@ -83,4 +83,5 @@ def test_stored_command_line_of_a_usual_grid_is_accepted():
         "data.path=/x",
     ]
     check_stored_words(words, STORE, where="run 1")
-    check_stored_words(["tracking.uri=sqlite:///mlruns.db"], STORE, where="run 1")
+    for uri in ("sqlite:///mlruns.db", "'sqlite:///mlruns.db'", f"'{STORE}'"):
+        check_stored_words([f"tracking.uri={uri}"], STORE, where="run 1")
