@@ -9,7 +9,7 @@ import contextlib
 import json
 import shlex
 import shutil
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Self
 
@@ -44,14 +44,6 @@ class JobOutcome:
     varied: str
     failure: str | None = None
     metrics: dict[str, dict[str, float]] = field(default_factory=dict)
-
-    def is_failed(self, *, is_interrupted: bool) -> bool:
-        """Whether something went wrong; to be interrupted is no failure where the whole multirun was."""
-        return self.failure is not None and not (is_interrupted and self.failure == INTERRUPTED)
-
-    def interrupted(self) -> JobOutcome:
-        """Return the outcome of a job whose multirun was interrupted: its own, if it had one by then."""
-        return replace(self, failure=INTERRUPTED) if self.failure == NO_OUTCOME else self
 
 
 @dataclass(frozen=True)

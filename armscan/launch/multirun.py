@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,11 +111,11 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         return 0
     files = sorted((Multirun.folder / OUTCOME_FOLDER).glob("*.json"), key=lambda file: int(file.stem))
     outcomes = {file.stem: JobOutcome(**json.loads(file.read_text())) for file in files}
+    failed = {number: outcome for number, outcome in outcomes.items() if outcome.failure is not None}
     if is_interrupted:
-        outcomes = {number: outcome.interrupted() for number, outcome in outcomes.items()}
-    failed = {
-        number: outcome for number, outcome in outcomes.items() if outcome.is_failed(is_interrupted=is_interrupted)
-    }
+        # A job that had no outcome by then was interrupted, too, and that is no failure.
+        unended = {number for number, outcome in failed.items() if outcome.failure in (NO_OUTCOME, INTERRUPTED)}
+        outcomes |= {number: replace(failed.pop(number), failure=INTERRUPTED) for number in unended}
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
     word = json.loads((Multirun.folder / PARENT_FILE).read_text())
     try:

@@ -10,9 +10,8 @@ from typing import Any
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.system_metrics import PREFIX
 
-# Of the clock and the machine, which are never the same twice.
-TIMES = (PREFIX, "speed/")
-TIME_NAMES = ("wall_s", "training_s")
+# Metrics of the clock and the machine, which are never the same twice, begin so.
+TIMES = (PREFIX, "speed/", "wall_s", "training_s")
 N_SHOWN = 10
 
 
@@ -123,5 +122,5 @@ def difference(metric: str, then: Mapping[int, float], now: Mapping[int, float])
 
 def _histories(store: TrackingStore, run_id: str) -> dict[str, dict[int, float]]:
     metrics = store.get_run(run_id).data.metrics
-    names = [name for name in metrics if not name.startswith(TIMES) and name not in TIME_NAMES]
+    names = [name for name in metrics if not name.startswith(TIMES)]
     return {name: {point.step: point.value for point in store.get_metric_history(run_id, name)} for name in names}

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from armscan.config.command_hints import armscan_command
-from armscan.errors import InvalidValueError, TrackingError
+from armscan.errors import TrackingError
 from armscan.evaluation import EvaluationReport
 from armscan.evaluation.report import REFUSED_BY_MLFLOW, metrics_in_markdown
 from armscan.tracking import EVALUATED_TAG, FoundRun
@@ -18,6 +17,7 @@ from armscan.utils.files import EVALUATION_FILE
 
 # What MLflow's databases take of a description.
 MAX_CHARS = 5000
+OWN_VOLUMES = "own volumes"
 TAGGED = ("success_rate", "mean_steps", "mean_distance_mm", "mean_distance_deg", "mean_dice")
 
 
@@ -63,12 +63,11 @@ def _reports(run: FoundRun, folder: Path) -> dict[str, EvaluationReport]:
     """Return the evaluations of a run by their titles, its own first."""
     reports = {}
     if EVALUATION_FILE in run.files:
-        reports["at the end of the run"] = _read(run, run.run_id, EVALUATION_FILE, folder, _by_run)
+        reports["at the end of the run"] = _read(run, run.run_id, EVALUATION_FILE, folder)
     if (latest := _latest(run)) is not None:
-        run_id, file = latest
-        report = _read(run, run_id, file, folder, _by_command)
+        report = _read(run, *latest, folder)
         changes = "".join(f", {key}={value}" for key, value in report.facts["changes"].items())
-        reports[f"by evaluation {run_id}, on {report.facts['data']}{changes}"] = report
+        reports[f"by evaluation {latest[0]}, on {report.facts['data']}{changes}"] = report
     return reports
 
 
@@ -86,33 +85,25 @@ def _latest(run: FoundRun) -> tuple[str, str] | None:
     return None
 
 
-def _read(
-    run: FoundRun, run_id: str, file: str, folder: Path, understand: Callable[[Any], EvaluationReport]
-) -> EvaluationReport:
-    contents = Path(run.client.download_artifacts(run_id, file, str(folder))).read_bytes()
+def _read(run: FoundRun, run_id: str, file: str, folder: Path) -> EvaluationReport:
+    """Return the evaluation in an artifact, of the run itself or of one by `armscan evaluate`."""
+    text = Path(run.client.download_artifacts(run_id, file, str(folder))).read_bytes()
     try:
-        return understand(json.loads(contents))
+        contents = json.loads(text)
+        if run_id == run.run_id:
+            contents = {"episodes": {label: each["episodes"] for label, each in contents.items()}}
+        facts = {key: contents[key] for key in ("data", "changes") if run_id != run.run_id}
+        evaluations = {label: Evaluation.of_plain(some) for label, some in contents["episodes"].items()}
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise TrackingError(f"run {run_id}: its {file} is damaged; put it back, or remove it") from error
+        raise _damaged(run_id, file) from error
+    is_read = not facts or (isinstance(facts["data"], str) and isinstance(facts["changes"], dict))
+    if not (is_read and evaluations and all(evaluation.episodes for evaluation in evaluations.values())):
+        raise _damaged(run_id, file)
+    return EvaluationReport(evaluations, has_total=facts.get("data", OWN_VOLUMES) != OWN_VOLUMES, facts=facts)
 
 
-def _by_run(contents: Any) -> EvaluationReport:
-    return _report({label: each["episodes"] for label, each in contents.items()}, has_total=False, facts={})
-
-
-def _by_command(contents: Any) -> EvaluationReport:
-    data, changes = contents["data"], contents["changes"]
-    if not isinstance(data, str) or not isinstance(changes, dict):
-        raise InvalidValueError(f"the data are {data!r} and the changes {changes!r}, but that is no text or no dict")
-    is_foreign = data != "own volumes"
-    return _report(contents["episodes"], has_total=is_foreign, facts={"data": data, "changes": changes})
-
-
-def _report(episodes: Mapping[str, object], *, has_total: bool, facts: Mapping[str, Any]) -> EvaluationReport:
-    evaluations = {label: Evaluation.of_plain(some) for label, some in episodes.items()}
-    if not evaluations or not all(evaluation.episodes for evaluation in evaluations.values()):
-        raise InvalidValueError("there are no episodes, but each group of volumes must have some")
-    return EvaluationReport(evaluations, has_total=has_total, facts=facts)
+def _damaged(run_id: str, file: str) -> TrackingError:
+    return TrackingError(f"run {run_id}: its {file} is damaged; put it back, or remove it")
 
 
 def _tags(report: EvaluationReport) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 
 from mlflow.entities import Run
 from rich.console import Console
@@ -37,12 +37,11 @@ def show(client: TrackingStore, run: Run, uri: str) -> None:
     """
     console, entry = Console(), RunRow(client, run)
     tags = {name: value for name, value in run.data.tags.items() if value}
-    _print_pairs(console, _facts(run, entry))
+    _print_pairs(console, "", _facts(run, entry))
     _print_figures(console, run)
-    console.print("\ntags", style="bold")
     shown = {*STARTED_BY, FAILURE_TAG, PARENT_TAG}
     others = {name: tags[name] for name in sorted(tags) if name not in shown and not name.startswith("mlflow.")}
-    _print_pairs(console, others)
+    _print_pairs(console, "tags", others)
     artifacts = artifacts_of(client, run)
     folder = _print_folder(console, run)
     if artifacts is None:
@@ -50,7 +49,12 @@ def show(client: TrackingStore, run: Run, uri: str) -> None:
     else:
         _print_sizes(console, f"artifacts in {run.info.artifact_uri}", artifacts)
     children = search(client, experiment_ids(client), f"tags.mlflow.parentRunId = '{run.info.run_id}'")
-    _print_children(console, children)
+    if children:
+        console.print("\nchildren", style="bold")
+        table = narrow_table("id", "name", "status")
+        for child in sorted(children, key=lambda child: child.info.start_time):
+            table.add_row(child.info.run_id[:ID_CHARS], Text(child.info.run_name), child.info.status.lower())
+        console.print(table)
     _print_commands(console, uri, run, folder, artifacts or {})
 
 
@@ -71,8 +75,11 @@ def _facts(run: Run, entry: RunRow) -> dict[str, str]:
     return {name: value for name, value in facts.items() if name and value}
 
 
-def _print_pairs(console: Console, pairs: dict[str, str]) -> None:
-    table = narrow_table("", "")
+def _print_pairs(console: Console, title: str, pairs: dict[str, str], right: str = "") -> None:
+    """Print names with their values; `right` is the heading of the values, > for numbers."""
+    if title:
+        console.print(Text(f"\n{title}", style="bold"), soft_wrap=True)
+    table = narrow_table("", right)
     table.show_header = False
     for name, value in pairs.items():
         whole = " ".join(value.split())
@@ -105,9 +112,8 @@ def _print_folder(console: Console, run: Run) -> OwnFolder | None:
     except RunSkippedError as error:
         console.print(f"\nfolder: {error}", style="bold", soft_wrap=True)
         return None
-    _print_sizes(
-        console, f"folder {ours.path}", {str(file.relative_to(ours.path)): n for file, n in ours.files().items()}
-    )
+    sizes = {str(file.relative_to(ours.path)): n_bytes for file, n_bytes in ours.files().items()}
+    _print_sizes(console, f"folder {ours.path}", sizes)
     try:
         with ours.held(is_planned=True):
             pass
@@ -117,22 +123,8 @@ def _print_folder(console: Console, run: Run) -> OwnFolder | None:
 
 
 def _print_sizes(console: Console, where: str, files: dict[str, int]) -> None:
-    console.print(Text(f"\n{where}, {decimal(sum(files.values()))}", style="bold"), soft_wrap=True)
-    table = narrow_table("", ">")
-    table.show_header = False
-    for name, n_bytes in sorted(files.items()):
-        table.add_row(Text(name), decimal(n_bytes))
-    console.print(table)
-
-
-def _print_children(console: Console, children: Sequence[Run]) -> None:
-    if not children:
-        return
-    console.print("\nchildren", style="bold")
-    table = narrow_table("id", "name", "status")
-    for child in sorted(children, key=lambda child: child.info.start_time):
-        table.add_row(child.info.run_id[:ID_CHARS], Text(child.info.run_name), child.info.status.lower())
-    console.print(table)
+    sizes = {name: decimal(n_bytes) for name, n_bytes in sorted(files.items())}
+    _print_pairs(console, f"{where}, {decimal(sum(files.values()))}", sizes, ">")
 
 
 def _print_commands(console: Console, uri: str, run: Run, folder: OwnFolder | None, artifacts: Collection[str]) -> None:
