@@ -77,7 +77,8 @@ def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
         # Hydra takes the value in quotes, too.
         value = value.strip("'\"")
         # A server is sent this user's password.
-        is_elsewhere = key.startswith("tracking.") and "://" in value and not value.startswith(("sqlite:", uri))
+        is_server = "://" in value and not value.startswith("sqlite:")
+        is_elsewhere = key.startswith("tracking.") and is_server and value != uri
         if is_elsewhere or TARGET in word or INTERPOLATION in word or key.startswith(("hydra", "-")):
             raise UntrustedError(
                 f"{where}: its command line has {word!r}, which could execute code of others or send results "

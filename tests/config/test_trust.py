@@ -66,6 +66,7 @@ def test_offered_classes_are_of_runs_and_not_of_commands():
         "~hydra.callbacks",
         "--config-dir=/tmp",
         "tracking.uri=http://elsewhere",
+        f"tracking.uri={STORE}.elsewhere",
         "tracking.artifacts='s3://elsewhere'",
     ],
 )
