@@ -133,16 +133,23 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
 @runs.command(epilog=examples("runs sync outputs", "runs sync studies/sac_y"))
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--tracking", type=UriParam(), help="MLflow tracking store.  [default: the one that each run names]")
-def sync(folder: Path, tracking: str | None) -> int:
+@trust_option
+def sync(folder: Path, tracking: str | None, trust: bool) -> int:
     """Upload what runs could not while their store was away.
 
     FOLDER is the folder of a run, of a study, or above them. What is delivered already is not delivered again; runs
     that are still going on deliver for themselves. Exit code: 1 if something is left.
     """
+    from armscan.config.trust import check_stored_address
     from armscan.tracking import open_existing_store
     from armscan.tracking import sync as deliver
 
-    deliveries = deliver(folder, cache(lambda tracked_in: open_existing_store(tracking or tracked_in)))
+    def opened(tracked_in: str) -> TrackingStore:
+        if tracking is None and not trust:
+            check_stored_address(tracked_in)
+        return open_existing_store(tracking or tracked_in)
+
+    deliveries = deliver(folder, cache(opened), trust=trust)
     for delivery in deliveries:
         which = f"run {delivery.run_id}" if delivery.run_id else "a run"
         left = f", the rest is left: {delivery.left}" if delivery.left else ""

@@ -8,15 +8,18 @@ else in it is computed, unless the user says `--trust`.
 from __future__ import annotations
 
 import functools
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from armscan.config.defaults import default_tracking
 from armscan.config.legacy import migrate
 from armscan.config.sources import config_folder, sweeps_folder
 from armscan.errors import UntrustedError
 
 TRUST = "--trust"
+SERVER_SECRETS = ("MLFLOW_TRACKING_PASSWORD", "MLFLOW_TRACKING_TOKEN")
 HOW = f"if you trust whoever made it, repeat the command with {TRUST}"
 TARGET, INTERPOLATION = "_target_", "${"
 TARGETS = re.compile(rf"{TARGET}: *([\w.]+)")
@@ -84,6 +87,13 @@ def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
                 f"{where}: its command line has {word!r}, which could execute code of others or send results "
                 f"elsewhere; {HOW}"
             )
+
+
+def check_stored_address(uri: str) -> None:
+    """Raise `UntrustedError` where a stored address would be sent a password that is meant for another server."""
+    secrets = [name for name in SERVER_SECRETS if os.environ.get(name)]
+    if uri.startswith("http") and secrets and uri != default_tracking()["uri"]:
+        raise UntrustedError(f"{uri} would be sent this user's {secrets[0]}: give --tracking {uri} if it is yours")
 
 
 def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:

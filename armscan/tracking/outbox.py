@@ -172,6 +172,8 @@ class Outbox(OutboxFile):
             truncate_torn_line(file)
             super().__init__(file)
             self._appending, self._adding = file.open("ab", buffering=0), threading.Lock()
+            # The files that this process has added.
+            self.added: set[str] = set()
         except BaseException:
             self._lock.release()
             raise
@@ -189,6 +191,8 @@ class Outbox(OutboxFile):
     def add(self, **entry: Any) -> None:
         """Append an entry. It survives this process and failures of the store."""
         line = json.dumps(entry).encode() + b"\n"
+        if "file" in entry:
+            self.added.add(file_and_place(entry["file"])[0])
         with self._adding:
             size = os.fstat(self._appending.fileno()).st_size
             if self._appending.write(line) != len(line):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from armscan.errors import FolderInUseError, TrackingError
+from armscan.errors import FolderInUseError, TrackingError, UntrustedError
 from armscan.tracking.client import TrackingStore, reason_in
 from armscan.tracking.outbox import CHANNELS, Address, Outbox, notes, now_ms, outbox_files
 from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
@@ -41,20 +41,21 @@ class Delivery:
     left: str | None
 
 
-def sync(folder: Path, opened: Callable[[str], TrackingStore]) -> list[Delivery]:
+def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = False) -> list[Delivery]:
     """Deliver what the runs in a folder, and in the folders in it, have left.
 
     Args:
         folder: folder of a run, of a study, or above them.
         opened: opens a store by its address; called once for each address.
+        trust: whether files outside of a run's folder are uploaded; default: false.
 
     Returns:
         What became of each run that had something left.
     """
-    return _synced(outbox_files(folder), opened)
+    return _synced(outbox_files(folder), opened, trust=trust)
 
 
-def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore]) -> list[Delivery]:
+def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, trust: bool) -> list[Delivery]:
     deliveries: list[Delivery] = []
     stores: dict[str, TrackingStore | TrackingError] = {}
     for file in files:
@@ -67,7 +68,7 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore]) -> li
                 if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
                     deliveries.append(Delivery(outbox.folder, run_id, 0, str(store)))
                 else:
-                    deliveries.append(_delivered(outbox, store))
+                    deliveries.append(_delivered(outbox, store, trust=trust))
                 stores[uri] = store
         except FileNotFoundError:
             # Its run was removed meanwhile.
@@ -83,15 +84,15 @@ def _opened(opened: Callable[[str], TrackingStore], uri: str) -> TrackingStore |
     """Open a store; return why it cannot be used, so that it is not waited for again with the next run."""
     try:
         return opened(uri)
-    except TrackingError as error:
-        return error
+    except (TrackingError, UntrustedError) as error:
+        return TrackingError(str(error))
 
 
-def _delivered(outbox: Outbox, store: TrackingStore) -> Delivery:
+def _delivered(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Delivery:
     n_entries, left = 0, None
     for channel in CHANNELS:
         try:
-            n_entries += deliver(outbox, store.mlflow, channel, is_whole=False)
+            n_entries += deliver(outbox, store.mlflow, channel, is_whole=False, trust=trust)
         # Whatever a store raises: what it does not take stays there, and the next channel may be taken.
         except Exception as error:
             left = reason_in(error)
@@ -112,7 +113,8 @@ def _deliver_pending(store: TrackingStore) -> None:
         return store
 
     for note in notes():
-        deliveries = _synced([note.resolve()], opened)
+        # This user's own, as the note is.
+        deliveries = _synced([note.resolve()], opened, trust=True)
         for delivery in deliveries:
             if delivery.n_entries:
                 log(f"run {delivery.run_id}: {delivery.n_entries} entries that it had left are delivered now")

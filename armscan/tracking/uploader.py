@@ -11,7 +11,8 @@ from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, RunTag
 from mlflow.exceptions import MlflowException
 
-from armscan.errors import TrackingError
+from armscan.config.trust import TRUST
+from armscan.errors import TrackingError, UntrustedError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, why_away
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
 from armscan.utils.log import log
@@ -112,7 +113,9 @@ class Uploader:
             log(f"{self._store.uri} is back: everything is delivered")
 
 
-def deliver(outbox: Outbox, client: MlflowClient, channel: Channel, *, is_whole: bool = True) -> int:
+def deliver(
+    outbox: Outbox, client: MlflowClient, channel: Channel, *, is_whole: bool = True, trust: bool = False
+) -> int:
     """Upload the pending entries of one channel.
 
     Args:
@@ -120,20 +123,27 @@ def deliver(outbox: Outbox, client: MlflowClient, channel: Channel, *, is_whole:
         client: client of its store.
         channel: the channel.
         is_whole: whether the run's folder is complete, so that a missing file was removed on purpose.
+        trust: whether files outside of the run's folder are uploaded that another process has added; default: false.
 
     Returns:
         The number of entries.
 
     Raises:
         FileNotFoundError: if a file is missing, and the folder may be an incomplete copy.
+        UntrustedError: if a file outside of the run's folder was added by another process, perhaps a stranger's.
     """
     n_delivered = 0
     while True:
         entries, end = outbox.next_entries(channel, ENTRIES_AT_ONCE if channel == "figures" else 1)
         if not entries:
             return n_delivered
-        for entry in entries if channel == "files" and not is_whole else ():
-            if not (file := outbox.folder / file_and_place(entry["file"])[0]).exists():
+        for entry in entries if channel == "files" else ():
+            file = outbox.folder / (name := file_and_place(entry["file"])[0])
+            if not trust and name not in outbox.added and not file.resolve().is_relative_to(outbox.folder.resolve()):
+                raise UntrustedError(
+                    f"{file} is outside of the run's folder; if you trust whoever made it, add {TRUST}"
+                )
+            if not is_whole and not file.exists():
                 raise FileNotFoundError(f"{file} is not there")
         for kind, group in itertools.groupby(entries, key=lambda entry: next(iter(entry))):
             _deliver(client, outbox, kind, [entry[kind] for entry in group])

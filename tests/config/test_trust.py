@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 
 from armscan.config.compose import compose
 from armscan.config.defaults import to_plain
-from armscan.config.trust import check_stored_words, offered_classes, stored_config
+from armscan.config.trust import check_stored_address, check_stored_words, offered_classes, stored_config
 from armscan.errors import UntrustedError
 
 STORE = "http://127.0.0.1:5000"
@@ -86,3 +86,14 @@ def test_stored_command_line_of_a_usual_grid_is_accepted():
     check_stored_words(words, STORE, where="run 1")
     for uri in ("sqlite:///mlruns.db", "'sqlite:///mlruns.db'", f"'{STORE}'"):
         check_stored_words([f"tracking.uri={uri}"], STORE, where="run 1")
+
+
+@pytest.mark.parametrize("secret", ["MLFLOW_TRACKING_PASSWORD", "MLFLOW_TRACKING_TOKEN"])
+def test_password_is_sent_to_no_address_that_a_folder_names(monkeypatch, secret):
+    check_stored_address("http://elsewhere:5000")
+    monkeypatch.setenv(secret, "secret")
+    with pytest.raises(UntrustedError, match=f"http://elsewhere:5000 would be sent this user's {secret}"):
+        check_stored_address("http://elsewhere:5000")
+    check_stored_address("sqlite:////mlruns.db")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://elsewhere:5000")
+    check_stored_address("http://elsewhere:5000")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import armscan
-from armscan.errors import InvalidValueError, TrackingError
+from armscan.errors import InvalidValueError, TrackingError, UntrustedError
 from armscan.experiment.runner import keep_results
 from armscan.tracking import (
     VERSION_TAG,
@@ -24,6 +24,7 @@ from armscan.tracking import (
 )
 from armscan.tracking.outbox import Address, Outbox, file_of
 from armscan.tracking.sanitize import flattened
+from armscan.tracking.sync import sync
 from armscan.tracking.uploader import deliver
 from armscan.training import EpochReport, TrainingResult
 from tests.support.waiting import wait_until
@@ -119,6 +120,32 @@ def test_folder_that_was_removed_before_it_was_delivered_is_told(store, tmp_path
     said = capsys.readouterr().out
     assert "policy/MLmodel was removed before the store could keep it" in said
     assert "best.pt was removed" in said
+
+
+@pytest.mark.parametrize("kind", ["above", "absolute", "link"])
+def test_file_outside_of_a_strangers_folder_is_not_uploaded(store, tmp_path, kind):
+    client, experiment_id = store
+    run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id
+    (tmp_path / "secret").write_text("secret")
+    folder = tmp_path / "theirs"
+    names = {"above": "../secret", "absolute": str(tmp_path / "secret"), "link": "link"}
+    outbox = Outbox.begin(folder, Address(run_id, client.uri))
+    (folder / "link").symlink_to(tmp_path / "secret")
+    outbox.add(file=names[kind])
+    outbox.close()
+    (delivery,) = sync(tmp_path, lambda _: client)
+    assert "is outside of the run's folder" in delivery.left
+    assert client.list_artifacts(run_id) == []
+    # Nor by one that goes on with the run.
+    with (
+        contextlib.closing(Outbox.begin(folder, Address(run_id, client.uri))) as outbox,
+        pytest.raises(UntrustedError, match="add --trust"),
+    ):
+        deliver(outbox, client.mlflow, "files")
+    assert client.list_artifacts(run_id) == []
+    (delivery,) = sync(tmp_path, lambda _: client, trust=True)
+    assert delivery.left is None
+    assert len(client.list_artifacts(run_id)) == 1
 
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), "KILLED"), (ValueError("no"), "FAILED")])
