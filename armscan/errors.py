@@ -73,7 +73,7 @@ class ResumeError(ArmscanError, RuntimeError):
 
 
 class UntrustedError(ArmscanError, RuntimeError):
-    """What a stranger may have written would be executed."""
+    """A stored value, which a stranger may have written, would be executed."""
 
 
 class DisplayError(ArmscanError, RuntimeError):

@@ -1,4 +1,4 @@
-"""What Tianshou's trainer reports during an epoch."""
+"""Metrics that Tianshou's trainer reports during an epoch."""
 
 from __future__ import annotations
 

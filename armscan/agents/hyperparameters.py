@@ -18,7 +18,7 @@ def number(default: float, **limits: float) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """What every learning algorithm is told.
+    """Hyperparameters of every learning algorithm.
 
     Fields of subclasses are checked by their types: whole numbers are at least 1, others within their limits.
 
@@ -59,7 +59,7 @@ class Parameters:
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyParameters(Parameters):
-    """What every algorithm is told whose policy explores while it learns."""
+    """Hyperparameters of every algorithm whose policy explores while it learns."""
 
     deterministic_eval: bool = True
     """Whether the policy is evaluated by its mode; false: its actions are sampled, as they are during training."""

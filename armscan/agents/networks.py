@@ -22,7 +22,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "el
 
 
 class NetworkChoice(Protocol):
-    """What says which network takes an observation."""
+    """Chooses the network by the observation."""
 
     def chosen_for(self, observation_space: spaces.Space[Any]) -> Network:
         """Return the network for such observations; a network returns itself, if it can take them.

@@ -78,7 +78,7 @@ class Regression(Parameters):
 class RegressionLearner:
     """Fits a network to the optimal actions of observed planes; default: random planes.
 
-    As in `TianshouLearner`, every epoch begins with new episodes and draws whatever it draws from `seed` and its own
+    As in `TianshouLearner`, every epoch begins with new episodes and draws everything from `seed` and its own
     number, so that it goes on from its state bit for bit.
 
     Args:

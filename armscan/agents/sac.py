@@ -33,7 +33,7 @@ class SAC(PolicyParameters):
     """Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) with a learned entropy coefficient."""
 
     ent_coef_init: float = number(0.1, above=0.0, at_most=1000.0)
-    """What the entropy coefficient is at first; rewards here are small, so that 1 would drown them for long."""
+    """Initial entropy coefficient; rewards here are small, so that 1 would drown them for long."""
 
     ent_coef_lr: float = number(3e-4, above=0.0, at_most=1.0)
     """Learning rate of the entropy coefficient."""

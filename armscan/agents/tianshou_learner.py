@@ -30,7 +30,7 @@ class TianshouLearner:
     Its test collector, persistence and progress bars are left out: evaluation, checkpoints and progress are the same
     for every agent, and belong to training.
 
-    Every epoch begins with new episodes, and draws whatever it draws from `seed` and its own number. So nothing of an
+    Every epoch begins with new episodes, and draws everything from `seed` and its own number. So nothing of an
     episode has to be kept for a training to go on later exactly as it would have gone on at once.
 
     Args:

@@ -1,4 +1,4 @@
-"""What is seen in a slice: tissues, their clusters, and the rewards computed from them."""
+"""Tissues in a slice, their clusters, and the rewards computed from them."""
 
 from armscan.anatomy.landmarks import Clusters, Landmarks, TissueClusters, tissue_dice
 from armscan.anatomy.plane_search import FoundPlane, PlaneScorer, find_optimal_plane

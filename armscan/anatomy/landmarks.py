@@ -1,4 +1,4 @@
-"""What is seen in a slice: the clusters of each landmark tissue, and their summary."""
+"""Clusters of each landmark tissue in a slice, and their summary."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ MAX_ANGLE_DEG = 80.0
 
 @dataclass(frozen=True)
 class FoundPlane:
-    """What a search has found.
+    """Result of a search.
 
     Args:
         action: the plane, its origin (tx, ty) within the volume.

@@ -1,4 +1,4 @@
-"""What a slice is worth, computed from the summary of its clusters; each in [-1, 0], 0 at best."""
+"""Rewards of a slice, computed from the summary of its clusters; each in [-1, 0], 0 at best."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ MOST_SAMPLES = 10_000_000
 
 
 class Neighbourhood(NamedTuple):
-    """What makes a core pixel: at least `min_samples` pixels in the disc of these half widths about it."""
+    """Rule for core pixels: at least `min_samples` pixels in the disc of these half widths about it."""
 
     half_widths: IntArray
     min_samples: int

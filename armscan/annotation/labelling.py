@@ -28,7 +28,7 @@ SUCCESS_THRESHOLD = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class LabellingOptions:
-    """What is to be labelled, and how.
+    """Volumes to label, and options of the search.
 
     Args:
         data: the folder of volumes.

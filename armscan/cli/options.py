@@ -113,7 +113,7 @@ storage_option = partial(
     help="Optuna storage of the studies.",
 )
 trust_option = click.option(
-    "--trust", is_flag=True, help="Trust whoever made the run: execute code and read files that it names."
+    "--trust", is_flag=True, help="Trust the author of the run: execute code and read files that it names."
 )
 clustering_option = click.option(
     "--clustering",

@@ -17,7 +17,7 @@ def one_line_message(error: BaseException) -> str | None:
     """Return what a user did wrong and what is allowed instead; None if the error is no user's mistake.
 
     Args:
-        error: whatever was raised.
+        error: the exception, of any class.
     """
     if (ours := _ours(error)) is not None:
         return str(ours)

@@ -1,4 +1,4 @@
-"""What a stored configuration or command line may execute.
+"""Code that a stored configuration or command line may execute.
 
 Hydra builds objects by the names of their classes, so a configuration is a program. What this user typed is trusted.
 What comes from a store or a run's folder may be anybody's: of its classes only armscan's own are built, and nothing
@@ -20,7 +20,7 @@ from armscan.errors import UntrustedError
 
 TRUST = "--trust"
 SERVER_SECRETS = ("MLFLOW_TRACKING_PASSWORD", "MLFLOW_TRACKING_TOKEN")
-HOW = f"if you trust whoever made it, repeat the command with {TRUST}"
+HOW = f"if you trust its author, repeat the command with {TRUST}"
 TARGET, INTERPOLATION = "_target_", "${"
 TARGETS = re.compile(rf"{TARGET}: *([\w.]+)")
 # Of grids and studies, not of the runs in them.

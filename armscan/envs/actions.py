@@ -24,7 +24,7 @@ MAX_TRANSLATION_MM = 1e6
 
 @dataclass(frozen=True)
 class ActionBounds:
-    """What the normalised vector (rz, rx, tx, ty) in [-1, 1]^4 stands for.
+    """Meaning of the normalised vector (rz, rx, tx, ty) in [-1, 1]^4.
 
     Rotation is a * bound, translation (a + 1) / 2 * bound; a zero bound fixes its component at 0.
 

@@ -1,4 +1,4 @@
-"""What wrappers remember of an episode, for a batch of environments: the last observations, the best actions."""
+"""History of episodes, for a batch of environments: the last observations, the best actions."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def check_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozense
 
 
 class Remembered(Protocol):
-    """What a wrapper remembers of the episodes of a batch of environments."""
+    """History of the episodes of a batch of environments, kept by a wrapper."""
 
     boxes: dict[str, spaces.Box]
     """Space of each part of what one environment observes with it."""

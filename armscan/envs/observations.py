@@ -1,4 +1,4 @@
-"""What an agent gets to see: named parts, each with its space, that can be merged."""
+"""Observations: named parts, each with its space, that can be merged."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def smallest_shape(geometries: Sequence[SliceGeometry]) -> tuple[int, int]:
 
 @dataclass(eq=False)
 class View:
-    """What the environment shows an observation at one step.
+    """View of the environment at one step, from which observations are computed.
 
     Args:
         slice_xz: the slice's labels, indexed [across, depth].

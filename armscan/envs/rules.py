@@ -109,7 +109,7 @@ class Rules:
 
     @property
     def bounds(self) -> dict[str, ActionBounds]:
-        """What actions stand for on each volume, by its name."""
+        """Bounds of the actions on each volume, by its name."""
         return {name: self._sampler.bounds(volume) for name, volume in self.volumes.items()}
 
     def draw_scenes(self, names: Sequence[str], rngs: Sequence[np.random.Generator]) -> list[Scene]:

@@ -1,4 +1,4 @@
-"""What one episode is played on: a volume, how it is moved, and where its optimal plane then lies."""
+"""Scene of one episode: a volume, its motion, and where its optimal plane then lies."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from armscan.errors import InvalidValueError
 
 Parts = dict[str, NDArray[Any]]
-"""What is observed, by name."""
+"""Parts of an observation by name."""
 
 
 class MultiBoxSpace(spaces.Dict):

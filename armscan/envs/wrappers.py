@@ -1,4 +1,4 @@
-"""What is put around one environment or many: frame stack and memory of the best actions.
+"""Wrappers of one environment or many: frame stack and memory of the best actions.
 
 Gymnasium's own frame stack can leave out no part of an observation, and copies what it stacks twice: with images at
 full size it takes 107 microseconds where this one takes 43. Where both can be used they give the same; a test holds it.

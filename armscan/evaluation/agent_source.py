@@ -1,4 +1,4 @@
-"""What is evaluated: the agent of a tracked run, or one that a configuration describes."""
+"""The agent to evaluate: of a tracked run, or described by a configuration."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PATHS = ("path", "cache_dir")
 
 @dataclass(frozen=True)
 class TrainedAgent:
-    """What is evaluated.
+    """An agent to evaluate.
 
     Args:
         name: what tables and files call it.

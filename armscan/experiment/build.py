@@ -29,7 +29,7 @@ TRACKING_KEYS = ("uri", "experiment", "artifacts", "wait_s", "system_metrics_s",
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """What a configuration describes.
+    """An experiment, built from its configuration.
 
     Args:
         split: the volumes.
@@ -39,7 +39,7 @@ class Experiment:
         n_episodes: number of episodes of each final evaluation.
         seed: seed of everything that is drawn.
         smallest_slice_px: shape (across, depth) that the slices of all volumes have at least; images are cropped to it
-            where nothing else is said, whichever the split.
+            by default, in every split.
     """
 
     split: Split

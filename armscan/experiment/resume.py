@@ -77,7 +77,7 @@ def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
     if folder.resolve() != Path.cwd().resolve():
         raise UntrustedError(
             f"{where}: it was started in {folder}, whose configuration could execute code of others; repeat the "
-            f"command there or, if you trust whoever made it, with {TRUST}"
+            f"command there or, if you trust its author, with {TRUST}"
         )
 
 

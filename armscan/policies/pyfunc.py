@@ -1,4 +1,4 @@
-"""What MLflow runs to answer with a policy: a file of its own, kept in the model, that imports nothing of armscan."""
+"""MLflow model of a policy: a file of its own, kept in the model, that imports nothing of armscan."""
 
 from typing import Any
 

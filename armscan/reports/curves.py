@@ -38,7 +38,7 @@ class Curve:
 
 
 NOTHING = Curve(np.empty(0), Band(*[np.empty(0)] * 3), 0, {})
-"""What stands where no training has measured the figure over an axis."""
+"""Placeholder where no training has measured the metric over an axis."""
 
 
 def curve_of(group: Group, figure: str, axis: str) -> Curve | None:

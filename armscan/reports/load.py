@@ -90,7 +90,7 @@ class TrackedTraining:
 
     @property
     def label(self) -> str:
-        """What tells it from the others of its group."""
+        """Label that tells it from the others of its group."""
         return f"seed {self.seed}" if self.seed is not None else f"run {self.id}"
 
     @property

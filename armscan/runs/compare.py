@@ -64,7 +64,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What two runs have measured, compared.
+    """Comparison of the metrics of two runs.
 
     Args:
         differences: the difference of each metric that the first run has.

@@ -1,4 +1,4 @@
-"""What is told of a registered policy: the figures of its run's evaluations, as Markdown and as tags."""
+"""Model card of a registered policy: the metrics of its run's evaluations, as Markdown and as tags."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TAGGED = ("success_rate", "mean_steps", "mean_distance_mm", "mean_distance_deg",
 
 @dataclass(frozen=True)
 class Card:
-    """What is told of a policy.
+    """Model card of a policy.
 
     Args:
         text: Markdown.

@@ -23,7 +23,7 @@ CHECKPOINTS, FOLDERS = "checkpoints", "folders"
 
 @dataclass(frozen=True)
 class PruneItem:
-    """What is to become of a run's files.
+    """Files of a run that are to be removed, or the reason why they stay.
 
     Args:
         run: the run.

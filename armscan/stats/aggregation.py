@@ -1,4 +1,4 @@
-"""What trainings with several seeds say together, as Agarwal et al. 2021 (arXiv:2108.13264) recommend.
+"""Aggregate trainings with several seeds, as Agarwal et al. 2021 (arXiv:2108.13264) recommend.
 
 Intervals are percentile bootstraps of the seeds, with generators of their own: the same numbers give the same interval.
 With two or three seeds such an interval is just the range from the lowest to the highest; with four or more it is an

@@ -1,4 +1,4 @@
-"""What a run was computed with: the state of the code, Python, the machine, and the version of every package."""
+"""Environment of a run: the state of the code, Python, the machine, and the version of every package."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Source:
 
     @property
     def tags(self) -> dict[str, str]:
-        """What is tracked of it."""
+        """Tags that are tracked of it."""
         known = {} if self.commit == UNKNOWN else {"mlflow.source.git.commit": self.commit}
         dirty = UNKNOWN if self.diff is None else str(bool(self.diff)).lower()
         summed = {DIFF_SUM: sha256(self.diff)} if self.diff else {}

@@ -1,4 +1,4 @@
-"""What MLflow takes of names and values: what is longer is shortened and says so, and is whole in a file of the run."""
+"""Names and values within MLflow's limits: longer ones are shortened and say so; a file of the run has them whole."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _looked_for: set[str] = set()
 
 @dataclass(frozen=True)
 class Delivery:
-    """What became of the entries of a run.
+    """Delivery of the entries of a run.
 
     Args:
         folder: the run's folder.

@@ -1,4 +1,4 @@
-"""What the machine does while a run trains: MLflow's system metrics, delivered as all else that is tracked."""
+"""MLflow's system metrics of the machine while a run trains, delivered like all other metrics."""
 
 from __future__ import annotations
 

@@ -140,9 +140,7 @@ def deliver(
         for entry in entries if channel == "files" else ():
             file = outbox.folder / (name := file_and_place(entry["file"])[0])
             if not trust and name not in outbox.added and not file.resolve().is_relative_to(outbox.folder.resolve()):
-                raise UntrustedError(
-                    f"{file} is outside of the run's folder; if you trust whoever made it, add {TRUST}"
-                )
+                raise UntrustedError(f"{file} is outside of the run's folder; if you trust its author, add {TRUST}")
             if not is_whole and not file.exists():
                 raise FileNotFoundError(f"{file} is not there")
         for kind, group in itertools.groupby(entries, key=lambda entry: next(iter(entry))):

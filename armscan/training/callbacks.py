@@ -1,4 +1,4 @@
-"""What training reports while it goes on, and to whom."""
+"""Callbacks of a training, and the reports that they receive."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from armscan.training.rollout import Evaluation
 
 @dataclass(frozen=True, kw_only=True)
 class EpochReport:
-    """What is known at the end of an epoch.
+    """Report at the end of an epoch.
 
     Args:
         epoch: number of the epoch, from 1.

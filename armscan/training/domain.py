@@ -23,7 +23,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class TrainingDomain:
-    """What environments on some volumes show, and in which range the volumes' sizes are.
+    """Observations of environments on some volumes, and the range of the volumes' sizes.
 
     Args:
         observed: the shape of each part of an observation, of the one vector under the name `vector`.

@@ -28,7 +28,7 @@ METRICS: dict[str, tuple[Statistic, str]] = {
 
 @dataclass(frozen=True)
 class MetricEstimates:
-    """What some episodes add up to.
+    """Sums and means over some episodes.
 
     Args:
         n_volumes: number of volumes that they are on.

@@ -111,7 +111,7 @@ class Evaluation:
 
     @property
     def score(self) -> tuple[float, float]:
-        """What evaluations are compared by: first the success rate, then the fewest steps."""
+        """Key that evaluations are compared by: first the success rate, then the fewest steps."""
         return self.success_rate, -self.mean_steps
 
     def metrics(self) -> dict[str, float]:

@@ -70,7 +70,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a training leaves; the learner holds its best weights again.
+    """Result of a training; the learner holds its best weights again.
 
     Args:
         reports: one an epoch.

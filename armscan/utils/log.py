@@ -1,4 +1,4 @@
-"""What a process says while it works, and what its libraries are not to say."""
+"""Log lines of a process, and the warnings of its libraries that are silenced."""
 
 from __future__ import annotations
 

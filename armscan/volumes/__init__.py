@@ -1,4 +1,4 @@
-"""What the agent moves through: labelmap volumes, their files, phantom wrists, and the slicing plane."""
+"""Labelmap volumes, their files and manifests, phantom wrists, and the slicing plane."""
 
 from armscan.volumes.dataset import Dataset, open_dataset, read_dataset
 from armscan.volumes.labelmap import LABEL_NAMES, LANDMARK_LABELS, LabelMap

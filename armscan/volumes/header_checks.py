@@ -1,4 +1,4 @@
-"""What the text headers of NRRD files and MetaImages say, where the reading library would mend it in silence.
+"""Text headers of NRRD files and MetaImages, checked where the reading library would mend them in silence.
 
 SimpleITK replaces a NaN, zero, negative or missing spacing by another one, and reads compressed voxels that are
 damaged. Both would end in wrong figures, so they are looked for here before the file is read.

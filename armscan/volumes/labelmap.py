@@ -100,7 +100,7 @@ class LabelMap:
 
 @dataclass(frozen=True)
 class Found:
-    """What a file holds.
+    """Contents of a file.
 
     Args:
         source: a value, or the name of a segment.

@@ -1,4 +1,4 @@
-"""What a manifest may say. Loaded only when one is read; `docs/manifest.md` is the page for those who write one."""
+"""Schema of a manifest, loaded only when one is read; `docs/manifest.md` describes it for those who write one."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class _Strict(BaseModel):
 
 
 class VolumeEntry(_Strict):
-    """What a manifest says about one volume; each description is what the key's value must be."""
+    """Entry of a manifest for one volume; the description of each key says what its value must be."""
 
     rotation: Rotation | None = None
     translation: Translation | None = None

@@ -1,4 +1,4 @@
-"""What the header of a NIfTI file says, checked before SimpleITK reads the file.
+"""Headers of NIfTI files, checked before SimpleITK reads the file.
 
 SimpleITK fills the missing end of a truncated file with zeros, shifts the image where its voxels begin within the
 header, makes voxels that are NaN or infinite 0, and prints pages where the place in the world is no number.

@@ -1,4 +1,4 @@
-"""What is said about a file's axes: their order, their standard orientation, the part of them that is kept."""
+"""Axes of a file: their order, their standard orientation, the part of them that is kept."""
 
 from __future__ import annotations
 

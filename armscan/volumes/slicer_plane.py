@@ -1,4 +1,4 @@
-"""What a markups file of 3D Slicer says about a plane, read as Slicer reads it.
+"""Planes in markups files of 3D Slicer, read as Slicer reads them.
 
 What Slicer shows of a plane follows from its `planeType`: from its `controlPoints` and, for `pointNormal`, from the
 axes in `baseToNode`. It writes `center` and `normal` as well, for other readers. After its schema,

@@ -1,4 +1,4 @@
-"""What was found in a file, and what became of it."""
+"""Summary of a file that was read: its contents, and the volume made of it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from armscan.volumes.volume import LabelVolume
 
 @dataclass(frozen=True, kw_only=True)
 class StoredFile:
-    """What a volume was read from.
+    """The file of a volume.
 
     Args:
         shape: voxels along the file's own axes.
@@ -33,13 +33,13 @@ class StoredFile:
 
     @property
     def ignored(self) -> tuple[Source, ...]:
-        """What the file holds that became background, the value 0 aside."""
+        """Values and segments of the file that became background, without the value 0."""
         return tuple(each.source for each in self.found if each.label == BACKGROUND and each.source != 0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class VolumeReport:
-    """What a volume was read from, and what it is: after orientation, order of axes, crop and resampling.
+    """A volume and its file, after orientation, order of axes, crop and resampling.
 
     Args:
         name: the volume's.

@@ -1,1 +1,1 @@
-"""What a study found."""
+"""Results of a study."""

@@ -1,4 +1,4 @@
-"""What a person sees of a study: one live table on a terminal, a line a trial elsewhere, the result at the end."""
+"""Progress of a study: one live table on a terminal, a line a trial elsewhere, the result at the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Outcome of a trial and pending writes, which share one round trip to the storage with whatever is asked next."""
+"""Outcome of a trial and pending writes, which share one round trip to the storage with the next request."""
 
 from __future__ import annotations
 

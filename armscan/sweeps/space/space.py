@@ -1,4 +1,4 @@
-"""What a study searches: keys and groups of the configuration, each with its range or its choices."""
+"""Search space of a study: keys and groups of the configuration, each with its range or its choices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the words of a command line say of a study: which it is, what its trials are composed of, who launches it."""
+"""Command line of a study: its name, the overrides of its trials, and its launcher."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a study's configuration names: its settings, task, sampler and pruner, and whether its space can be built."""
+"""Components of a study: its settings, task, sampler and pruner, and whether its space can be built."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
 
 @dataclass(frozen=True, kw_only=True)
 class Phase:
-    """What the trials of one phase have in common.
+    """A phase of a study, and what its trials share.
 
     Args:
         name: the name of its study in the storage.

@@ -1,4 +1,4 @@
-"""What a study would do, without doing it: what is searched, how far it is, and what the rest will take."""
+"""Plan of a study, without running it: what is searched, how far it is, and what the rest will take."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class FinalEvalSettings(Section):
 
 
 class StudySettings(Limits):
-    """What a study is asked to do.
+    """Settings of a study.
 
     Args:
         name: of the study, in its storage and of its folder.

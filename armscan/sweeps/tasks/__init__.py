@@ -1,1 +1,1 @@
-"""What a trial does."""
+"""Tasks: the work of a trial."""

@@ -1,4 +1,4 @@
-"""What a trial can do, and an attempt at it: what it tries and reports, its tracked run and its folder."""
+"""Tasks of trials, and an attempt at one: its values, reports, tracked run and folder."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ class Attempt:
 
 
 class Task(Protocol):
-    """What the trials of a study do; `study.task._target_` names its class, which needs no arguments."""
+    """Work of the trials of a study; `study.task._target_` names its class, which needs no arguments."""
 
     @property
     def metrics(self) -> tuple[str, ...]:
