@@ -235,7 +235,10 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["obs=cluster,action_reward"], "Ambiguous value for argument 'obs=cluster,action_reward' 1. To use it"),
         (["seed=-1"], "seed is -1, but it must be a whole number of at least 0"),
         (["stack=0"], "stack is 0, but it must be a whole number of at least 1"),
-        (["projection=q"], "projection is 'q', but it must be x, y, xy, zy or full, or a list of rz, rx, tx or ty"),
+        (
+            ["projection=q"],
+            "projection is 'q', but it must be x, y, xy, zy or full, or a list of different ones of rz, rx, tx or ty",
+        ),
         (["env.transform=3"], "transform is 3, but it must be a RandomTransform or None"),
         (["agent.lr=fast"], "agent.lr is 'fast', but it must be a finite number above 0"),
         (["training.env_steps=abc"], "training.env_steps is 'abc', but it must be a whole number of at least 1"),
@@ -312,7 +315,7 @@ def test_run_shows_what_is_wrong_with_a_volume(answer, tmp_path, write_labelmap,
     folder = write_manifest({"wrist.nii.gz": {"rotation": [0, 0], "translation": [0, 5]}})
     code, printed = answer("data=nifti", f"data.path={folder}")
     assert code == 2
-    assert printed.startswith(f"error: {path}: the file is truncated or damaged")
+    assert printed.startswith(f"error: {path}: the file is truncated: it ends within its compressed voxels")
     assert {file.name for file in tmp_path.iterdir()} == {"wrist.nii.gz", "optimal_actions.json"}
 
 

@@ -13,7 +13,6 @@ import click
 from armscan.config.credentials import check_address
 from armscan.errors import listed
 
-FILE_PATH = click.Path(path_type=Path)
 AGE = re.compile(r"(\d+(?:\.\d+)?)([mhdw])")
 UNITS = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 
@@ -21,6 +20,21 @@ UNITS = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 def examples(*lines: str) -> str:
     """Return the epilog of a command's help: command lines, each given without the name of the program."""
     return "\n".join(("\b\nExamples:", *(f"  armscan {line}" for line in lines)))
+
+
+class FilePath(click.ParamType[Path]):
+    """A path; an empty one, as of a variable that is not set, would be the working folder."""
+
+    name = "path"
+
+    def convert(self, value: str | Path, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Return the path."""
+        if not value:
+            self.fail("a path is required.", param, ctx)
+        return Path(value)
+
+
+FILE_PATH = FilePath()
 
 
 class UriParam(click.ParamType[str]):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from armscan.cli.options import FILE_PATH, CommaSeparated, Moment, UriParam, examples, tracking_option, trust_option
+from armscan.errors import printable
 
 if TYPE_CHECKING:
     from armscan.tracking import TrackingStore
@@ -185,7 +186,7 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: b
 
     original = reproduction.load_original(tracking, run, trust=trust)
     differences = reproduction.differences(original)
-    print(f"run {original.run.run_id}: {original.run.name}")
+    print(f"run {original.run.run_id}: {printable(original.run.name)}")
     for difference in differences:
         print(f"differs: {difference}")
     if not differences:

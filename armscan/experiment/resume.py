@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from armscan.agents import Learner
 from armscan.config.defaults import RESUME, TRACKING_URI, default_tracking
 from armscan.config.trust import TRUST, check_stored_words, stored_config
-from armscan.errors import InvalidValueError, ResumeError, UntrustedError
+from armscan.errors import InvalidValueError, ResumeError, UntrustedError, printable
 from armscan.experiment.build import set_up
 from armscan.experiment.job import GRID_TAG
 from armscan.experiment.provenance import place_tags, volume_tags
@@ -103,7 +103,7 @@ def resume_run(
         _check_last_checkpoint(run, folder)
         remove_unfinished(folder)
         _enter_working_folder(run)
-        print(f"resuming {run.info.run_name}, run {run_id}", flush=True)
+        print(f"resuming {printable(run.info.run_name)}, run {run_id}", flush=True)
         setup = set_up(OmegaConf.create(migrated))
         _check_volumes(run, folder, setup.fingerprints)
         agent = setup.agent

@@ -10,6 +10,7 @@ from rich.filesize import decimal
 from rich.text import Text
 
 from armscan.config.command_hints import armscan_command, resume_command
+from armscan.errors import printable
 from armscan.experiment.console import ID_CHARS, RESULT_ROWS
 from armscan.runs.query import experiment_ids, search
 from armscan.runs.rows import PARENT_TAG, RunRow, artifacts_of
@@ -45,7 +46,7 @@ def show(client: TrackingStore, run: Run, uri: str) -> None:
     artifacts = artifacts_of(client, run)
     folder = _print_folder(console, run)
     if artifacts is None:
-        console.print(f"\nartifacts in {run.info.artifact_uri}: their store does not answer", style="bold")
+        _print_pairs(console, f"artifacts in {run.info.artifact_uri}: their store does not answer", {})
     else:
         _print_sizes(console, f"artifacts in {run.info.artifact_uri}", artifacts)
     children = search(client, experiment_ids(client), f"tags.mlflow.parentRunId = '{run.info.run_id}'")
@@ -53,7 +54,7 @@ def show(client: TrackingStore, run: Run, uri: str) -> None:
         console.print("\nchildren", style="bold")
         table = narrow_table("id", "name", "status")
         for child in sorted(children, key=lambda child: child.info.start_time):
-            table.add_row(child.info.run_id[:ID_CHARS], Text(child.info.run_name), child.info.status.lower())
+            table.add_row(child.info.run_id[:ID_CHARS], Text(printable(child.info.run_name)), child.info.status.lower())
         console.print(table)
     _print_commands(console, uri, run, folder, artifacts or {})
 
@@ -78,14 +79,15 @@ def _facts(run: Run, entry: RunRow) -> dict[str, str]:
 def _print_pairs(console: Console, title: str, pairs: dict[str, str], right: str = "") -> None:
     """Print names with their values; `right` is the heading of the values, > for numbers."""
     if title:
-        console.print(Text(f"\n{title}", style="bold"), soft_wrap=True)
+        console.print(Text(f"\n{printable(title)}", style="bold"), soft_wrap=True)
     table = narrow_table("", right)
     table.show_header = False
     for name, value in pairs.items():
         whole = " ".join(value.split())
         cut = f"{whole[:MAX_VALUE_CHARS]}…" if len(whole) > MAX_VALUE_CHARS and name not in STARTED_BY else whole
-        table.add_row(Text(name), Text(cut))
-    console.print(table)
+        table.add_row(Text(printable(name)), Text(printable(cut)))
+    if pairs:
+        console.print(table)
 
 
 def _print_figures(console: Console, run: Run) -> None:
@@ -110,7 +112,7 @@ def _print_folder(console: Console, run: Run) -> OwnFolder | None:
     try:
         ours = OwnFolder.of(run)
     except RunSkippedError as error:
-        console.print(f"\nfolder: {error}", style="bold", soft_wrap=True)
+        _print_pairs(console, f"folder: {error}", {})
         return None
     sizes = {str(file.relative_to(ours.path)): n_bytes for file, n_bytes in ours.files().items()}
     _print_sizes(console, f"folder {ours.path}", sizes)

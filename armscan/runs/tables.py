@@ -15,6 +15,7 @@ from rich.filesize import decimal
 from rich.table import Table
 from rich.text import Text
 
+from armscan.errors import printable
 from armscan.experiment.console import ID_CHARS
 from armscan.runs.prune import PruneItem
 from armscan.runs.rows import PARENT_TAG, RunRow
@@ -82,7 +83,8 @@ def _table(rows: Sequence[RunRow]) -> Table:
 
 
 def shortened(name: str) -> str:
-    """Return a name that is not too long for a line of a list."""
+    """Return a name that is safe to show, and not too long for a line of a list."""
+    name = printable(name)
     return name if len(name) <= MAX_NAME_CHARS else f"{name[: MAX_NAME_CHARS - 1]}…"
 
 

@@ -6,10 +6,12 @@ import logging
 import warnings
 from datetime import datetime
 
+from armscan.errors import printable
+
 
 def log(text: str) -> None:
     """Print a line with the time; what a worker prints is its log."""
-    print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
+    print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {printable(text)}", flush=True)
 
 
 def silence_library_warnings() -> None:

@@ -206,3 +206,13 @@ def test_run_that_goes_on_again_has_no_duration(answer, make_run, store, aged, l
     assert rows == {going_on: None, ended: 30.0}
     assert listed("--sort=-duration") == ["ended", "going_on"]
     assert "running after" not in answer("show", going_on)[1]
+
+
+def test_control_characters_of_names_and_tags_do_not_reach_the_terminal(answer, make_run):
+    harmful = "\x1b]0;title\x07\x1b[2J\rnew"
+    run_id = make_run(f"a{harmful}", tags={"mine": harmful, f"named {harmful}": "x"})
+    for words in (["list"], ["show", run_id]):
+        code, printed, errors = answer(*words)
+        assert (code, errors) == (0, "")
+        assert "\\x1b]0;title" in printed
+        assert not {each for each in printed if ord(each) < 32} - {"\n"}
