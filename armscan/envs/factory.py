@@ -38,7 +38,7 @@ class EnvFactory:
     """
 
     def __init__(self, **rules: Any) -> None:
-        allowed = [name for maker in (Rules, make_armscan_env) for name in _keywords(maker)]
+        allowed = [name for env_factory in (Rules, make_armscan_env) for name in _keywords(env_factory)]
         if unknown := [name for name in rules if name not in allowed]:
             raise InvalidValueError(f"env has no rule {unknown[0]!r}, but only {listed(allowed)}")
         self.rules = rules
@@ -51,11 +51,13 @@ class EnvFactory:
             **self.rules | {"reward": reward.fitted_to(volumes.values(), tissues), "targets": PUBLISHED_TARGETS}
         )
 
-    def one(self, volumes: Volumes, *, render_mode: str | None = None) -> Env:
+    def make_env(self, volumes: Volumes, *, render_mode: str | None = None) -> Env:
         """Make one environment."""
         return make_armscan_env(volumes, render_mode=render_mode, **self.rules)
 
-    def many(self, num_envs: int, volumes: Volumes, *, autoreset_mode: str = "NextStep") -> VectorEnv[Any, Any, Any]:
+    def make_vector_env(
+        self, num_envs: int, volumes: Volumes, *, autoreset_mode: str = "NextStep"
+    ) -> VectorEnv[Any, Any, Any]:
         """Make many environments on the same volumes."""
         return make_armscan_vector_env(num_envs, volumes, autoreset_mode=autoreset_mode, **self.rules)
 
@@ -117,7 +119,7 @@ def _wrapped(
     return wrapped
 
 
-def _keywords(maker: Callable[..., Any]) -> list[str]:
+def _keywords(env_factory: Callable[..., Any]) -> list[str]:
     """Return the names of what can only be given by name."""
-    parameters = inspect.signature(maker).parameters.values()
+    parameters = inspect.signature(env_factory).parameters.values()
     return [parameter.name for parameter in parameters if parameter.kind is inspect.Parameter.KEYWORD_ONLY]

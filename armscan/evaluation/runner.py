@@ -116,8 +116,8 @@ def prepare(
         config = subject.config
         if trained is not None:
             config = apply_crop(config, trained.slice_px, smallest_slice(volumes.values()))
-        maker = make_env_factory(config, TrainingVolumes(own))
-        envs[label] = _env(maker, volumes, config.env.clustering, render_mode)
+        env_factory = make_env_factory(config, TrainingVolumes(own))
+        envs[label] = _env(env_factory, volumes, config.env.clustering, render_mode)
         here = TrainingDomain.of(envs[label])
         if subject.domain is not None:
             notes += [f"{label}: {difference}" for difference in subject.domain.differences(here)]
@@ -126,15 +126,15 @@ def prepare(
         trained.check_observed(here)
         if agent is None:
             budget = int(config.training.env_steps)
-            agent = make_agent(config, maker, volumes, total_env_steps=budget, seed=int(config.seed))
+            agent = make_agent(config, env_factory, volumes, total_env_steps=budget, seed=int(config.seed))
             _load_weights(agent, subject)
     assert agent is not None
     return PreparedAgent(subject, agent, envs, tuple(notes))
 
 
-def _env(maker: EnvFactory, volumes: Volumes, clustering: object, render_mode: str | None) -> Env:
+def _env(env_factory: EnvFactory, volumes: Volumes, clustering: object, render_mode: str | None) -> Env:
     try:
-        return maker.one(volumes, render_mode=render_mode)
+        return env_factory.make_env(volumes, render_mode=render_mode)
     except OptimalPlaneError as error:
         sizes = {volume.pixel_mm for volume in volumes.values()}
         is_usual = all(

@@ -80,7 +80,7 @@ def evaluate_and_track(
         )
         for group, metrics in report.metrics().items():
             named = {f"{group}/{name}": value for name, value in metrics.items()}
-            tracked.log_figures(named, n_env_steps=subject.n_env_steps)
+            tracked.log_metrics(named, n_env_steps=subject.n_env_steps)
         file = out or FOLDER / f"{file_name(f'{subject.name}-{data}')}-{tracked.run_id[:8]}{SUFFIX}"
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, lambda opened: opened.write(text.encode()))

@@ -33,7 +33,7 @@ class Experiment:
 
     Args:
         split: the volumes.
-        maker: makes environments, with the reward fitted to the training volumes.
+        env_factory: makes environments, with the reward fitted to the training volumes.
         agent: the agent, which may be a learner.
         budget: the training's budget.
         n_episodes: number of episodes of each final evaluation.
@@ -43,7 +43,7 @@ class Experiment:
     """
 
     split: Split
-    maker: EnvFactory
+    env_factory: EnvFactory
     agent: Agent
     budget: Budget
     n_episodes: int
@@ -53,22 +53,22 @@ class Experiment:
     @cached_property
     def training_env(self) -> Env:
         """Of the training volumes, for the final evaluation."""
-        return self.maker.one(self.split.training)
+        return self.env_factory.make_env(self.split.training)
 
     @cached_property
     def validation_env(self) -> Env:
         """Of the validation volumes, for the validation after each epoch."""
-        return self.maker.one(self.split.validation)
+        return self.env_factory.make_env(self.split.validation)
 
     @cached_property
     def test_env(self) -> Env:
         """Of the test volumes, for the final evaluation."""
-        return self.maker.one(self.split.test)
+        return self.env_factory.make_env(self.split.test)
 
     @cached_property
     def video_env(self) -> Env:
         """Of the test volumes, for the video of an episode."""
-        return self.maker.one(self.split.test, render_mode="rgb_array")
+        return self.env_factory.make_env(self.split.test, render_mode="rgb_array")
 
     @cached_property
     def fingerprints(self) -> Fingerprints:
@@ -119,11 +119,11 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
     split = split or instantiate(config.data, _convert_="object")
     budget = instantiate(config.training, _convert_="object")
     smallest = smallest_slice([*split.training.values(), *split.validation.values(), *split.test.values()])
-    maker = make_env_factory(apply_crop(config, smallest, smallest), split.training)
-    agent = make_agent(config, maker, split.training, total_env_steps=budget.env_steps, seed=seed)
+    env_factory = make_env_factory(apply_crop(config, smallest, smallest), split.training)
+    agent = make_agent(config, env_factory, split.training, total_env_steps=budget.env_steps, seed=seed)
     return Experiment(
         split=split,
-        maker=maker,
+        env_factory=env_factory,
         agent=agent,
         budget=budget,
         n_episodes=n_episodes,
@@ -142,18 +142,18 @@ def apply_crop(config: DictConfig, trained_px: tuple[int, int], here_px: tuple[i
 
 
 def make_env_factory(config: DictConfig, training: Mapping[str, LabelVolume]) -> EnvFactory:
-    """Return the maker of environments, its reward fitted to the training volumes."""
-    maker: EnvFactory = instantiate(config.env, _convert_="object")
-    return maker.fitted_to(training)
+    """Return the factory of environments, its reward fitted to the training volumes."""
+    env_factory: EnvFactory = instantiate(config.env, _convert_="object")
+    return env_factory.fitted_to(training)
 
 
 def make_agent(
-    config: DictConfig, maker: EnvFactory, volumes: Mapping[str, LabelVolume], *, total_env_steps: int, seed: int
+    config: DictConfig, env_factory: EnvFactory, volumes: Mapping[str, LabelVolume], *, total_env_steps: int, seed: int
 ) -> Agent:
     """Return the agent, which has learned nothing yet, for environments on these volumes."""
-    env = maker.one(dict(volumes))
+    env = env_factory.make_env(dict(volumes))
     setup = AgentSetup(
-        make_envs=partial(maker.many, volumes=dict(volumes), autoreset_mode="Disabled"),
+        make_envs=partial(env_factory.make_vector_env, volumes=dict(volumes), autoreset_mode="Disabled"),
         observation_space=env.observation_space,
         action_names=env.get_wrapper_attr("action_names"),
         total_env_steps=total_env_steps,

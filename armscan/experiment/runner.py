@@ -150,9 +150,9 @@ def keep_results(
     for name, evaluation in evaluations.items():
         prefix = name.replace(" ", "_").replace("-", "_")
         figures = {f"{prefix}/{figure}": value for figure, value in evaluation.metrics().items()}
-        tracked.log_figures(figures, n_env_steps=result.best.n_env_steps if result else 0)
+        tracked.log_metrics(figures, n_env_steps=result.best.n_env_steps if result else 0)
     if result:
-        tracked.log_figures({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
+        tracked.log_metrics({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
         draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
     write_evaluations(evaluations, folder)
     tracked.log_results(folder)

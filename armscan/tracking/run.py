@@ -137,7 +137,7 @@ class TrackedRun:
         if (every_s := self._store.system_metrics_s) is not None:
             looks = [step for name, step in self._logged if name.startswith(PREFIX)]
             self._system = SystemMetrics(
-                lambda figures, number: self.log_figures(figures, n_env_steps=number),
+                lambda figures, number: self.log_metrics(figures, n_env_steps=number),
                 every_s=every_s,
                 first=max(looks, default=-1) + 1,
             )
@@ -146,7 +146,7 @@ class TrackedRun:
         """Log an epoch's figures by environment step."""
         figures = {f"validation/{name}": value for name, value in report.evaluation.metrics().items()}
         figures |= report.metrics | {"wall_s": report.wall_s}
-        self.log_figures(figures, n_env_steps=report.n_env_steps)
+        self.log_metrics(figures, n_env_steps=report.n_env_steps)
 
     def on_end(self) -> None:
         """Watch the machine no longer; evaluation and artifacts follow."""
@@ -154,7 +154,7 @@ class TrackedRun:
             self._system.finish()
             self._system = None
 
-    def log_figures(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
+    def log_metrics(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
         """Log figures at an environment step; none twice."""
         at_ms = now_ms()
         points = [

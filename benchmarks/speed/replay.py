@@ -46,8 +46,8 @@ NEAR_SHORT, NEAR_LONG = (0.5, (0.0, 0.05), {}), (1.0, (0.15, 0.3), {"success_thr
 def played(folder: str | Path, near: tuple, seed: int) -> list[dict]:
     """The transitions of one environment."""
     share, distances, rules = near
-    maker = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES | rules)
-    env, rng = maker.one(read_dataset(folder)), np.random.default_rng(seed)
+    env_factory = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES | rules)
+    env, rng = env_factory.make_env(read_dataset(folder)), np.random.default_rng(seed)
     obs, _ = env.reset(seed=seed)
     transitions = []
     for _ in range(N_PLAYED // N_ENVS):
@@ -123,7 +123,7 @@ def measure(folder: str | Path, name: str, near: tuple) -> None:
     """Print the table of one kind of episodes."""
     steps = batches(folder, near)
     n_ended = sum(int((step.terminated | step.truncated).sum()) for step in steps)
-    space = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES).one(read_dataset(folder))
+    space = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES).make_env(read_dataset(folder))
     to_plain = Replay(N_PLAIN, N_ENVS)
     image = replay_for(space.observation_space, N_TRANSITIONS, N_ENVS)
     # Whatever is compiled at first is no growth of the buffer's.

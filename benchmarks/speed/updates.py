@@ -52,12 +52,12 @@ def ways() -> dict[str, Compute]:
     }
 
 
-def updater(maker: EnvFactory, network: Network, compute: Compute):
+def updater(env_factory: EnvFactory, network: Network, compute: Compute):
     """Return what measures updates a second, with a replay buffer that is filled."""
     volumes = load_phantoms(range(2))
     setup = AgentSetup(
-        make_envs=partial(maker.many, volumes=volumes, autoreset_mode="Disabled"),
-        observation_space=maker.one(volumes).observation_space,
+        make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
+        observation_space=env_factory.make_env(volumes).observation_space,
         action_names=("rz", "rx", "tx", "ty"),
         total_env_steps=10 * N_RANDOM_STEPS,
         seed=0,
@@ -87,8 +87,8 @@ def main(words: list[str]) -> None:
     chosen = {name: case for name, case in CASES.items() if not words or any(word in name for word in words)}
     print("| observation, network | computed | updates/s, median | best | beside the first |")
     print("| --- | --- | --- | --- | --- |")
-    for name, (maker, network) in chosen.items():
-        measures = {way: updater(maker, network, compute) for way, compute in ways().items()}
+    for name, (env_factory, network) in chosen.items():
+        measures = {way: updater(env_factory, network, compute) for way, compute in ways().items()}
         for measure in measures.values():
             # Compiles.
             measure(0.0)

@@ -12,7 +12,7 @@ SMALL_SAC = {"num_envs": 2, "learning_starts": 20, "batch_size": 16, "env_steps_
 SMALL_PPO = {"num_envs": 2, "env_steps_per_collection": 20, "batch_size": 10, "n_epochs": 2}
 SMALL_REGRESSION = {"num_envs": 2, "batch_size": 16, "utd_ratio": 0.5, "own_planes_share": 0.5}
 ALGORITHMS = {"sac": (SAC, SMALL_SAC), "ppo": (PPO, SMALL_PPO), "regression": (Regression, SMALL_REGRESSION)}
-MAKERS = {
+ENV_FACTORIES = {
     "vector": (EnvFactory(projection="zy"), MLP((8,))),
     "images": (
         EnvFactory(projection="zy", observation=SliceChannelsObservation(shape=(36, 36)), stack=2, memory=2),
@@ -21,10 +21,10 @@ MAKERS = {
 }
 
 
-def setup_for(maker, phantom, **changes):
+def setup_for(env_factory, phantom, **changes):
     arguments = {
-        "make_envs": partial(maker.many, volumes=[phantom], autoreset_mode="Disabled"),
-        "observation_space": maker.one([phantom]).observation_space,
+        "make_envs": partial(env_factory.make_vector_env, volumes=[phantom], autoreset_mode="Disabled"),
+        "observation_space": env_factory.make_env([phantom]).observation_space,
         "action_names": ("rz", "ty"),
         "total_env_steps": 100,
         "seed": 3,
@@ -40,19 +40,19 @@ def algorithm(request):
     return lambda network=None, **changes: kind(network=network or MLP((8,)), **small | changes)
 
 
-@pytest.fixture(params=list(MAKERS))
-def maker_and_network(request):
-    return MAKERS[request.param]
+@pytest.fixture(params=list(ENV_FACTORIES))
+def factory_and_network(request):
+    return ENV_FACTORIES[request.param]
 
 
 @pytest.fixture
-def make_learner(algorithm, maker_and_network, phantom):
+def make_learner(algorithm, factory_and_network, phantom):
     """Makes a learner of every algorithm, for vectors and for images."""
-    maker, network = maker_and_network
-    return lambda **changes: algorithm(network, **changes).agent(setup_for(maker, phantom))
+    env_factory, network = factory_and_network
+    return lambda **changes: algorithm(network, **changes).agent(setup_for(env_factory, phantom))
 
 
 @pytest.fixture
-def env(maker_and_network, phantom):
+def env(factory_and_network, phantom):
     """An environment that `make_learner`'s learners can act in."""
-    return maker_and_network[0].one([phantom])
+    return factory_and_network[0].make_env([phantom])

@@ -8,15 +8,15 @@ from armscan.envs import ArmscanEnv
 from armscan.envs.actions import ActionBounds
 from armscan.errors import InvalidValueError
 from armscan.training import evaluate
-from tests.agents.conftest import MAKERS, setup_for
+from tests.agents.conftest import ENV_FACTORIES, setup_for
 
 BOUNDS = ActionBounds((90.0, 45.0), (97.2, 216.0))
 FREE = {"y": ("ty",), "x": ("tx",), "zy": ("rz", "ty"), "xy": ("tx", "ty"), "full": ("rz", "rx", "tx", "ty")}
 
 
 def agent_of(algorithm, phantom, projection="y"):
-    maker, _ = MAKERS["vector"]
-    return algorithm.agent(setup_for(maker, phantom, action_names=FREE[projection]))
+    env_factory, _ = ENV_FACTORIES["vector"]
+    return algorithm.agent(setup_for(env_factory, phantom, action_names=FREE[projection]))
 
 
 def planes(agent, n, seed=0, bounds=BOUNDS, rewards=()):

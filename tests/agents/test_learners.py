@@ -7,7 +7,7 @@ import torch
 from armscan.agents import PPO, SAC, Learner, Regression
 from armscan.errors import CheckpointError, DivergedError, InvalidValueError
 from armscan.training import load_checkpoint, save_checkpoint
-from tests.agents.conftest import ALGORITHMS, MAKERS, SMALL_SAC, setup_for
+from tests.agents.conftest import ALGORITHMS, ENV_FACTORIES, SMALL_SAC, setup_for
 
 by_reinforcement = pytest.mark.parametrize("algorithm", ["sac", "ppo"], indirect=True)
 
@@ -68,8 +68,8 @@ def test_learner_reports_episodes_losses_and_speed(make_learner):
 @pytest.mark.parametrize("algorithm", ["sac", "regression"], indirect=True)
 @pytest.mark.parametrize("share", [0.1, 0.26, 0.7, 2.0])
 def test_learner_takes_as_many_gradient_steps_as_are_asked_for_also_after_going_on(algorithm, phantom, share):
-    maker, network = MAKERS["vector"]
-    learners = [algorithm(network, utd_ratio=share).agent(setup_for(maker, phantom)) for _ in range(2)]
+    env_factory, network = ENV_FACTORIES["vector"]
+    learners = [algorithm(network, utd_ratio=share).agent(setup_for(env_factory, phantom)) for _ in range(2)]
     learners[0].warm_up()
     first, last = learners
     n_random = first.n_env_steps
@@ -159,8 +159,8 @@ def test_load_refuses_what_belongs_to_another_network(make_learner):
 
 
 def test_sac_keeps_no_more_transitions_than_the_training_takes(phantom):
-    maker, network = MAKERS["vector"]
-    learner = SAC(network=network, **SMALL_SAC, buffer_size=10**9).agent(setup_for(maker, phantom))
+    env_factory, network = ENV_FACTORIES["vector"]
+    learner = SAC(network=network, **SMALL_SAC, buffer_size=10**9).agent(setup_for(env_factory, phantom))
     assert learner._replay.maxsize <= 110
 
 
@@ -224,10 +224,10 @@ def test_algorithm_refuses_impossible_parameters(algorithm, changes, message):
     ],
 )
 def test_algorithm_refuses_its_own_impossible_parameters(phantom, kind, changes, message):
-    maker, network = MAKERS["vector"]
+    env_factory, network = ENV_FACTORIES["vector"]
     small = next(small for each, small in ALGORITHMS.values() if each is kind)
     with pytest.raises(InvalidValueError, match=message):
-        kind(network=network, **small | changes).agent(setup_for(maker, phantom))
+        kind(network=network, **small | changes).agent(setup_for(env_factory, phantom))
 
 
 def test_learning_rates_come_down_to_their_final_share(make_learner):

@@ -15,7 +15,7 @@ BY_OBSERVATION = NetworkByObservation(vector=MLP((8,)), images=SMALL_MULTIMODAL)
 
 
 def space_of(phantom, observation, **rules):
-    return EnvFactory(observation=observation, projection="zy", **rules).one([phantom]).observation_space
+    return EnvFactory(observation=observation, projection="zy", **rules).make_env([phantom]).observation_space
 
 
 @pytest.mark.parametrize(
@@ -145,10 +145,10 @@ def test_compute_without_a_gpu_takes_the_cpu_and_says_so_where_one_was_asked_for
     "compute", [Compute("cpu", "bfloat16"), pytest.param(Compute("cpu", compile=True), marks=pytest.mark.slow)]
 )
 def test_learner_learns_with_every_way_of_computing(phantom, compute):
-    maker = EnvFactory(projection="zy", observation=SliceChannelsObservation(shape=(36, 36)))
-    learner = SAC(network=SMALL_MULTIMODAL, **SMALL_SAC).agent(setup_for(maker, phantom, compute=compute))
+    env_factory = EnvFactory(projection="zy", observation=SliceChannelsObservation(shape=(36, 36)))
+    learner = SAC(network=SMALL_MULTIMODAL, **SMALL_SAC).agent(setup_for(env_factory, phantom, compute=compute))
     learner.warm_up()
     metrics = learner.learn(40)
     assert np.isfinite(metrics["update/critic_loss"])
-    env = maker.one([phantom])
+    env = env_factory.make_env([phantom])
     assert env.action_space.contains(learner.act(env.reset(seed=0)[0], -1.0))

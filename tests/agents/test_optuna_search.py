@@ -11,15 +11,15 @@ from armscan.agents import Learner, OptunaSearch, Random
 from armscan.agents.optuna_search import SAMPLERS
 from armscan.envs.actions import ActionBounds
 from armscan.errors import InvalidValueError
-from tests.agents.conftest import MAKERS, setup_for
+from tests.agents.conftest import ENV_FACTORIES, setup_for
 
 BOUNDS = ActionBounds((90.0, 45.0), (97.2, 216.0))
 NAMES = ("rz", "rx", "tx", "ty")
 
 
 def agent_of(algorithm, phantom, n_free):
-    maker, _ = MAKERS["vector"]
-    return algorithm.agent(setup_for(maker, phantom, action_names=NAMES[:n_free]))
+    env_factory, _ = ENV_FACTORIES["vector"]
+    return algorithm.agent(setup_for(env_factory, phantom, action_names=NAMES[:n_free]))
 
 
 def played(agent, n_planes, seed, optimum=0.3):

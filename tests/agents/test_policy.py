@@ -11,7 +11,7 @@ from armscan.agents.policy import Policy, batch_of
 from armscan.agents.torch_export import NEXT_ACTION, OBSERVATION, export_program, save_onnx
 from armscan.envs.history import FLAT, parts_of
 from armscan.errors import ExportError
-from tests.agents.conftest import MAKERS, setup_for
+from tests.agents.conftest import ENV_FACTORIES, setup_for
 
 N_OBSERVED = 7
 
@@ -69,10 +69,10 @@ def test_policy_of_a_learner_with_stochastic_evaluation_is_its_most_likely_actio
     assert "draws its actions" in learner.policy().differs
 
 
-def test_policy_computes_in_32_bits_where_the_learner_does_not(algorithm, maker_and_network, phantom, env):
-    maker, network = maker_and_network
+def test_policy_computes_in_32_bits_where_the_learner_does_not(algorithm, factory_and_network, phantom, env):
+    env_factory, network = factory_and_network
     learners = [
-        algorithm(network).agent(setup_for(maker, phantom, compute=Compute("cpu", precision=precision)))
+        algorithm(network).agent(setup_for(env_factory, phantom, compute=Compute("cpu", precision=precision)))
         for precision in ("bfloat16", "float32")
     ]
     learners[1].load_weights(learners[0].weights())
@@ -88,10 +88,10 @@ def test_policy_computes_in_32_bits_where_the_learner_does_not(algorithm, maker_
 def test_policy_of_a_compiled_network_is_a_plain_one(phantom):
     from armscan.agents import SAC
 
-    maker, network = MAKERS["vector"]
-    setup = setup_for(maker, phantom, compute=Compute("cpu", compile=True))
+    env_factory, network = ENV_FACTORIES["vector"]
+    setup = setup_for(env_factory, phantom, compute=Compute("cpu", compile=True))
     learner = SAC(network=network, num_envs=2, learning_starts=20, batch_size=16).agent(setup)
-    observations = observed(maker.one([phantom]))
+    observations = observed(env_factory.make_env([phantom]))
     acted = [learner.act(each, 0.0) for each in observations]
     policy = learner.policy()
     assert policy.actor._compiled_call_impl is None

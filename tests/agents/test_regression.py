@@ -13,7 +13,7 @@ from armscan.envs.spaces import MultiBoxSpace
 from armscan.errors import DivergedError, InvalidValueError
 from armscan.training import evaluate
 from armscan.volumes import load_phantoms
-from tests.agents.conftest import MAKERS, SMALL_REGRESSION, setup_for
+from tests.agents.conftest import ENV_FACTORIES, SMALL_REGRESSION, setup_for
 
 
 def test_optimal_actions_are_those_of_each_environments_episode(phantom):
@@ -33,8 +33,8 @@ def test_optimal_actions_are_those_of_each_environments_episode(phantom):
 
 
 def test_optimal_actions_are_told_to_no_agent(phantom):
-    maker, _ = MAKERS["images"]
-    envs = maker.many(2, [phantom])
+    env_factory, _ = ENV_FACTORIES["images"]
+    envs = env_factory.make_vector_env(2, [phantom])
     observations, infos = envs.reset(seed=0)
     optima = envs.unwrapped.optimal_actions.astype(np.float32)
     for part in [*observations.values(), *infos.values()]:
@@ -42,9 +42,9 @@ def test_optimal_actions_are_told_to_no_agent(phantom):
 
 
 def test_regression_keeps_what_it_sees_with_the_optimum_of_that_episode(phantom):
-    maker, network = MAKERS["vector"]
+    env_factory, network = ENV_FACTORIES["vector"]
     learner = Regression(network=network, **SMALL_REGRESSION | {"num_envs": 1, "own_planes_share": 0.0}).agent(
-        setup_for(maker, phantom)
+        setup_for(env_factory, phantom)
     )
     learner.learn(40)
     state = learner.state()["examples"]
@@ -60,7 +60,7 @@ def test_regression_keeps_what_it_sees_with_the_optimum_of_that_episode(phantom)
 
 
 def test_examples_make_way_for_new_ones_and_come_back_from_their_state(phantom):
-    space = MultiBoxSpace({"a": MAKERS["vector"][0].one([phantom]).action_space})
+    space = MultiBoxSpace({"a": ENV_FACTORIES["vector"][0].make_env([phantom]).action_space})
     examples = SupervisedBuffer(5, space, 1)
     for i in range(4):
         examples.add({"a": np.full((2, 2), i, np.float32)}, np.full((2, 1), float(i)))
@@ -80,12 +80,12 @@ def test_examples_make_way_for_new_ones_and_come_back_from_their_state(phantom):
 @pytest.mark.full
 def test_regression_learns_where_the_plane_lies_on_two_phantoms():
     volumes = list(load_phantoms(range(2)).values())
-    maker = EnvFactory(projection="zy", rotation_bounds_deg=(90.0, 45.0))
-    env = maker.one(volumes)
+    env_factory = EnvFactory(projection="zy", rotation_bounds_deg=(90.0, 45.0))
+    env = env_factory.make_env(volumes)
     setup = setup_for(
-        maker,
+        env_factory,
         volumes[0],
-        make_envs=partial(maker.many, volumes=volumes, autoreset_mode="Disabled"),
+        make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
         observation_space=env.observation_space,
         total_env_steps=3000,
     )
@@ -101,11 +101,11 @@ def test_regression_learns_where_the_plane_lies_on_two_phantoms():
 
 
 def test_regression_learns_from_random_planes_and_those_near_its_own(phantom):
-    maker, network = MAKERS["vector"]
+    env_factory, network = ENV_FACTORIES["vector"]
     near = {}
     for share in (0.0, 0.5, 1.0):
         small = SMALL_REGRESSION | {"num_envs": 400, "own_planes_share": share}
-        learner = Regression(network=network, **small).agent(setup_for(maker, phantom, total_env_steps=1000))
+        learner = Regression(network=network, **small).agent(setup_for(env_factory, phantom, total_env_steps=1000))
         observations, _ = learner._envs.reset(seed=0)
         with torch.no_grad():
             chosen = learner._predicted(observations).numpy().clip(-1, 1)
@@ -117,9 +117,9 @@ def test_regression_learns_from_random_planes_and_those_near_its_own(phantom):
 
 
 def test_regression_answers_the_same_observation_alike_whatever_came_before(phantom):
-    maker, network = MAKERS["images"]
-    learner = Regression(network=network, **SMALL_REGRESSION).agent(setup_for(maker, phantom))
-    env = maker.one([phantom])
+    env_factory, network = ENV_FACTORIES["images"]
+    learner = Regression(network=network, **SMALL_REGRESSION).agent(setup_for(env_factory, phantom))
+    env = env_factory.make_env([phantom])
     observation, _ = env.reset(seed=0)
     action = learner.act(observation, -0.3)
     learner.act({name: np.zeros_like(part) for name, part in observation.items()}, 0.0)
@@ -127,8 +127,8 @@ def test_regression_answers_the_same_observation_alike_whatever_came_before(phan
 
 
 def test_regression_says_that_it_has_diverged(phantom):
-    maker, network = MAKERS["vector"]
-    learner = Regression(network=network, **SMALL_REGRESSION).agent(setup_for(maker, phantom))
+    env_factory, network = ENV_FACTORIES["vector"]
+    learner = Regression(network=network, **SMALL_REGRESSION).agent(setup_for(env_factory, phantom))
     for weights in learner._network.parameters():
         weights.data.fill_(float("nan"))
     with pytest.raises(DivergedError, match=r"learning has diverged: after \d+ environment steps .* agent\.lr"):
@@ -136,8 +136,10 @@ def test_regression_says_that_it_has_diverged(phantom):
 
 
 def test_regression_without_an_update_in_an_epoch_reports_no_loss(phantom):
-    maker, network = MAKERS["vector"]
-    learner = Regression(network=network, num_envs=2, batch_size=16, utd_ratio=0.01).agent(setup_for(maker, phantom))
+    env_factory, network = ENV_FACTORIES["vector"]
+    learner = Regression(network=network, num_envs=2, batch_size=16, utd_ratio=0.01).agent(
+        setup_for(env_factory, phantom)
+    )
     metrics = learner.learn(10)
     assert "update/loss" not in metrics
     assert metrics["speed/updates_per_s"] == 0

@@ -13,8 +13,8 @@ from tests.agents.conftest import setup_for
 @pytest.fixture
 def make(phantom):
     def make(**rules):
-        maker = EnvFactory(projection="zy", max_steps=4, **rules)
-        envs = TianshouVectorEnv(maker.many(3, [phantom], autoreset_mode="Disabled"))
+        env_factory = EnvFactory(projection="zy", max_steps=4, **rules)
+        envs = TianshouVectorEnv(env_factory.make_vector_env(3, [phantom], autoreset_mode="Disabled"))
         envs.seed([7, 8, 9])
         return envs
 
@@ -75,9 +75,9 @@ def test_collector_steps_the_vector_environment(make, phantom, monkeypatch):
     from armscan.agents import MLP, SAC
     from armscan.anatomy import Scanner
 
-    maker = EnvFactory(projection="zy", max_steps=4)
+    env_factory = EnvFactory(projection="zy", max_steps=4)
     algorithm = SAC(network=MLP((8,)), num_envs=4, learning_starts=20, batch_size=8)
-    learner = algorithm.agent(setup_for(maker, phantom))
+    learner = algorithm.agent(setup_for(env_factory, phantom))
     looked_at = []
     look_all = Scanner.look_all
     monkeypatch.setattr(Scanner, "look_all", lambda *a: looked_at.append(len(a[1])) or look_all(*a))

@@ -53,7 +53,7 @@ def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json",
     client, experiment_id = open_store(
         f"sqlite:///{folder}/mlruns.db", experiment="armscan", artifacts=str(folder / "artifacts"), wait_s=60.0
     )
-    domain = TrainingDomain.of(experiment.maker.one(experiment.split.training))
+    domain = TrainingDomain.of(experiment.env_factory.make_env(experiment.split.training))
     (folder / "config.yaml").write_text(yaml.safe_dump(OmegaConf.to_container(config)))
     (folder / "volumes.json").write_text(json.dumps(experiment.split.fingerprints()))
     tags = {SHA256_TAGS[name]: sha256((folder / name).read_bytes()) for name in SHA256_TAGS if name in kept}

@@ -15,7 +15,7 @@ def choices(group):
 
 def one_env(volume, *overrides):
     config = compose(overrides)
-    return instantiate(config.env, _convert_="object").fitted_to({volume.name: volume}).one([volume])
+    return instantiate(config.env, _convert_="object").fitted_to({volume.name: volume}).make_env([volume])
 
 
 @pytest.mark.parametrize("reward", choices("reward"))
@@ -36,7 +36,7 @@ def test_conf_composes_every_agent_and_experiment(override):
     # A reward that is fitted to one wrist alone would not take the labelled plane of another.
     few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1", "env.success_threshold=0.5"]
     experiment = build_experiment(compose([override, *few]))
-    env = experiment.maker.one(experiment.split.test)
+    env = experiment.env_factory.make_env(experiment.split.test)
     observation, info = env.reset(seed=0)
     experiment.agent.begin(seed=0, bounds=env.get_wrapper_attr("scene").bounds)
     action = experiment.agent.act(observation, info["reward"])
@@ -60,8 +60,11 @@ def test_conf_takes_any_combination_of_observations(phantom):
 
 def test_conf_fits_the_reward_to_the_volumes_that_are_trained_on(dataset):
     first, second = list(dataset.values())[:2]
-    maker = instantiate(compose(["reward=agreement", "env.success_threshold=0.5"]).env, _convert_="object")
-    rewards = [maker.fitted_to({volume.name: volume}).one([first]).unwrapped.rules.reward for volume in (first, second)]
+    env_factory = instantiate(compose(["reward=agreement", "env.success_threshold=0.5"]).env, _convert_="object")
+    rewards = [
+        env_factory.fitted_to({volume.name: volume}).make_env([first]).unwrapped.rules.reward
+        for volume in (first, second)
+    ]
     landmarks = np.array([[4, 3000, 180, 40], [3, 1000, 180, 45], [1, 100, 190, 50]], dtype=float)
     scores = [reward.score(landmarks, first.pixel_mm) for reward in rewards]
     assert scores[0] != scores[1]

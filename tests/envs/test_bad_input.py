@@ -74,11 +74,11 @@ def test_env_with_junk(wrist, rule, value):
 @given(value=junk)
 def test_made_env_with_junk(wrist, others, rule, value):
     arguments = others | {rule: value}
-    maker = EnvFactory(**arguments)
+    env_factory = EnvFactory(**arguments)
     try_out(refuses(lambda: make_armscan_env([wrist], **arguments)))
-    try_out(refuses(lambda: maker.one([wrist])))
+    try_out(refuses(lambda: env_factory.make_env([wrist])))
     try_out(refuses(lambda: make_armscan_vector_env(2, [wrist], **arguments)))
-    try_out(refuses(lambda: maker.many(2, [wrist])))
+    try_out(refuses(lambda: env_factory.make_vector_env(2, [wrist])))
 
 
 @pytest.mark.parametrize(

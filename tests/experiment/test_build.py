@@ -46,9 +46,9 @@ def config_of_sizes(phantom, monkeypatch, *overrides):
 def test_build_crops_images_of_all_splits_alike(phantom, overrides, monkeypatch):
     experiment = build_experiment(config_of_sizes(phantom, monkeypatch, *overrides))
     volumes = (experiment.split.training, experiment.split.validation, experiment.split.test)
-    frames = [experiment.maker.one(each).unwrapped.rules._observation for each in volumes]
+    frames = [experiment.env_factory.make_env(each).unwrapped.rules._observation for each in volumes]
     assert {frame.observations[0]._crop for frame in frames} == {(336, 80)}
-    spaces = [experiment.maker.one(each).observation_space for each in volumes]
+    spaces = [experiment.env_factory.make_env(each).observation_space for each in volumes]
     assert spaces[0] == spaces[1] == spaces[2]
 
 

@@ -21,7 +21,7 @@ from armscan.errors import ExportError
 from armscan.policies.build import FIRST_SEED, make_model, onnx_answers, save_policy
 from armscan.policies.model import FILES, arrays_of, is_model, model_sha256, others_in
 from armscan.tracking import TrackedRun, open_store
-from tests.agents.conftest import ALGORITHMS, MAKERS, setup_for
+from tests.agents.conftest import ALGORITHMS, ENV_FACTORIES, setup_for
 from tests.agents.test_policy import observed, taught
 from tests.support.waiting import HANG_S, wait_until
 
@@ -29,7 +29,7 @@ from tests.support.waiting import HANG_S, wait_until
 pytestmark = pytest.mark.full
 
 LOOPBACK = "127.0.0.1"
-VARIANTS = [(algorithm, made_of) for algorithm in ALGORITHMS for made_of in MAKERS]
+VARIANTS = [(algorithm, made_of) for algorithm in ALGORITHMS for made_of in ENV_FACTORIES]
 # Loads each model that it is given and asks it, for a batch of one and for all; what it has loaded is said at its end.
 ASK = """
 import sys, mlflow.pyfunc, numpy
@@ -46,8 +46,10 @@ print([name for name in ("armscan", "tianshou", "gymnasium") if name in sys.modu
 
 def learner_of(algorithm, made_of, phantom):
     kind, small = ALGORITHMS[algorithm]
-    maker, network = MAKERS[made_of]
-    return taught(kind(network=network, **small).agent(setup_for(maker, phantom))), maker.one([phantom])
+    env_factory, network = ENV_FACTORIES[made_of]
+    return taught(kind(network=network, **small).agent(setup_for(env_factory, phantom))), env_factory.make_env(
+        [phantom]
+    )
 
 
 @pytest.fixture(scope="module")

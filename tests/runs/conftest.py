@@ -56,7 +56,7 @@ def make_run(store, tmp_path):
                 client, experiment_id, name=name, config=config, tags=tags, folder=folder, parent_id=parent_id
             )
             stack.callback(run.end, status, reason=None if status == "FINISHED" else "no reason")
-            run.log_figures(figures or {}, n_env_steps=7)
+            run.log_metrics(figures or {}, n_env_steps=7)
             run.log_files(*(folder / file for file in (*contents, *also)))
             for file, text in (policy or {}).items():
                 (folder / "policy" / file).parent.mkdir(parents=True, exist_ok=True)

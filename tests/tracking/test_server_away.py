@@ -52,7 +52,7 @@ def histories(uri, run_id):
 def test_what_a_run_could_not_deliver_the_next_start_delivers(server, opened, tmp_path, monkeypatch, capfd):
     tracked = begun(opened, tmp_path)
     server.stop()
-    tracked.log_figures({"x": 1.0}, n_env_steps=7)
+    tracked.log_metrics({"x": 1.0}, n_env_steps=7)
     assert not tracked.end("FINISHED", wait_s=0.1)
     # One that is still going on delivers for itself; one whose folder was removed is forgotten.
     gone = tmp_path / "gone"
@@ -93,7 +93,7 @@ def test_run_goes_on_while_the_server_is_away_and_nothing_is_lost_or_there_twice
             server.stop()
         if epoch == 20:
             server.start()
-        tracked.log_figures({"x": 1.0 * epoch, "y": -1.0}, n_env_steps=epoch)
+        tracked.log_metrics({"x": 1.0 * epoch, "y": -1.0}, n_env_steps=epoch)
         time.sleep(0.1)
     file = tmp_path / "best.pt"
     file.write_text("weights")
@@ -123,7 +123,7 @@ def test_run_waits_at_its_end_for_a_server_that_comes_back(server, opened, tmp_p
     server.stop()
     back = threading.Timer(4.0, server.start)
     back.start()
-    tracked.log_figures({"x": 1.0}, n_env_steps=7)
+    tracked.log_metrics({"x": 1.0}, n_env_steps=7)
     assert tracked.end("FINISHED")
     back.join()
     assert MlflowClient(server.uri).get_run(tracked.run_id).info.status == "FINISHED"
@@ -138,7 +138,7 @@ def test_run_whose_server_never_comes_back_is_delivered_once_by_track_sync(serve
     server.stop()
     (tmp_path / "curve.png").write_text("picture")
     tracked.log_files(tmp_path / "curve.png")
-    tracked.log_figures({"x": 1.0}, n_env_steps=7)
+    tracked.log_metrics({"x": 1.0}, n_env_steps=7)
     try:
         assert not tracked.end("FINISHED")
         assert f"armscan runs sync {tmp_path} delivers the rest" in capfd.readouterr().out
@@ -169,7 +169,7 @@ def test_delivery_whose_answer_is_lost_is_not_there_twice(server, opened, tmp_pa
             raise ConnectionResetError(104, "Connection reset by peer")
 
     monkeypatch.setattr(uploader, "_deliver", lost)
-    tracked.log_figures({"x": 1.0, "z": 2.0}, n_env_steps=7)
+    tracked.log_metrics({"x": 1.0, "z": 2.0}, n_env_steps=7)
     tracked.set_tags({"a": "b"})
     assert tracked.end("FINISHED")
     assert calls["metrics"] > 1
@@ -213,7 +213,7 @@ def test_figures_are_kept_where_files_cannot_be_because_the_disk_is_full(tmp_pat
     tracked = begun((store, experiment_id), tmp_path / "run")
     (tmp_path / "run" / "best.pt").write_text("weights")
     tracked.log_files(tmp_path / "run" / "best.pt")
-    tracked.log_figures({"x": 1.0}, n_env_steps=7)
+    tracked.log_metrics({"x": 1.0}, n_env_steps=7)
     assert not tracked.end("FINISHED")
     assert "cannot be reached or written to" in capfd.readouterr().out
     assert histories(uri, tracked.run_id) == {"x": [(7, 1.0)]}
@@ -244,7 +244,7 @@ def test_run_ends_where_the_servers_disk_is_full_and_its_files_are_delivered_lat
         weights = tmp_path / "run" / "best.pt"
         weights.write_bytes(os.urandom(2**20))
         tracked.log_files(weights)
-        tracked.log_figures({"x": 1.0}, n_env_steps=7)
+        tracked.log_metrics({"x": 1.0}, n_env_steps=7)
         assert not tracked.end("FINISHED")
         assert capfd.readouterr().out.count("cannot be reached or written to") == 1
         assert histories(server.uri, tracked.run_id) == {"x": [(7, 1.0)]}
@@ -260,7 +260,7 @@ def test_run_that_was_deleted_meanwhile_is_not_waited_for(opened, server, tmp_pa
     tracked = begun(opened, tmp_path)
     assert tracked._uploader._is_done.wait(HANG_S)
     MlflowClient(server.uri).delete_run(tracked.run_id)
-    tracked.log_figures({"x": 1.0}, n_env_steps=7)
+    tracked.log_metrics({"x": 1.0}, n_env_steps=7)
     began_s = time.monotonic()
     assert not tracked.end("FINISHED", wait_s=HANG_S)
     assert time.monotonic() - began_s < HANG_S
@@ -270,7 +270,7 @@ def test_run_that_was_deleted_meanwhile_is_not_waited_for(opened, server, tmp_pa
 def test_runs_of_a_dead_process_are_ended_and_those_of_a_living_one_are_not(opened, server, tmp_path):
     store, _ = opened
     dead, alive = begun(opened, tmp_path / "dead"), begun(opened, tmp_path / "alive")
-    dead.log_figures({"x": 1.0}, n_env_steps=7)
+    dead.log_metrics({"x": 1.0}, n_env_steps=7)
     # As the system does for who is killed.
     dead._uploader._stopped.set()
     dead._outbox.close()
@@ -290,7 +290,7 @@ def test_sync_goes_on_after_what_it_cannot_deliver(opened, server, tmp_path, cap
     for run in runs:
         run._uploader.finish(60.0)
         run.log_files(tmp_path / run._outbox.folder / "best.pt")
-        run.log_figures({"x": 1.0}, n_env_steps=7)
+        run.log_metrics({"x": 1.0}, n_env_steps=7)
         run._outbox.close()
     with runs[0]._outbox.file.open("ab") as file:
         file.write(b"nonsense\n")

@@ -201,7 +201,7 @@ class Worker:
         log(f"trial {trial.number} " + (f"failed: {reason}" if reason else f"{state.name.lower()} {shown}".rstrip()))
         if tracked is None:
             return
-        tracked.log_figures(metrics, n_env_steps=0)
+        tracked.log_metrics(metrics, n_env_steps=0)
         if state == TrialState.PRUNED:
             tracked.set_tags({"pruned": "true"})
         tracked.end("FAILED" if reason else "FINISHED", reason=reason)
