@@ -22,6 +22,7 @@ from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, TrackingError
 from armscan.utils.files import OUTBOX_FOLDER, OUTBOX_SUFFIXES, atomic_write, cache_folder, truncate_torn_line
+from armscan.utils.processes import ProcessInfo
 
 Entry = dict[str, Any]
 # Uploaded independently: metrics arrive although the disk of the artifacts is full.
@@ -29,7 +30,7 @@ Channel = Literal["figures", "files"]
 CHANNELS: tuple[Channel, ...] = ("files", "figures")
 DELIVERED, LOCK, SUFFIX = OUTBOX_SUFFIXES
 ID = re.compile(r"[\w-]{1,64}", re.ASCII)
-# Of a machine: links to the outboxes of runs that may have something to upload.
+# Of a machine: notes of the runs that may have something to upload.
 NOTES_FOLDER = "undelivered"
 # The process that had the run before may still be ending.
 LOCK_TIMEOUT_S = 20.0
@@ -213,7 +214,7 @@ class Outbox(OutboxFile):
             folder = cache_folder() / NOTES_FOLDER
             folder.mkdir(parents=True, exist_ok=True)
             forget(self.address.run_id)
-            (folder / self.address.run_id).symlink_to(self.file.absolute())
+            Note(self.file.absolute(), self.address.uri, ProcessInfo.current()).write(folder / self.address.run_id)
 
     def close(self) -> None:
         """Close and unlock the outbox."""
@@ -227,9 +228,51 @@ def forget(run_id: str) -> None:
         (cache_folder() / NOTES_FOLDER / run_id).unlink(missing_ok=True)
 
 
-def notes() -> list[Path]:
-    """Return the notes of this machine, named after their runs, links to the outboxes."""
-    return sorted(file for file in (cache_folder() / NOTES_FOLDER).glob("*") if file.is_symlink())
+@dataclass(frozen=True)
+class Note:
+    """A note of this machine: a run that may have something to upload, or that nobody has ended.
+
+    Args:
+        outbox: its outbox.
+        uri: address of its tracking store.
+        process: the process that tracks it.
+    """
+
+    outbox: Path
+    uri: str
+    process: ProcessInfo
+
+    @classmethod
+    def read(cls, file: Path) -> Self | None:
+        """Return the note in a file, None if there is none; that of an earlier version is a link to the outbox."""
+        try:
+            if file.is_symlink():
+                return cls(file.readlink(), "", ProcessInfo.of({}))
+            told = json.loads(file.read_bytes())
+            return cls(Path(told["outbox"]), str(told["uri"]), ProcessInfo.of(told["process"]))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return None
+
+    @classmethod
+    def of(cls, run_id: str) -> Self | None:
+        """Return the note of a run, None if there is none."""
+        return cls.read(cache_folder() / NOTES_FOLDER / run_id)
+
+    def write(self, file: Path) -> None:
+        """Write it to a file."""
+        told = {"outbox": str(self.outbox), "uri": self.uri, "process": asdict(self.process)}
+        atomic_write(file, lambda opened: opened.write(json.dumps(told).encode()))
+
+    @property
+    def is_abandoned(self) -> bool:
+        """Whether the process that tracked the run is known to have died."""
+        return self.process.is_here and not self.process.is_alive
+
+
+def notes() -> dict[str, Note]:
+    """Return the notes of this machine by the IDs of their runs."""
+    files = sorted((cache_folder() / NOTES_FOLDER).glob("*"))
+    return {file.name: note for file in files if (note := Note.read(file)) is not None}
 
 
 def now_ms() -> int:

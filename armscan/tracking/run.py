@@ -110,9 +110,7 @@ class TrackedRun:
         outbox = Outbox.begin(folder, Address(run_id, store.uri))
         logged = _logged_in(outbox) if had_outbox else _logged_of(store, run)
         tracked = cls(store, outbox, name=run.info.run_name or run_id, logged=logged)
-        tracked._is_resumed = True
-        tracked.set_status("RUNNING")
-        tracked._add(untagged=FAILURE_TAG)
+        tracked.go_on()
         tracked.set_tags(dict(tags) | changed | {"resumed": str(n_resumed)})
         tracked._log_config(config)
         if (diff := source().diff) and f"resumed.{DIFF_SUM}" in changed:
@@ -197,9 +195,11 @@ class TrackedRun:
         else:
             self.end("FAILED", reason=repr(error))
 
-    def set_status(self, status: str) -> None:
-        """Say how the run stands, such as RUNNING."""
-        self._add(status=(status, now_ms()))
+    def go_on(self) -> None:
+        """Mark the run as RUNNING again, whatever was said of it since its last process."""
+        self._is_resumed = True
+        self._add(status=("RUNNING", now_ms()))
+        self._add(untagged=FAILURE_TAG)
 
     def end(self, status: str, *, reason: str | None = None, wait_s: float | None = None) -> bool:
         """Close the run as FINISHED, FAILED (with the reason) or KILLED, and wait until the store has all of it.
@@ -220,7 +220,7 @@ class TrackedRun:
         elif self._is_resumed:
             # Who took the one before for dead may have said so since.
             self._add(untagged=FAILURE_TAG)
-        self.set_status(status)
+        self._add(status=(status, now_ms()))
         failure = self._uploader.finish(self._store.wait_s if wait_s is None else wait_s)
         self._is_delivered = failure is None
         if self._is_delivered:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from armscan.errors import FolderInUseError, TrackingError, UntrustedError
-from armscan.tracking.client import TrackingStore, reason_in
-from armscan.tracking.outbox import CHANNELS, Address, Outbox, notes, now_ms, outbox_files
-from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
+from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in
+from armscan.tracking.outbox import CHANNELS, Address, Note, Outbox, forget, notes, now_ms, outbox_files
+from armscan.tracking.run import FAILURE_TAG, SHORT_WAIT_S, TrackedRun
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.store import absolute
 from armscan.tracking.uploader import deliver
@@ -19,6 +19,7 @@ from armscan.utils.log import log
 
 # Of a run: how it ended, as its outbox says it.
 ENDED = ("FINISHED", "FAILED", "KILLED")
+PROCESS_DIED, FOLDER_REMOVED = "its process died", "its process died, and its folder was removed"
 IN_USE = "it is still going on"
 # Stores whose pending entries this process has looked for.
 _looked_for: set[str] = set()
@@ -52,7 +53,11 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
     Returns:
         What became of each run that had something left.
     """
-    return _synced(outbox_files(folder), opened, trust=trust)
+    place = folder.absolute()
+    removed = [
+        each.outbox for each in notes().values() if each.outbox.is_relative_to(place) and not each.outbox.exists()
+    ]
+    return _synced([*outbox_files(folder), *removed], opened, trust=trust)
 
 
 def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, trust: bool) -> list[Delivery]:
@@ -63,6 +68,9 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
         try:
             with contextlib.closing(Outbox(file, timeout_s=0.0)) as outbox:
                 run_id, uri = outbox.address.run_id, outbox.address.uri
+                if outbox.status not in ENDED and _is_abandoned(run_id, file):
+                    outbox.add(tags={FAILURE_TAG: PROCESS_DIED})
+                    outbox.add(status=("FAILED", now_ms()))
                 if outbox.is_delivered:
                     continue
                 if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
@@ -71,13 +79,37 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
                     deliveries.append(_delivered(outbox, store, trust=trust))
                 stores[uri] = store
         except FileNotFoundError:
-            # Its run was removed meanwhile.
-            continue
+            if _is_abandoned(file.stem, file) and (left := _end_removed(file.stem, opened)) is not None:
+                deliveries.append(Delivery(file.parent.parent, file.stem, 0, left))
         except FolderInUseError:
             deliveries.append(Delivery(file.parent.parent, None, 0, IN_USE))
         except (OSError, TrackingError) as error:
             deliveries.append(Delivery(file.parent.parent, run_id, 0, str(error)))
     return deliveries
+
+
+def _is_abandoned(run_id: str, file: Path) -> bool:
+    """Whether the process that kept a run's outbox in this file has died on this machine."""
+    note = Note.of(run_id)
+    return note is not None and note.is_abandoned and note.outbox == file.absolute()
+
+
+def _end_removed(run_id: str, opened: Callable[[str], TrackingStore]) -> str | None:
+    """End a run as FAILED whose process has died and whose folder was removed; return why that cannot be done now."""
+    note = Note.of(run_id)
+    assert note is not None
+    try:
+        client = opened(note.uri).mlflow
+        run = client.get_run(run_id)
+        if run.info.status == "RUNNING" and run.info.lifecycle_stage == "active":
+            client.set_tag(run_id, FAILURE_TAG, FOLDER_REMOVED)
+            client.set_terminated(run_id, "FAILED")
+    # Whatever a store raises: the next start tries again, unless the store has no such run.
+    except Exception as error:
+        if getattr(error, "error_code", None) != NOT_THERE:
+            return reason_in(error)
+    forget(run_id)
+    return None
 
 
 def _opened(opened: Callable[[str], TrackingStore], uri: str) -> TrackingStore | TrackingError:
@@ -112,15 +144,16 @@ def _deliver_pending(store: TrackingStore) -> None:
             raise TrackingError(f"{uri} is another store")
         return store
 
-    for note in notes():
+    for run_id, note in notes().items():
+        is_there = note.outbox.exists()
         # This user's own, as the note is.
-        deliveries = _synced([note.resolve()], opened, trust=True)
+        deliveries = _synced([note.outbox], opened, trust=True)
         for delivery in deliveries:
             if delivery.n_entries:
                 log(f"run {delivery.run_id}: {delivery.n_entries} entries that it had left are delivered now")
         # Those of a run that was removed, too; one that is still going on delivers for itself.
-        if all(delivery.left is None for delivery in deliveries):
-            note.unlink(missing_ok=True)
+        if all(delivery.left is None for delivery in deliveries) and (is_there or not note.process.is_here):
+            forget(run_id)
 
 
 def abandon(folder: Path, store: TrackingStore, reason: str) -> None:

@@ -62,19 +62,19 @@ def test_what_a_run_could_not_deliver_the_next_start_delivers(server, opened, tm
     assert removed._uploader.finish(HANG_S) is None
     removed._outbox.close()
     shutil.rmtree(gone)
-    assert {tracked.run_id, going_on.run_id, removed.run_id} <= {note.name for note in notes()}
+    assert {tracked.run_id, going_on.run_id, removed.run_id} <= notes().keys()
     # A note that was never written to its end is in nobody's way.
     (cache_folder() / "undelivered" / "0").write_bytes(b"\0")
     # Of the package, `sync` is the function.
     monkeypatch.setattr(sys.modules["armscan.tracking.sync"], "_looked_for", set())
     for _ in range(2):
         deliver_pending(opened[0])
-    wait_until(lambda: tracked.run_id not in {note.name for note in notes()})
+    wait_until(lambda: tracked.run_id not in notes())
     assert histories(server.uri, tracked.run_id) == {"x": [(7, 1.0)]}
     assert MlflowClient(server.uri).get_run(tracked.run_id).info.status == "FINISHED"
     assert f"run {tracked.run_id}: " in capfd.readouterr().out.splitlines()[-1]
     assert going_on.end("FINISHED")
-    assert not {tracked.run_id, going_on.run_id} & {note.name for note in notes()}
+    assert not {tracked.run_id, going_on.run_id} & notes().keys()
 
 
 def test_run_goes_on_while_the_server_is_away_and_nothing_is_lost_or_there_twice(

@@ -65,7 +65,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     ProcessInfo.current(str(working_folder())).write(folder / LAUNCHER_FILE)
     words = _words(opened, given, launcher, folder)
     tracked = TrackedRun.joined(opened.search.client, opened.search.run_id, name=opened.settings.name, folder=folder)
-    tracked.set_status("RUNNING")
+    tracked.go_on()
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
     with _leaving(opened, folder, tracked, leave_s), progress_display(opened, folder):
         if launcher not in ON_THIS_MACHINE:
