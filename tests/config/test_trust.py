@@ -1,5 +1,8 @@
 """What a stored configuration may execute."""
 
+import copy
+import functools
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,9 +27,14 @@ FOREIGN = (
 )
 
 
+@functools.cache
+def default_config():
+    return to_plain(compose([]))
+
+
 @given(data=st.data(), target=st.sampled_from(FOREIGN))
 def test_class_of_others_is_refused_wherever_it_stands(data, target):
-    config = to_plain(compose([]))
+    config = copy.deepcopy(default_config())
     # Any place of the configuration, in a list or a mapping of its own.
     node, path = config, []
     while isinstance(node, dict) and data.draw(st.booleans(), label="deeper"):

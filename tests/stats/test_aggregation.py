@@ -57,6 +57,7 @@ def test_intervals_of_improvement_are_those_of_rliable_on_one_volume():
     assert probability_of_improvement(ours, others)[1:] == pytest.approx(expected, abs=0.05)
 
 
+@pytest.mark.full
 def test_interval_of_improvement_holds_the_truth_only_if_seeds_are_drawn_with_all_their_volumes():
     rng = np.random.default_rng(0)
     n_whole = n_stratified = 0

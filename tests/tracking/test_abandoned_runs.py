@@ -14,6 +14,7 @@ from armscan.tracking.outbox import NOTES_FOLDER, notes
 from armscan.tracking.sync import FOLDER_REMOVED, PROCESS_DIED, _deliver_pending
 from armscan.utils.processes import ProcessInfo
 
+pytestmark = pytest.mark.full
 KILLED = """
 import os, signal, sys
 from pathlib import Path
