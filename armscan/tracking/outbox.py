@@ -21,6 +21,7 @@ from typing import Any, Literal, Self
 from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, TrackingError
+from armscan.tracking.notes import NOTES_FOLDER, Note, forget
 from armscan.utils.files import OUTBOX_FOLDER, OUTBOX_SUFFIXES, atomic_write, cache_folder, truncate_torn_line
 from armscan.utils.processes import ProcessInfo
 
@@ -30,8 +31,6 @@ Channel = Literal["figures", "files"]
 CHANNELS: tuple[Channel, ...] = ("files", "figures")
 DELIVERED, LOCK, SUFFIX = OUTBOX_SUFFIXES
 ID = re.compile(r"[\w-]{1,64}", re.ASCII)
-# Of a machine: notes of the runs that may have something to upload.
-NOTES_FOLDER = "undelivered"
 # The process that had the run before may still be ending.
 LOCK_TIMEOUT_S = 20.0
 
@@ -220,59 +219,6 @@ class Outbox(OutboxFile):
         """Close and unlock the outbox."""
         self._appending.close()
         self._lock.release()
-
-
-def forget(run_id: str) -> None:
-    """Remove the note of a run: everything is uploaded, or the run is removed."""
-    with contextlib.suppress(OSError):
-        (cache_folder() / NOTES_FOLDER / run_id).unlink(missing_ok=True)
-
-
-@dataclass(frozen=True)
-class Note:
-    """A note of this machine: a run that may have something to upload, or that nobody has ended.
-
-    Args:
-        outbox: its outbox.
-        uri: address of its tracking store.
-        process: the process that tracks it.
-    """
-
-    outbox: Path
-    uri: str
-    process: ProcessInfo
-
-    @classmethod
-    def read(cls, file: Path) -> Self | None:
-        """Return the note in a file, None if there is none; that of an earlier version is a link to the outbox."""
-        try:
-            if file.is_symlink():
-                return cls(file.readlink(), "", ProcessInfo.of({}))
-            told = json.loads(file.read_bytes())
-            return cls(Path(told["outbox"]), str(told["uri"]), ProcessInfo.of(told["process"]))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            return None
-
-    @classmethod
-    def of(cls, run_id: str) -> Self | None:
-        """Return the note of a run, None if there is none."""
-        return cls.read(cache_folder() / NOTES_FOLDER / run_id)
-
-    def write(self, file: Path) -> None:
-        """Write it to a file."""
-        told = {"outbox": str(self.outbox), "uri": self.uri, "process": asdict(self.process)}
-        atomic_write(file, lambda opened: opened.write(json.dumps(told).encode()))
-
-    @property
-    def is_abandoned(self) -> bool:
-        """Whether the process that tracked the run is known to have died."""
-        return self.process.is_here and not self.process.is_alive
-
-
-def notes() -> dict[str, Note]:
-    """Return the notes of this machine by the IDs of their runs."""
-    files = sorted((cache_folder() / NOTES_FOLDER).glob("*"))
-    return {file.name: note for file in files if (note := Note.read(file)) is not None}
 
 
 def now_ms() -> int:

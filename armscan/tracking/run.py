@@ -14,7 +14,8 @@ from armscan.config.command_hints import armscan_command
 from armscan.errors import is_interruption
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import DIFF_SUM, environment_tags, source, source_tags
-from armscan.tracking.outbox import Address, Outbox, file_of, forget, now_ms
+from armscan.tracking.notes import forget
+from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
 from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.uploader import Uploader

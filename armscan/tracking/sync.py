@@ -10,7 +10,8 @@ from pathlib import Path
 
 from armscan.errors import FolderInUseError, TrackingError, UntrustedError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in
-from armscan.tracking.outbox import CHANNELS, Address, Note, Outbox, forget, notes, now_ms, outbox_files
+from armscan.tracking.notes import Note, forget, notes
+from armscan.tracking.outbox import CHANNELS, Address, Outbox, now_ms, outbox_files
 from armscan.tracking.run import FAILURE_TAG, SHORT_WAIT_S, TrackedRun
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.store import absolute

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from armscan.tracking.outbox import NOTES_FOLDER, file_of
+from armscan.tracking.notes import NOTES_FOLDER
+from armscan.tracking.outbox import file_of
 from armscan.utils.files import LOCK_FILE
 
 

@@ -10,7 +10,7 @@ import pytest
 from mlflow import MlflowClient
 
 from armscan.tracking import open_existing_store, sync
-from armscan.tracking.outbox import NOTES_FOLDER, notes
+from armscan.tracking.notes import NOTES_FOLDER, notes
 from armscan.tracking.sync import FOLDER_REMOVED, PROCESS_DIED, _deliver_pending
 from armscan.utils.processes import ProcessInfo
 

@@ -17,7 +17,8 @@ from armscan.cli.main import main
 from armscan.errors import TrackingAwayError, TrackingError
 from armscan.tracking import TrackedRun, abandon, deliver_pending, note_end, open_store, sync, uploader
 from armscan.tracking.client import reason_in, why_away
-from armscan.tracking.outbox import file_of, notes
+from armscan.tracking.notes import notes
+from armscan.tracking.outbox import file_of
 from armscan.utils.files import cache_folder
 from tests.support.mlflow_server import mlflow_server
 from tests.support.requirements import unavailable

@@ -1,0 +1,67 @@
+"""Notes of this machine: the runs that may have something to upload, or that nobody has ended."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Self
+
+from armscan.utils.files import atomic_write, cache_folder
+from armscan.utils.processes import ProcessInfo
+
+NOTES_FOLDER = "undelivered"
+
+
+def forget(run_id: str) -> None:
+    """Remove the note of a run: everything is uploaded, or the run is removed."""
+    with contextlib.suppress(OSError):
+        (cache_folder() / NOTES_FOLDER / run_id).unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class Note:
+    """A note of this machine: a run that may have something to upload, or that nobody has ended.
+
+    Args:
+        outbox: its outbox.
+        uri: address of its tracking store.
+        process: the process that tracks it.
+    """
+
+    outbox: Path
+    uri: str
+    process: ProcessInfo
+
+    @classmethod
+    def read(cls, file: Path) -> Self | None:
+        """Return the note in a file, None if there is none; that of an earlier version is a link to the outbox."""
+        try:
+            if file.is_symlink():
+                return cls(file.readlink(), "", ProcessInfo.of({}))
+            told = json.loads(file.read_bytes())
+            return cls(Path(told["outbox"]), str(told["uri"]), ProcessInfo.of(told["process"]))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return None
+
+    @classmethod
+    def of(cls, run_id: str) -> Self | None:
+        """Return the note of a run, None if there is none."""
+        return cls.read(cache_folder() / NOTES_FOLDER / run_id)
+
+    def write(self, file: Path) -> None:
+        """Write it to a file."""
+        told = {"outbox": str(self.outbox), "uri": self.uri, "process": asdict(self.process)}
+        atomic_write(file, lambda opened: opened.write(json.dumps(told).encode()))
+
+    @property
+    def is_abandoned(self) -> bool:
+        """Whether the process that tracked the run is known to have died."""
+        return self.process.is_here and not self.process.is_alive
+
+
+def notes() -> dict[str, Note]:
+    """Return the notes of this machine by the IDs of their runs."""
+    files = sorted((cache_folder() / NOTES_FOLDER).glob("*"))
+    return {file.name: note for file in files if (note := Note.read(file)) is not None}
