@@ -31,7 +31,7 @@ class Multimodal:
     units, after the network of Mnih et al. 2015 (doi:10.1038/nature14236).
 
     Args:
-        filters: of each convolution.
+        filters: number of filters of each convolution.
         vector_sizes: units of each layer for the vectors.
         head_sizes: units of each layer of the head but the output.
 
@@ -111,7 +111,7 @@ class MultimodalBody(ModuleWithVectorOutput):
 
     Args:
         network: its sizes.
-        space: of the observations.
+        space: space of the observations.
         n_action: components of the action that a critic judges, 0 for none.
     """
 
@@ -132,7 +132,7 @@ class MultimodalBody(ModuleWithVectorOutput):
 
         Args:
             obs: the parts by name, each shape (n, ...).
-            state: of recurrent networks, unused.
+            state: state of recurrent networks, unused.
             info: unused.
             act: the actions to be judged, shape (n, n_action).
         """

@@ -23,7 +23,7 @@ class Policy(nn.Module):
     Args:
         actor: gives mean and spread of the actions.
         bounded: takes the mean to [-1, 1], as the learner does when it acts.
-        compute: what the learner computes with.
+        compute: device and precision that the learner computes with.
         is_sampling: whether the learner draws its actions from mean and spread, also where it is judged.
     """
 

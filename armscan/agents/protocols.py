@@ -25,15 +25,15 @@ class Agent(Protocol):
         """Begin an episode.
 
         Args:
-            seed: of the random numbers that the agent draws in this episode.
-            bounds: what the action's components stand for on the episode's volume.
+            seed: seed of the agent's random numbers in this episode.
+            bounds: ranges of the action's components on the episode's volume, in degrees and mm.
         """
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
         """Return the next action, shape (n_free,), within [-1, 1], as it is judged: without exploration.
 
         Args:
-            observation: of the current plane.
+            observation: observation of the current plane.
             reward: of the current plane, which is the start's before the first action.
         """
 

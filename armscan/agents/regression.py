@@ -85,7 +85,7 @@ class RegressionLearner:
         regression: parameters of the algorithm.
         network: kind of network; the mean of its actor's actions is fitted.
         size: number of slices that are kept.
-        setup: what the agent is made from.
+        setup: environments, spaces, budget and seed of the agent.
     """
 
     def __init__(self, regression: Regression, network: Network, size: int, setup: AgentSetup) -> None:

@@ -18,8 +18,8 @@ class SupervisedBuffer:
     """Observations with the optimal actions of their episodes; the oldest make way for new ones.
 
     Args:
-        size: how many are kept.
-        space: of one observation.
+        size: maximum number of observations.
+        space: space of one observation.
         n_free: components of an action.
     """
 

@@ -27,7 +27,7 @@ class TianshouVectorEnv(BaseVectorEnv):
 
     Attributes:
         n_ended: episodes that have ended since somebody set it to 0.
-        n_successes: those among them that ended on a rewarded plane.
+        n_successes: number of them that ended on a rewarded plane.
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:

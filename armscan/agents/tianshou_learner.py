@@ -37,7 +37,7 @@ class TianshouLearner:
         trainer: with `training_parameters`.
         bounded: takes the mean of the policy's actions to [-1, 1], as the trainer's policy does.
         parameters: parameters of the algorithm; the learning rates fall by as much in each epoch as it has steps.
-        setup: what the agent was given.
+        setup: environments, spaces, budget and seed of the agent.
         learning_starts: steps with random actions before the first update; default: none.
     """
 

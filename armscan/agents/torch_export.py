@@ -27,7 +27,7 @@ def export_program(policy: Policy, batch: Batch) -> ExportedProgram:
     """Return a policy as a program of torch, for batches of every size.
 
     Args:
-        policy: of a learner.
+        policy: policy of a learner.
         batch: two observations at least: one would make a program for one.
 
     Raises:
@@ -50,7 +50,7 @@ def save_onnx(program: ExportedProgram, batch: Batch, file: Path) -> None:
 
     Args:
         program: as `export_program` returns it.
-        batch: of observations, which names its inputs.
+        batch: batch of observations, which names the inputs.
         file: takes all of it, weights included.
 
     Raises:

@@ -211,7 +211,7 @@ def cluster_label(
     Args:
         slice_xz: labels, indexed [across, depth].
         label: whose pixels.
-        half_widths: of the disc of neighbours, as `disc_half_widths` gives them.
+        half_widths: half widths of the disc of neighbours, in pixels, as `disc_half_widths` returns them.
         min_samples: neighbours, the pixel itself included, that make a core pixel.
 
     Returns:
@@ -236,7 +236,7 @@ def summarise_label(
     Args:
         slice_xz: labels, indexed [across, depth].
         label: whose pixels.
-        half_widths: of the disc of neighbours, as in `cluster_label`.
+        half_widths: half widths of the disc of neighbours, in pixels, as in `cluster_label`.
         min_samples: neighbours that make a core pixel, as in `cluster_label`.
         summary: filled with the number of clusters, the number of pixels in them, and the mean of their centres,
             (across, depth) in pixels, 0 where there is none; shape (4,).

@@ -24,7 +24,7 @@ from armscan.volumes.plane import FloatArray, ManipulatorAction, shift_into
 from armscan.volumes.volume import LabelVolume
 
 MAX_PLANES = 1_000_000
-# Planes one step apart are neighbours, whichever and however many of their components differ.
+# Planes one step apart are neighbours, in one component or in several.
 NEIGHBOURS = np.ones((3, 3, 3))
 # Rewards that differ by rounding only are the same.
 SAME_REWARD = 1e-9
@@ -104,7 +104,7 @@ class PlaneScorer:
     Args:
         volume: the volume.
         reward: scores what is seen.
-        tissues: how what is seen is clustered.
+        tissues: clustering rule of each tissue.
     """
 
     def __init__(self, volume: LabelVolume, reward: Reward, tissues: Tissues) -> None:
@@ -136,13 +136,13 @@ def find_optimal_plane(
     rotations, the middle is that of the part within.
 
     Args:
-        volume: where to search, over its whole length.
+        volume: volume to search, over its whole length.
         rz_deg: planes turned about Z by up to +- this are tried, at most 80.
         rx_deg: the same about X.
         step_deg: between the rotations tried at first; half of it about the region that scores best.
         step_mm: between the places along the arm, likewise.
         success_threshold: a plane counts as found only if it scores above -success_threshold.
-        targets: of the reward.
+        targets: target counts of the reward.
         clustering: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
 
     Returns:

@@ -77,9 +77,9 @@ class AgreementReward(LandmarkReward):
     change when the picture is shifted.
 
     Args:
-        targets: of the published reward.
+        targets: target counts of the published reward.
         area_tolerance: how far outside its range an area has its full cost, as a share of the nearer end.
-        distance_tolerance_mm: how far outside its range a distance has.
+        distance_tolerance_mm: tolerance of a distance outside its range, in mm.
         slack: by which share of an area's ends its range is widened: the pixels of the same plane differ a little from
             one motion of the volume to another.
         slack_mm: by how much the range of a distance is widened.
@@ -199,7 +199,7 @@ def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED
     """Return the published reward, `LandmarkReward`, of what a slice shows.
 
     Args:
-        clusters: what it shows.
+        clusters: clusters in the slice.
         targets: how many clusters of bones, tendons and artery the wanted plane shows.
 
     Raises:

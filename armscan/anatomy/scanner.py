@@ -78,8 +78,8 @@ class Scanner:
     """Looks at planes of some volumes.
 
     Args:
-        volumes: by their place in this sequence.
-        tissues: how what is seen is clustered.
+        volumes: volumes, which are named by their index in this sequence.
+        tissues: clustering rule of each tissue.
     """
 
     def __init__(self, volumes: Sequence[LabelVolume], tissues: Tissues) -> None:
@@ -103,9 +103,9 @@ class Scanner:
         """Look at one plane.
 
         Args:
-            which: place of the volume.
-            matrix: 3 x 3, from the plane's frame into the volume's.
-            offset_mm: the plane's origin in the volume, shape (3,).
+            which: index of the volume.
+            matrix: rotation from the plane's frame into the volume's, shape (3, 3).
+            offset_mm: the plane's origin in the volume, in mm, shape (3,).
 
         Returns:
             The slice, indexed [across, depth], and the summary of its clusters.
@@ -118,12 +118,12 @@ class Scanner:
     def look_all(
         self, which: IntArray, matrices: FloatArray, offsets_mm: FloatArray
     ) -> tuple[list[Pixels], FloatArray]:
-        """Look at n planes on as many threads as NUMBA_NUM_THREADS says, default: one a core.
+        """Look at n planes on as many threads as NUMBA_NUM_THREADS says, default: one for each core.
 
         Args:
-            which: place of each plane's volume, shape (n,).
-            matrices: shape (n, 3, 3).
-            offsets_mm: shape (n, 3).
+            which: index of each plane's volume, shape (n,).
+            matrices: rotation of each plane, shape (n, 3, 3).
+            offsets_mm: origin of each plane in its volume, in mm, shape (n, 3).
 
         Returns:
             The slices, and the summaries of their clusters, shape (n, 3, 4): bit for bit what `look` gives.
@@ -137,7 +137,9 @@ class Scanner:
             planes = (which[start:stop], matrices[start:stop], offsets_mm[start:stop])
             _look_all(volumes, *planes, *self._rules, slices[start:stop], landmarks[start:stop])
 
-        if (n_threads := int(os.environ.get("NUMBA_NUM_THREADS") or os.cpu_count() or 1)) == 1:
+        # Numba's default is the number of cores that this process may use.
+        n_threads = int(os.environ.get("NUMBA_NUM_THREADS") or vars(numba.config)["NUMBA_DEFAULT_NUM_THREADS"])
+        if n_threads == 1:
             look_from(0, len(which))
         else:
             bounds = range(0, len(which), max(1, len(which) // N_CHUNKS))

@@ -39,7 +39,7 @@ class Tissue(Protocol):
 
 @dataclass(frozen=True)
 class PixelTissue:
-    """A tissue clustered by pixels, whatever their size; DBSCAN on the pixel coordinates.
+    """A tissue clustered by pixels of any size; DBSCAN on the pixel coordinates.
 
     Args:
         label: its value in a labelmap.

@@ -37,18 +37,18 @@ class Explorer:
     """A figure with the picture of a plane, a slider for each of its components, and buttons.
 
     Args:
-        volumes: what can be looked at, by name; at least one.
+        volumes: volumes to explore, by name; at least one.
         name: the volume to begin with.
-        tissues: how what is seen is clustered.
+        tissues: clustering rule of each tissue.
 
     Attributes:
         figure: Matplotlib's.
-        sliders: of rz, rx in degrees and tx, ty in mm, by name.
-        volume: what is looked at.
+        sliders: sliders of rz and rx in degrees, tx and ty in mm, by name.
+        volume: volume that is shown.
         optimum: its optimal plane within the sliders' bounds, None where none is known.
         plane: the current plane.
-        view: what it shows.
-        rewards: of the planes looked at in this volume, the current one last.
+        view: slice at the current plane, with its clusters.
+        rewards: rewards of the planes shown in this volume, the current one last.
     """
 
     volume: LabelVolume

@@ -32,7 +32,7 @@ class LabellingOptions:
 
     Args:
         data: the folder of volumes.
-        tissues: how what is seen is clustered.
+        tissues: clustering rule of each tissue.
         volumes: only these, by file name; None for all.
         overwrite: whether volumes that have a plane are labelled as well.
         pictures: the folder for pictures, made where it is not there.

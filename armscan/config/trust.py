@@ -46,8 +46,8 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
 
     Args:
         config: configuration as it was stored, resolved.
-        where: what it belongs to, for the error, such as `run 3bf2`.
-        trust: whether it may name any class.
+        where: owner of the configuration, such as `run 3bf2`, for the error.
+        trust: whether the configuration may name any class.
 
     Raises:
         UntrustedError: if it names a class that armscan does not offer, or holds an interpolation.
@@ -73,7 +73,7 @@ def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
     Args:
         words: overrides of the command line.
         uri: address of the store that they were read from.
-        where: what they belong to, for the error.
+        where: owner of the command line, such as `run 3bf2`, for the error.
     """
     for word in words:
         key, _, value = word.lstrip("+~").partition("=")

@@ -88,7 +88,7 @@ def make_armscan_vector_env(num_envs: int = 1, volumes: Volumes = None, **kwargs
     """Make many environments with their wrappers; what `gymnasium.make_vec("armscan/Armscan-v0", ...)` calls.
 
     Args:
-        num_envs: how many.
+        num_envs: number of environments.
         volumes: as in `ArmscanEnv`.
         **kwargs: the arguments of `make_armscan_env` for wrappers, and the other arguments of `ArmscanVectorEnv`.
     """

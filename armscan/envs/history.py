@@ -89,7 +89,7 @@ class FrameHistory:
 
     Args:
         boxes: space of each part of one environment.
-        size: how many observations are kept, from 1 to 1000.
+        size: number of observations, from 1 to 1000.
         excluded: parts that are not stacked.
         n_envs: environments of the batch.
 
@@ -142,7 +142,7 @@ class BestPairs:
 
     Args:
         boxes: space of each part of one environment.
-        size: how many pairs are kept, from 1 to 1000.
+        size: number of pairs of action and reward, from 1 to 1000.
         action_space: the free components of an action.
         n_envs: environments of the batch.
 

@@ -19,6 +19,9 @@ from armscan.envs.slice_observations import SliceChannelsObservation, SliceObser
 from armscan.envs.spaces import Parts
 from armscan.errors import InvalidValueError, listed
 
+# As users give one: an object, a name, or a list of those that are merged.
+ObservationLike = str | Observation | Sequence["ObservationLike"]
+
 
 class MergedObservation:
     """Several observations as one.
@@ -31,9 +34,7 @@ class MergedObservation:
         InvalidValueError: if there is none, or one is no observation.
     """
 
-    def __init__(
-        self, observations: Sequence[str | Observation], *, targets: Sequence[int] = PUBLISHED_TARGETS
-    ) -> None:
+    def __init__(self, observations: Sequence[ObservationLike], *, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
         if isinstance(observations, str) or not isinstance(observations, Sequence) or not observations:
             raise InvalidValueError(f"observations is {observations!r}, but it must be a list of at least one")
         checked = [_observation(observation, targets) for observation in observations]
@@ -74,9 +75,7 @@ NAMED_OBSERVATIONS: dict[str, type[Observation]] = {
 }
 
 
-def with_action_reward(
-    observation: str | Observation | Sequence[str | Observation], targets: Sequence[int] = PUBLISHED_TARGETS
-) -> Observation:
+def with_action_reward(observation: ObservationLike, targets: Sequence[int] = PUBLISHED_TARGETS) -> Observation:
     """Return an observation with action and reward, which are part of every one.
 
     Args:
@@ -86,13 +85,13 @@ def with_action_reward(
     Raises:
         InvalidValueError: if there is no observation of that name, or it is no observation.
     """
-    merged = MergedObservation([observation], targets=targets)  # type: ignore[list-item]
+    merged = MergedObservation([observation], targets=targets)
     if any(isinstance(member, ActionRewardObservation) for member in merged.observations):
         return merged
     return MergedObservation([*merged.observations, ActionRewardObservation()])
 
 
-def _observation(observation: str | Observation | Sequence[str | Observation], targets: Sequence[int]) -> Observation:
+def _observation(observation: ObservationLike, targets: Sequence[int]) -> Observation:
     if isinstance(observation, str) and observation in NAMED_OBSERVATIONS:
         return ClusterObservation(targets=targets) if observation == "cluster" else NAMED_OBSERVATIONS[observation]()
     if isinstance(observation, list | tuple):

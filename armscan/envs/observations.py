@@ -48,7 +48,7 @@ class View:
     Args:
         slice_xz: the slice's labels, indexed [across, depth].
         landmarks: the summary of its clusters, shape (3, 4).
-        tissues: how they were clustered.
+        tissues: clustering rule of each tissue.
         geometry: the slice's shape and pixel size.
         smallest_shape: shape that the slices of every volume have at least, (across, depth).
         action: the free components of the last action, normalised, shape (n_free,).
@@ -126,7 +126,7 @@ class ClusterObservation:
 
     Args:
         normalised: which form.
-        targets: what the counts are divided by.
+        targets: numbers that the counts are divided by.
     """
 
     def __init__(self, *, normalised: bool = True, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:

@@ -83,10 +83,10 @@ def draw_plane(
     """Draw a plane: its slice, the volume from two sides, what it is worth.
 
     Args:
-        volume: where the plane lies.
+        volume: volume that the plane lies in.
         plane: the plane, in the frame of the moved volume.
-        view: what it shows.
-        transform: how the volume is moved, None where it is as it is.
+        view: slice at the plane, with its clusters.
+        transform: motion of the volume, None for none.
         beside: another plane to draw, and to measure the distance from.
         history: the rewards before.
         caption: written before the reward.

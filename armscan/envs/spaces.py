@@ -41,7 +41,7 @@ class MultiBoxSpace(spaces.Dict):
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """The boxes' shapes by name."""
-        return {name: box.shape for name, box in self.spaces.items()}  # type: ignore[misc]
+        return {name: box.shape or () for name, box in self.spaces.items()}
 
 
 def in_order(parts: Parts, boxes: Mapping[str, spaces.Box], leading: tuple[int, ...] = ()) -> Parts:

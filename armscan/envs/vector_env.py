@@ -27,7 +27,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
 
     Environment i gives bit for bit what an `ArmscanEnv` with the same seed gives. In the autoreset mode `NextStep` the
     step after an episode's end resets that environment, its action ignored and its reward 0, as Gymnasium defines it;
-    with `Disabled` whoever steps resets the ended ones by `reset(options={"reset_mask": mask})`.
+    with `Disabled` the caller resets the ended ones by `reset(options={"reset_mask": mask})`.
 
     Args:
         num_envs: how many.

@@ -26,12 +26,12 @@ class TrainedAgent:
     """An agent to evaluate.
 
     Args:
-        name: what tables and files call it.
+        name: name of the agent in tables and files.
         config: resolved configuration, with the changes that were asked for.
         run: run that it was trained in, None for an agent that no run is of.
         weights: weights of a learner, None where it has kept none.
         n_env_steps: environment steps that it was trained for.
-        domain: what it was trained on, None where that was not kept.
+        domain: training domain, None for a run that has not kept it.
         volumes: the fingerprints of its run's volumes, None where these were not kept.
     """
 

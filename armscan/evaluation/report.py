@@ -55,7 +55,7 @@ class EvaluationReport:
     Args:
         evaluations: evaluations by what their volumes are called.
         has_total: whether all of them are put together too; not where some volumes were trained on and others not.
-        facts: what was evaluated, and how; plain values for the JSON file.
+        facts: agent, data and settings of the evaluation, as plain values for the JSON file.
     """
 
     evaluations: Mapping[str, Evaluation]

@@ -36,7 +36,7 @@ class PreparedAgent:
         subject: the agent's configuration and weights.
         agent: the agent with its weights.
         envs: its environments, by what their volumes are called.
-        notes: what differs from its training, a sentence each.
+        notes: differences from its training, one sentence each.
         data: the folder of the volumes, `phantom`, or None for the volumes of the agent's own configuration.
     """
 

@@ -57,7 +57,7 @@ def volume_groups(data: str | None, n_phantoms: int, own: Callable[[], Split]) -
 
     Args:
         data: a folder, `phantom` for phantoms that no run trains on, None for the agent's own volumes.
-        n_phantoms: how many phantoms.
+        n_phantoms: number of phantoms.
         own: reads the agent's own volumes.
     """
     if data is None:

@@ -35,6 +35,7 @@ from armscan.utils.files import (
     remove_unfinished,
     sha256,
 )
+from armscan.utils.strict_yaml import load_yaml
 
 
 def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -> None:
@@ -98,7 +99,7 @@ def resume_run(
         sync(folder, lambda _: client)
         run = client.get_run(run_id)
         _check_unfinished(run)
-        config: dict[str, Any] = yaml.safe_load(_started_with(run, folder / CONFIG_FILE, "configuration"))
+        config = _config_of(run, folder)
         migrated = stored_config(config, where=f"run {run_id}", trust=trust)
         _check_last_checkpoint(run, folder)
         remove_unfinished(folder)
@@ -150,6 +151,14 @@ def _folder_of(run: Run) -> Path:
 def _check_unfinished(run: Run) -> None:
     if run.info.status == "FINISHED":
         raise ResumeError(f"run {run.info.run_id} has finished: there is nothing to resume")
+
+
+def _config_of(run: Run, folder: Path) -> dict[str, Any]:
+    """Return the configuration that a run was started with, as its version wrote it."""
+    try:
+        return dict(load_yaml(_started_with(run, folder / CONFIG_FILE, "configuration")))
+    except (yaml.YAMLError, TypeError, ValueError) as error:
+        raise ResumeError(f"{folder / CONFIG_FILE}: the run's configuration is damaged") from error
 
 
 def _started_with(run: Run, file: Path, what: str) -> bytes:

@@ -75,10 +75,10 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
     """Write an agent's policy as a model, in the place of what is there; one that fails a check is not written.
 
     Args:
-        agent: which has learned.
+        agent: trained agent.
         env: environment that it can act in.
         folder: folder of the model.
-        facts: what stays with the model; see `facts_of`.
+        facts: metadata of the model, as `facts_of` returns it.
 
     Raises:
         ExportError: if the policy cannot be written down, or the model does not answer as the agent does.

@@ -137,7 +137,7 @@ def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
 
 
 def sort_rows(rows: Sequence[RunRow], sort: str, limit: int | None = None) -> list[RunRow]:
-    """Return rows in an order; those without a value come last, whatever the direction.
+    """Return rows in an order; those without a value come last in both directions.
 
     Args:
         rows: the rows.

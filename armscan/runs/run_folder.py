@@ -92,7 +92,7 @@ class OwnFolder:
         return found
 
     def _tracked(self) -> Iterator[str]:
-        """Yield the names of the files that the run has tracked; earlier versions tracked whatever was there."""
+        """Yield the names of the files that the run has tracked; earlier versions tracked all files of the folder."""
         with contextlib.suppress(OSError, TrackingError):
             for entry in OutboxFile(file_of(self.path, self.run_id)).entries():
                 if "file" in entry and is_made_by_run(name := file_and_place(entry["file"])[0]):
@@ -130,7 +130,7 @@ class OwnFolder:
             yield
 
     def remove_emptied(self) -> bool:
-        """Remove the folder where nothing is left in it; return whether it is gone."""
+        """Remove the folder if it is empty; return whether it is gone."""
         model = self.path / POLICY_FOLDER
         inner = [] if model.is_symlink() else [Path(where) for where, _, _ in os.walk(model, topdown=False)]
         for folder in (*inner, self.path / HYDRA_FOLDER, self.path / OUTBOX_FOLDER, self.path):

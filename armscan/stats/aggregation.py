@@ -49,7 +49,7 @@ def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
 
     Args:
         scores: scores, shape (seeds, volumes).
-        mean: how values are put together; see `mean_for`.
+        mean: function that aggregates the values; see `mean_for`.
         seed: seed of the resamples; default: 0.
 
     Returns:
@@ -67,7 +67,7 @@ def band_over_seeds(scores: FloatArray, mean: Mean) -> Band:
 
     Args:
         scores: scores, shape (seeds, points), all finite.
-        mean: how values are put together; see `mean_for`.
+        mean: function that aggregates the values; see `mean_for`.
 
     Returns:
         The band, without an interval where there is one seed.

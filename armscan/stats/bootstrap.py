@@ -73,8 +73,8 @@ def estimates(
 
     Args:
         columns: by the name of each figure its statistic and the value of each episode, NaN for those left out.
-        volumes: which volume each episode is on.
-        trainings: which training each episode is of; None where all are of one.
+        volumes: volume of each episode.
+        trainings: training of each episode; None if all are of one.
         seed: seed of the resampling; the same one gives the same intervals.
 
     Raises:

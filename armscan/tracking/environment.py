@@ -68,7 +68,7 @@ class Source:
 
     Args:
         commit: of git, `unknown` where the code is under no git.
-        diff: what was changed since, as `git apply` takes it, empty where nothing was; None where nobody knows.
+        diff: what was changed since, as `git apply` takes it, empty if nothing was; None if that is unknown.
     """
 
     commit: str

@@ -19,6 +19,7 @@ from armscan.tracking.client import TrackingStore
 from armscan.tracking.store import open_existing_store, store_errors
 from armscan.training import Fingerprints
 from armscan.utils.files import BEST_CHECKPOINT, CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
+from armscan.utils.strict_yaml import load_yaml
 
 # What a run's agent was trained on, as `armscan.training.TrainingDomain` writes it.
 DOMAIN_TAG = "trained_on"
@@ -67,7 +68,7 @@ class FoundRun:
             TrackingError: if the run has kept none, it is damaged, or not the one that the run was started with.
         """
         try:
-            config = dict(yaml.safe_load(self._started_with(CONFIG_FILE, folder)))
+            config = dict(load_yaml(self._started_with(CONFIG_FILE, folder)))
         except (yaml.YAMLError, TypeError, ValueError) as error:
             raise TrackingError(f"run {self.run_id}: its {CONFIG_FILE} is damaged") from error
         return stored_config(config, where=f"run {self.run_id}", trust=trust)

@@ -197,7 +197,7 @@ class TrackedRun:
             self.end("FAILED", reason=repr(error))
 
     def go_on(self) -> None:
-        """Mark the run as RUNNING again, whatever was said of it since its last process."""
+        """Mark the run as RUNNING again, also if it was ended after its last process had died."""
         self._is_resumed = True
         self._add(status=("RUNNING", now_ms()))
         self._add(untagged=FAILURE_TAG)

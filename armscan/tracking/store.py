@@ -222,7 +222,7 @@ def _check_writable(location: str | None) -> None:
         return
     folder = Path(url2pathname(urlsplit(location).path))
     try:
-        # Nothing is made: whoever has made another mistake finds nothing left.
+        # Nothing is made, so that another mistake leaves nothing behind.
         check_writable(next(each for each in (folder, *folder.parents) if each.exists()) / "any")
     except OSError as error:
         raise TrackingError(

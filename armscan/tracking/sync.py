@@ -147,8 +147,7 @@ def _deliver_pending(store: TrackingStore) -> None:
 
     for run_id, note in notes().items():
         is_there = note.outbox.exists()
-        # This user's own, as the note is.
-        deliveries = _synced([note.outbox], opened, trust=True)
+        deliveries = _synced([note.outbox], opened, trust=False)
         for delivery in deliveries:
             if delivery.n_entries:
                 log(f"run {delivery.run_id}: {delivery.n_entries} entries that it had left are delivered now")
@@ -171,7 +170,7 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
         try:
             outbox = Outbox(file, timeout_s=0.0)
             is_ended = outbox.status in ENDED
-        # Its process is alive, another has just taken it over, or it is damaged, which whoever delivers it is told.
+        # Its process is alive, another has just taken it over, or it is damaged, which `sync` reports.
         except (FolderInUseError, FileNotFoundError, TrackingError):
             continue
         if is_ended:

@@ -49,7 +49,7 @@ class MetricEstimates:
 
         Args:
             evaluation: the episodes.
-            trainings: which training each episode is of; None where all are of one.
+            trainings: training of each episode; None if all are of one.
         """
         episodes = evaluation.episodes
         volumes = [episode.volume for episode in episodes]

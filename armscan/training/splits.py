@@ -27,7 +27,7 @@ class Split:
     """Volumes by name.
 
     Args:
-        training: what the agent moves through while it learns.
+        training: volumes that the agent learns on.
         validation: what it is tested on after each epoch; these choose the checkpoint and stop the training.
         test: what has no part in training at all; the final evaluation judges by them.
 
@@ -139,7 +139,7 @@ def mixed_data(
 
     Args:
         path: the folder.
-        n_volumes: how many of its volumes, the first by name; None for all.
+        n_volumes: number of its volumes to use, the first by name; None for all.
         n_training: number of phantoms to train on beside them, which may be 0.
         n_validation: number of phantoms that choose the checkpoint.
         n_test: number of phantoms to judge on.

@@ -102,12 +102,12 @@ def train(
 
     Args:
         learner: learner to train.
-        budget: how long.
+        budget: length of the training in environment steps, and of its epochs.
         validate: evaluates the learner on the validation volumes.
         folder: folder where `best.pt` and `last.pt` are kept.
         callbacks: called at start, after each epoch and at the end.
-        provenance: what the checkpoints say that they come from.
-        earlier: what `resume_from_checkpoint` returned, for a resumed training.
+        provenance: origin of the checkpoints, kept in them.
+        earlier: reports that `resume_from_checkpoint` returned, for a resumed training.
 
     Returns:
         The reports of all epochs.

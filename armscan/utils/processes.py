@@ -100,7 +100,7 @@ class ProcessInfo:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
-        """Return the process that a mapping describes, whatever else is in it; of an earlier version, too."""
+        """Return the process that a mapping describes, also one of an earlier version; other keys are ignored."""
         nobody: dict[str, Any] = {"host": "", "pid": 0, "started": ""}
         return cls(**nobody | {each.name: values[each.name] for each in fields(cls) if each.name in values})
 

@@ -29,7 +29,7 @@ class Dataset:
 
     Args:
         volumes: by file name, without the excluded ones.
-        reports: what was found in the file of each of them, and what became of it.
+        reports: summary of the file of each volume, and of the volume made of it.
         subjects: whose arm each of them is, by file name; a volume without a subject is its own.
         splits: `train`, `validation` or `test` by file name, None where the manifest has no splits.
         excluded: why a volume of the folder was left out, by file name.

@@ -104,8 +104,8 @@ class Found:
 
     Args:
         source: a value, or the name of a segment.
-        label: what it was mapped to, 0 to 4.
-        n_voxels: of the file; a segment may have none.
+        label: label that it was mapped to, 0 to 4.
+        n_voxels: number of its voxels in the file; a segment may have none.
     """
 
     source: Source

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections import Counter
 from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
@@ -18,6 +17,7 @@ from yaml.representer import SafeRepresenter
 
 from armscan.errors import InvalidValueError, ManifestError, VolumeError, few, listed
 from armscan.utils.files import atomic_write, sha256
+from armscan.utils.strict_yaml import check_no_duplicates, load_yaml
 from armscan.utils.validation import check_float, check_path
 from armscan.volumes.header_checks import CHECKS
 from armscan.volumes.plane import ManipulatorAction
@@ -29,10 +29,6 @@ if TYPE_CHECKING:
 MANIFEST_NAMES = ("manifest.yaml", "manifest.yml", "manifest.json", "optimal_actions.json")
 ENTRIES_ONLY = MANIFEST_NAMES[-1]
 NEW_MANIFEST = MANIFEST_NAMES[0]
-# Collections within each other; a manifest has five at the most.
-DEEPEST = 50
-# Of 10,000 volumes, 140,000 are used.
-MOST_NODES = 1_000_000
 
 Document = dict[str, Any]
 
@@ -178,7 +174,7 @@ def _load(path: Path) -> Document:
     is_json = path.suffix == ".json"
     try:
         text = path.read_text(encoding="utf-8-sig")
-        document = json.loads(text, object_pairs_hook=_without_duplicates) if is_json else _load_yaml(text)
+        document = json.loads(text, object_pairs_hook=_without_duplicates) if is_json else load_yaml(text)
     except OSError as error:
         raise ManifestError(f"{path}: the manifest cannot be read ({error.strerror or error})") from error
     # On some damaged texts PyYAML raises exceptions of other types: KeyError, AttributeError, ...
@@ -200,40 +196,10 @@ def _load(path: Path) -> Document:
     return {"volumes": document} if path.name == ENTRIES_ONLY else document
 
 
-def _load_yaml(text: str) -> Any:
-    """Read YAML, unless it is nested or repeats itself more than any manifest, or a mapping has a key twice."""
-    # Of each collection that is open, the nodes in it, and how many nodes these are with all that aliases repeat.
-    open_nodes: list[list[yaml.NodeEvent]] = [[]]
-    sizes, sizes_by_anchor = [0], dict[str | None, int]()
-    for event in yaml.parse(text, yaml.CSafeLoader):
-        if isinstance(event, yaml.CollectionEndEvent):
-            nodes, size = open_nodes.pop(), sizes.pop()
-            sizes[-1] += size
-            sizes_by_anchor[open_nodes[-1][-1].anchor] = size
-            if isinstance(event, yaml.MappingEndEvent):
-                keys = [key.value for key in nodes[::2] if isinstance(key, yaml.ScalarEvent)]
-                # The key of what is merged may be there for each of it.
-                _check_no_duplicates([key for key in keys if key != "<<"])
-        elif isinstance(event, yaml.NodeEvent):
-            open_nodes[-1].append(event)
-            sizes[-1] += sizes_by_anchor.get(event.anchor, 1) if isinstance(event, yaml.AliasEvent) else 1
-            if isinstance(event, yaml.CollectionStartEvent):
-                open_nodes.append([])
-                sizes.append(0)
-        if len(open_nodes) > DEEPEST or sizes[-1] > MOST_NODES:
-            raise ValueError(f"it is nested more than {DEEPEST} deep, or repeats more than {MOST_NODES} nodes")
-    return yaml.load(text, yaml.CSafeLoader)
-
-
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> Document:
     """Refuse what JSON allows and everybody regrets: a key that is there twice, the first one forgotten."""
-    _check_no_duplicates([key for key, _ in pairs])
+    check_no_duplicates([key for key, _ in pairs])
     return dict(pairs)
-
-
-def _check_no_duplicates(keys: list[str]) -> None:
-    if len(set(keys)) < len(keys):
-        raise ValueError(f"the key {Counter(keys).most_common(1)[0][0]!r} is there twice")
 
 
 def _round_trip() -> YAML:

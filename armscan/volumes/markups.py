@@ -41,7 +41,7 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
         path: the file, ending in `.mrk.json`; its folder exists.
         volume: the volume that the plane is for.
         action: the plane, in the volume's frame.
-        name: what Slicer calls the plane.
+        name: name of the plane in Slicer.
 
     Raises:
         InvalidValueError: if an argument is of another type.

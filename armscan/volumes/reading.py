@@ -63,7 +63,7 @@ def read_volume(
 ) -> LabelVolume:
     """Read a labelmap from .nii, .nii.gz, .nrrd, .mha or .mhd, or a segmentation of 3D Slicer from .seg.nrrd.
 
-    Where a voxel lies in the world stays as the file says, whichever way the array is turned and cropped.
+    Where a voxel lies in the world stays as the file says, however the array is turned and cropped.
 
     Args:
         path: the file.

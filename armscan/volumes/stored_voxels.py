@@ -21,7 +21,7 @@ from armscan.errors import VolumeError
 PIECE_BYTES = 1 << 20
 # No stream of deflate is inflated to more of its size.
 LARGEST_RATIO = 1032
-# What zlib calls its formats; MetaImages are read from either, whatever their header says.
+# What zlib calls its formats; MetaImages are read from either; their header does not say which.
 GZIP, GZIP_OR_ZLIB = 31, 47
 
 
@@ -30,8 +30,8 @@ class StoredVoxels:
     """Where voxels are stored.
 
     Args:
-        file: that holds them.
-        n_bytes: that the header promises, inflated, with `n_before`.
+        file: file that holds the voxels.
+        n_bytes: number of inflated bytes that the header declares, including `n_before`.
         offset: bytes of the file before them, or before the stream that they are compressed in.
         compression: `GZIP` or `GZIP_OR_ZLIB`, None where they are not compressed.
         n_before: bytes between the offset, inflated, and the first voxel.

@@ -18,10 +18,10 @@ class StoredFile:
     Args:
         shape: voxels along the file's own axes.
         spacing: likewise, in mm.
-        orientation: what the file's axes run towards, such as 'LPS'.
+        orientation: directions that the file's axes run towards, such as 'LPS'.
         found: every value or segment, what it was mapped to, and its voxels in the file.
-        missing: what the label map names and the file does not hold.
-        crop_mm: what was kept, None for all.
+        missing: values and segments of the label map that the file does not hold.
+        crop_mm: part of the volume that was kept, in mm, None for all.
     """
 
     shape: tuple[int, ...]
@@ -46,7 +46,7 @@ class VolumeReport:
         stored: the file.
         shape: (nx, ny, nz) in voxels.
         spacing: (sx, sy, sz) in mm.
-        orientation: what its axes run towards, such as 'LPS'.
+        orientation: directions that its axes run towards, such as 'LPS'.
         n_voxels: by tissue.
     """
 

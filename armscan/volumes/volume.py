@@ -32,7 +32,7 @@ class LabelVolume:
         labels: integers over (x, y, z), shape (nx, ny, nz): X across the palm, Y along the arm, Z through the depth;
             0 background, 1 bones, 2 flexor tendons, 3 ulnar artery, 4 median nerve. Kept as C-contiguous uint8.
         spacing: (sx, sy, sz) in mm.
-        name: what errors, `info` and tables call it.
+        name: name of the volume in errors, `info` and tables.
         optimal_action: the labelled plane, in the volume's own frame.
         origin: world coordinates of voxel (0, 0, 0) in mm, for the way back.
         direction: 3 x 3 direction cosines, columns are the world directions of the array's axes, for the way back.

@@ -7,7 +7,7 @@ import shlex
 import pytest
 import yaml
 
-from armscan.errors import UntrustedError
+from armscan.errors import ResumeError, UntrustedError
 from armscan.experiment.job import GRID_TAG
 from armscan.experiment.resume import resume
 from armscan.policies.build import SUM_TAG
@@ -42,11 +42,11 @@ def working_folder(database, tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlruns.db")
 
 
-def run_with(folder, **sections):
-    """Tracks a run, replaces sections of its configuration, and lets its tag say that it was started so."""
+def run_with(folder, text=None, **sections):
+    """Tracks a run, replaces its configuration or sections of it, and lets its tag say that it was started so."""
     run_id = tracked(folder)
     file, client = folder / CONFIG_FILE, store_of(folder)
-    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | sections))
+    file.write_text(text or yaml.safe_dump(yaml.safe_load(file.read_text()) | sections))
     client.log_artifact(run_id, str(file))
     client.set_tag(run_id, SHA256_TAGS[CONFIG_FILE], sha256(file.read_bytes()))
     client.set_tag(run_id, "folder", str(folder))
@@ -74,6 +74,27 @@ def test_no_command_executes_what_a_run_names(armscan, tmp_path, door, section):
     with pytest.raises(UntrustedError, match=line):
         resume([f"resume={run_id}"], list)
     assert not marker.exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a: &a [*a]",
+        "a: &a {b: *a}",
+        "\n".join(["a0: &a0 [1, 1]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12))]),
+        "[" * 3000 + "]" * 3000,
+        "a: !!python/object/apply:os.getcwd []",
+        "a: 1\na: 2",
+    ],
+    ids=["itself", "in itself", "billion laughs", "deep", "object", "twice"],
+)
+def test_configuration_that_was_made_to_harm_is_one_line(armscan, tmp_path, text):
+    run_id = run_with(tmp_path, text)
+    code, _, errors = answered(armscan, "evaluate", run_id)
+    assert (code, errors) == (2, f"error: run {run_id}: its config.yaml is damaged")
+    store_of(tmp_path).set_terminated(run_id, "KILLED")
+    with pytest.raises(ResumeError, match="the run's configuration is damaged"):
+        resume([f"resume={run_id}"], list)
 
 
 def test_run_with_a_class_of_ones_own_is_evaluated_with_trust(armscan, tmp_path):

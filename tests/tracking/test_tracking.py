@@ -22,9 +22,10 @@ from armscan.tracking import (
     open_store,
     source_tags,
 )
+from armscan.tracking.notes import notes
 from armscan.tracking.outbox import Address, Outbox, file_of
 from armscan.tracking.sanitize import flattened
-from armscan.tracking.sync import sync
+from armscan.tracking.sync import _deliver_pending, sync
 from armscan.tracking.uploader import deliver
 from armscan.training import EpochReport, TrainingResult
 from tests.support.waiting import wait_until
@@ -137,11 +138,14 @@ def test_file_outside_of_a_strangers_folder_is_not_uploaded(store, tmp_path, kin
     assert "is outside of the run's folder" in delivery.left
     assert client.list_artifacts(run_id) == []
     # Nor by one that goes on with the run.
-    with (
-        contextlib.closing(Outbox.begin(folder, Address(run_id, client.uri))) as outbox,
-        pytest.raises(UntrustedError, match="add --trust"),
-    ):
-        deliver(outbox, client.mlflow, "files")
+    with contextlib.closing(Outbox.begin(folder, Address(run_id, client.uri))) as outbox:
+        outbox.note()
+        with pytest.raises(UntrustedError, match="add --trust"):
+            deliver(outbox, client.mlflow, "files")
+    assert client.list_artifacts(run_id) == []
+    # Nor by a later start, though this machine has noted that something is left.
+    assert run_id in notes()
+    _deliver_pending(client)
     assert client.list_artifacts(run_id) == []
     (delivery,) = sync(tmp_path, lambda _: client, trust=True)
     assert delivery.left is None

@@ -99,7 +99,7 @@ def _table(opened: OpenedStudy) -> Table:
     final = opened.final_eval
     state = opened.search.scheduler.state()
     final_state = final.scheduler.state() if final is not None else StudyState.of(())
-    # As wide as the terminal, whatever the table has.
+    # As wide as the terminal.
     table = Table("worker", title=Text(_summary(opened, state)), title_justify="left", expand=True)
     for heading in ("trial", "seed", "environment steps", "return"):
         table.add_column(heading, justify="right")

@@ -66,7 +66,7 @@ def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folde
     }
     parts = [
         _summary(study, trials, objectives),
-        "<h2>Result</h2><p>The best settings with seeds that chose nothing, on the test volumes: "
+        "<h2>Result</h2><p>The best settings, trained with new seeds, on the test volumes: "
         "interquartile means over seeds and volumes, of success rates means, and 95 % intervals.</p>",
         table(_result_rows(found, trials)) if found else "<p>No final evaluation yet.</p>",
         _videos(final_trials),

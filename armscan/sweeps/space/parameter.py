@@ -118,7 +118,7 @@ class Parameter:
             number: float = suggest(self.name, drawn.low, drawn.high, log=drawn.log, step=drawn.step)
         except (ValueError, TypeError) as error:
             raise InvalidValueError(f"{refused}: {' '.join(str(error).split())}") from error
-        # Optuna takes whatever an enqueued trial has, and warns.
+        # Optuna accepts any value of an enqueued trial, and warns.
         if type(number) not in (int, float) or not drawn._contains(number):
             raise InvalidValueError(f"{refused}: {number!r}")
         return number

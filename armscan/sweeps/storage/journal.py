@@ -51,7 +51,7 @@ def open_journal(path: Path, *, is_written: bool) -> JournalStorage:
             pass
     try:
         return JournalStorage(journal)
-    # What is raised for a line that cannot be read, whichever way it is damaged.
+    # Raised for a line that cannot be read.
     except (ValueError, KeyError, TypeError, AssertionError) as error:
         raise StudyError(f"that file is no journal of Optuna: {error}") from error
 

@@ -46,7 +46,7 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
             directions=[*settings.objectives.values()],
             load_if_exists=True,
         )
-        # Also where whoever has just made it died before it could say what it is.
+        # Also if the process that created it died before it stored its settings.
         if not study.user_attrs.keys() >= wanted.keys() and not study.get_trials(deepcopy=False):
             for key, value in wanted.items():
                 study.set_user_attr(key, value)

@@ -113,7 +113,7 @@ class Attempt:
             metrics: the metrics of the last validation: the objective, and `mean_return` for the screen, if known.
             seed: the seed of the training.
             n_env_steps: the environment steps that it has taken.
-            grid: environment steps between two reports: trials are compared at the same step, whatever theirs are.
+            grid: environment steps between two reports: trials are compared at the same steps.
             total: environment steps of a whole training.
 
         Raises:
@@ -185,7 +185,7 @@ def of_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
     """Take from a composed configuration what is not of a run; returns it, and what was chosen of each group."""
     choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
     with open_dict(config):
-        # Where runs are tracked is the same whatever said so.
+        # The store is the same, however it was given.
         config.tracking = to_plain(config.tracking)
         for section in ("study", "hydra", CLUSTER):
             config.pop(section, None)

@@ -153,7 +153,7 @@ def _begun(
         try:
             earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id))
         except CheckpointError:
-            # Whatever has happened to it, the trial can be begun again, with an agent that has learned nothing.
+            # The trial can always start again, with an untrained agent.
             setup = set_up(config)
         else:
             client, _ = open_store(**to_plain(config.tracking), retry_s=RETRY_S)

@@ -19,7 +19,7 @@ class Tube:
     """A stack of ellipses in the wrist's own frame, interpolated linearly between its nodes.
 
     Args:
-        label: what its voxels are labelled.
+        label: label of its voxels.
         nodes: shape (n, 5), each row (y, x, z, radius_x, radius_z) in mm, ordered by y.
     """
 
@@ -81,7 +81,7 @@ def fill_tube(
         labels_xyz: the volume, changed in place; only voxels that are 0 are labelled.
         spacing_mm: (sx, sy, sz).
         matrix: 3 x 3 rotation from the wrist's frame into the volume's.
-        origin_mm: where the wrist's origin lies in the volume, shape (3,).
+        origin_mm: position of the wrist's origin in the volume, shape (3,).
         nodes: as in `Tube`.
         label: the label to write.
     """

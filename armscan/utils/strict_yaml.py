@@ -1,0 +1,54 @@
+"""YAML of strangers, read within limits: they are checked on the events of libyaml, before anything is built."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import yaml
+
+# Collections within each other; a manifest has five at the most, a configuration ten.
+DEEPEST = 50
+# A manifest of 10,000 volumes has 140,000.
+MOST_NODES = 1_000_000
+
+
+def load_yaml(text: str | bytes) -> Any:
+    """Return the contents of a YAML file.
+
+    Args:
+        text: text of the file.
+
+    Raises:
+        ValueError: if it is nested or repeats itself more than any file of armscan, or a mapping has a key twice.
+        yaml.YAMLError: if it is no YAML, or holds anything but plain values.
+    """
+    # Of each collection that is open, the nodes in it, and how many nodes these are with all that aliases repeat.
+    open_nodes: list[list[yaml.NodeEvent]] = [[]]
+    sizes, sizes_by_anchor = [0], dict[str | None, int]()
+    for event in yaml.parse(text, yaml.CSafeLoader):
+        if isinstance(event, yaml.CollectionEndEvent):
+            nodes, size = open_nodes.pop(), sizes.pop()
+            sizes[-1] += size
+            sizes_by_anchor[open_nodes[-1][-1].anchor] = size
+            if isinstance(event, yaml.MappingEndEvent):
+                keys = [key.value for key in nodes[::2] if isinstance(key, yaml.ScalarEvent)]
+                # The key of what is merged may be there for each of it.
+                check_no_duplicates([key for key in keys if key != "<<"])
+        elif isinstance(event, yaml.NodeEvent):
+            open_nodes[-1].append(event)
+            sizes[-1] += sizes_by_anchor.get(event.anchor, 1) if isinstance(event, yaml.AliasEvent) else 1
+            if isinstance(event, yaml.CollectionStartEvent):
+                # Until it ends: a collection that contains itself has no end.
+                sizes_by_anchor[event.anchor] = MOST_NODES + 1
+                open_nodes.append([])
+                sizes.append(0)
+        if len(open_nodes) > DEEPEST or sizes[-1] > MOST_NODES:
+            raise ValueError(f"it is nested more than {DEEPEST} deep, or repeats more than {MOST_NODES} nodes")
+    return yaml.load(text, yaml.CSafeLoader)
+
+
+def check_no_duplicates(keys: list[str]) -> None:
+    """Raise `ValueError` if a key is there twice."""
+    if len(set(keys)) < len(keys):
+        raise ValueError(f"the key {Counter(keys).most_common(1)[0][0]!r} is there twice")
