@@ -15,11 +15,10 @@ import torch
 from mlflow import MlflowClient
 
 import armscan
-from armscan.errors import FolderInUseError
 from armscan.experiment.job import GRID_TAG
 from armscan.tracking import open_store
 from armscan.training import load_checkpoint
-from armscan.utils.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, atomic_write, folder_lock
+from armscan.utils.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, folder_lock
 from tests.support.waiting import HANG_S, wait_until
 from tests.test_run import SMALL, TIMES, armscan_run, job_process_ids, runs_in
 
@@ -336,18 +335,3 @@ def test_resume_refuses_other_volumes_where_there_is_no_checkpoint(answer, tmp_p
     line = f"volumes are not those that run {run.info.run_id} was started with: "
     assert line in refused(answer, word)
     assert client.get_run(run.info.run_id).info.status == "KILLED"
-
-
-def test_folder_is_free_again_when_its_process_was_killed(tmp_path):
-    program = (
-        "import sys, time; from pathlib import Path; from armscan.utils.files import folder_lock\n"
-        "with folder_lock(Path(sys.argv[1])): print('held', flush=True); time.sleep(900)"
-    )
-    process = subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "held\n"
-    with pytest.raises(FolderInUseError, match="another process"), folder_lock(tmp_path):
-        pass
-    process.kill()
-    process.wait()
-    with folder_lock(tmp_path):
-        atomic_write(tmp_path / "a", lambda file: file.write(b"x"))

@@ -1,0 +1,78 @@
+"""Files that are there whole or not at all, and folders that one process holds."""
+
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from armscan.errors import FolderInUseError
+from armscan.utils.files import atomic_write, check_writable, folder_lock, remove_unfinished, truncate_torn_line
+
+
+def test_file_whose_writer_fails_stays_as_it_was(tmp_path):
+    def write(file):
+        file.write(b"half")
+        raise RuntimeError("out of ideas")
+
+    atomic_write(tmp_path / "a", lambda file: file.write(b"whole"))
+    with pytest.raises(RuntimeError, match="out of ideas"):
+        atomic_write(tmp_path / "a", write)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == {"a": b"whole"}
+
+
+def test_file_behind_a_link_is_replaced_with_its_mode_kept(tmp_path):
+    (tmp_path / "target").write_bytes(b"old")
+    (tmp_path / "target").chmod(0o640)
+    (tmp_path / "link").symlink_to(tmp_path / "target")
+    atomic_write(tmp_path / "link", lambda file: file.write(b"new"))
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "target").read_bytes() == b"new"
+    assert (tmp_path / "target").stat().st_mode & 0o777 == 0o640
+
+
+def test_unfinished_files_of_a_killed_writer_are_removed(tmp_path):
+    program = (
+        "import os, sys; from pathlib import Path; from armscan.utils.files import atomic_write\n"
+        "atomic_write(Path(sys.argv[1]), lambda file: (file.write(b'half'), file.flush(), os.kill(os.getpid(), 9)))"
+    )
+    assert subprocess.run([sys.executable, "-c", program, tmp_path / "a"], check=False).returncode == -9
+    assert len(list(tmp_path.iterdir())) == 1
+    remove_unfinished(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_check_of_a_place_leaves_nothing_there(tmp_path):
+    check_writable(tmp_path / "a")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(IsADirectoryError):
+        check_writable(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        check_writable(tmp_path / "missing" / "a")
+
+
+@given(
+    lines=st.lists(st.binary(max_size=20).map(lambda line: line.replace(b"\n", b"") + b"\n")),
+    torn=st.binary(max_size=20),
+)
+def test_torn_line_is_removed_and_no_other(tmp_path_factory, lines, torn):
+    path = tmp_path_factory.mktemp("torn") / "lines"
+    path.write_bytes(b"".join(lines) + torn.replace(b"\n", b""))
+    truncate_torn_line(path)
+    assert path.read_bytes() == b"".join(lines)
+
+
+def test_folder_is_free_again_when_its_process_was_killed(tmp_path):
+    program = (
+        "import sys, time; from pathlib import Path; from armscan.utils.files import folder_lock\n"
+        "with folder_lock(Path(sys.argv[1])): print('held', flush=True); time.sleep(900)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    with pytest.raises(FolderInUseError, match="another process"), folder_lock(tmp_path):
+        pass
+    process.kill()
+    process.wait()
+    with folder_lock(tmp_path):
+        atomic_write(tmp_path / "a", lambda file: file.write(b"x"))
