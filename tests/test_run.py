@@ -177,6 +177,17 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
 
 
 @pytest.mark.full
+def test_grid_that_configures_hydra_says_that_resuming_it_needs_trust(tmp_path):
+    ended = armscan_run("-m", "seed=0,-1", "agent=random", "hydra.launcher.n_jobs=1", *FEW, cwd=tmp_path)
+    assert ended.returncode == 1
+    (hint,) = [line for line in ended.stderr.splitlines() if line.startswith("resume all with: ")]
+    assert hint.endswith(" --trust")
+    again = armscan_run(*shlex.split(hint)[6:], cwd=tmp_path)
+    assert again.returncode == 1
+    assert again.stdout.count("has finished before: run") == 1
+
+
+@pytest.mark.full
 def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_path):
     few = [word for word in SMALL if not word.startswith(("agent.", "network"))]
     ended = armscan_run("-m", "agent=exhaustive,optuna", "projection=zy", *few, cwd=tmp_path)

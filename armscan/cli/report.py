@@ -56,6 +56,7 @@ def _report_on_study(name: str, uri: str, out: Path | None) -> Path:
     from armscan.sweeps.results.report import write_report
     from armscan.sweeps.storage.storage import existing_storage
     from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX, check_study_name
+    from armscan.sweeps.study.stored import check_trials
     from armscan.sweeps.study.study import is_ours
 
     check_study_name("--study", name)
@@ -70,8 +71,10 @@ def _report_on_study(name: str, uri: str, out: Path | None) -> Path:
     study = optuna.load_study(study_name=name, storage=storage.optuna)
     if not is_ours(study):
         raise StudyError(f"--study is {name!r}, but that one in {storage.uri!r} was not made by armscan")
+    check_trials(study)
     evaluated = []
     if name + FINAL_EVAL_SUFFIX in names:
         final = optuna.load_study(study_name=name + FINAL_EVAL_SUFFIX, storage=storage.optuna)
+        check_trials(final, n_searched=len(study.get_trials(deepcopy=False)))
         evaluated = final.get_trials(deepcopy=False)
     return write_report(study, evaluated, out or Path("reports", name))

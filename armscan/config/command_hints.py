@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Iterable
 
 from armscan.config.defaults import RESUME, TRACKING_URI, default_storage, default_tracking
+from armscan.config.trust import TRUST
 
 RUN = ("python", "-m", "armscan.run")
 
@@ -15,10 +16,16 @@ def run_command(words: Iterable[str]) -> str:
     return shlex.join([*RUN, *words])
 
 
-def resume_command(run_id: str, tracking_uri: str) -> str:
-    """Return the command that resumes a run."""
+def resume_command(run_id: str, tracking_uri: str, *, trust: bool = False) -> str:
+    """Return the command that resumes a run.
+
+    Args:
+        run_id: MLflow run ID.
+        tracking_uri: MLflow tracking URI of its store.
+        trust: whether it needs `--trust`. Default: False.
+    """
     where = () if tracking_uri == default_tracking()["uri"] else (f"{TRACKING_URI}={tracking_uri}",)
-    return run_command([f"{RESUME}={run_id}", *where])
+    return run_command([f"{RESUME}={run_id}", *where, *((TRUST,) if trust else ())])
 
 
 def armscan_command(*words: str, tracking: str | None = None, storage: str | None = None) -> str:

@@ -67,13 +67,12 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
     return config
 
 
-def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
-    """Raise `UntrustedError` where a stored command line could execute code, or send results elsewhere.
+def untrusted_word(words: Sequence[str], uri: str) -> str | None:
+    """Return the first override of a command line that could execute code, or send results elsewhere; None if none.
 
     Args:
         words: overrides of the command line.
-        uri: address of the store that they were read from.
-        where: owner of the command line, such as `run 3bf2`, for the error.
+        uri: address of the store that keeps them.
     """
     for word in words:
         key, _, value = word.lstrip("+~").partition("=")
@@ -83,10 +82,23 @@ def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
         is_server = "://" in value and not value.startswith("sqlite:")
         is_elsewhere = key.startswith("tracking.") and is_server and value != uri
         if is_elsewhere or TARGET in word or INTERPOLATION in word or key.startswith(("hydra", "-")):
-            raise UntrustedError(
-                f"{where}: its command line has {word!r}, which could execute code of others or send results "
-                f"elsewhere; {HOW}"
-            )
+            return word
+    return None
+
+
+def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
+    """Raise `UntrustedError` where a stored command line could execute code, or send results elsewhere.
+
+    Args:
+        words: overrides of the command line.
+        uri: address of the store that they were read from.
+        where: owner of the command line, such as `run 3bf2`, for the error.
+    """
+    if (word := untrusted_word(words, uri)) is not None:
+        raise UntrustedError(
+            f"{where}: its command line has {word!r}, which could execute code of others or send results elsewhere; "
+            f"{HOW}"
+        )
 
 
 def check_stored_address(uri: str) -> None:

@@ -17,6 +17,7 @@ from armscan.config.command_hints import armscan_command, resume_command, run_co
 from armscan.config.credentials import check_address
 from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
+from armscan.config.trust import untrusted_word
 from armscan.errors import InvalidValueError, TrackingError
 from armscan.experiment.job import (
     GRID_TAG,
@@ -83,7 +84,7 @@ class Multirun(Callback):
         tags = {**source_tags(), "overrides": command, "working_folder": str(Path.cwd()), GRID_TAG: json.dumps(again)}
         parent = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
         word = {"run_id": parent.info.run_id, "tracking": tracking, "overrides": overrides}
-        word["is_repeated"] = Multirun.is_repeated
+        word |= {"is_repeated": Multirun.is_repeated, "trust": untrusted_word(again, tracking["uri"]) is not None}
         (folder / PARENT_FILE).write_text(json.dumps(word))
         Multirun.folder = folder
 
@@ -139,7 +140,8 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
             again = resume_command(run.info.run_id, word["tracking"]["uri"])
             print(f"resume job {run.data.tags[JOB_TAG]} with: {again}", file=sys.stderr)
     if runs and status != "FINISHED":
-        print(f"resume all with: {resume_command(word['run_id'], word['tracking']['uri'])}", file=sys.stderr)
+        again = resume_command(word["run_id"], word["tracking"]["uri"], trust=word["trust"])
+        print(f"resume all with: {again}", file=sys.stderr)
     if is_known and not runs:
         remove_run_folder(Multirun.folder)
     return 1 if failed or not outcomes else 0

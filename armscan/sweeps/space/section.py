@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from armscan.errors import InvalidValueError, listed
 
+MAX_SHOWN_CHARS = 500
+
 
 class Section(BaseModel):
     """Takes no other keys, and no value of another type; the description of a field says what its value must be."""
@@ -46,4 +48,7 @@ class Section(BaseModel):
         model = field.annotation
         if len(place) > 1 and isinstance(model, type) and issubclass(model, Section):
             return model._line(f"{where}.{key}", values[key], place[1:])
-        return f"{where}.{key} is {values[key]!r}, but it must be {field.description}"
+        received = repr(values[key])
+        if len(received) > MAX_SHOWN_CHARS:
+            received = f"{received[:MAX_SHOWN_CHARS]}..."
+        return f"{where}.{key} is {received}, but it must be {field.description}"

@@ -52,7 +52,7 @@ def open_journal(path: Path, *, is_written: bool) -> JournalStorage:
     try:
         return JournalStorage(journal)
     # Raised for a line that cannot be read.
-    except (ValueError, KeyError, TypeError, AssertionError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, AssertionError) as error:
         raise StudyError(f"that file is no journal of Optuna: {error}") from error
 
 

@@ -21,6 +21,7 @@ from armscan.sweeps.scheduling.state import FINAL_SEED, Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX, StudySettings
+from armscan.sweeps.study.stored import check_trials
 from armscan.sweeps.study.study import STUDY_RUN, make_study
 from armscan.sweeps.tasks.attempt import Attempt, Task, trial_folder
 from armscan.tracking import TrackingStore, abandon, open_store, source_tags
@@ -172,6 +173,7 @@ def open_for_work(
 def _final_phase(search: Phase, settings: StudySettings, task: Task) -> Phase:
     storage, name = search.scheduler.storage, settings.name + FINAL_EVAL_SUFFIX
     study = storage.exclusive(lambda: optuna.create_study(study_name=name, storage=storage.optuna, load_if_exists=True))
+    check_trials(study, n_searched=len(search.scheduler.study.get_trials(deepcopy=False)))
     limits = Limits(n_trials=NO_END, max_failures=settings.max_failures, max_retries=settings.max_retries)
     return dataclasses.replace(
         search,

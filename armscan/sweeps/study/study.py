@@ -17,6 +17,7 @@ from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.components import make_pruner
 from armscan.sweeps.study.settings import FIRST_SEED_ABOVE, StudySettings
+from armscan.sweeps.study.stored import StudyAttributes, check_trials
 from armscan.tracking import flattened
 
 # User attributes of a study.
@@ -85,10 +86,15 @@ def _wanted(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]
 
 
 def is_ours(study: optuna.Study) -> bool:
-    """Whether a study was made here, and not by somebody else's program in the same storage."""
+    """Whether a study was made here, and not by somebody else's program in the same storage.
+
+    Raises:
+        InvalidValueError: if a user attribute of it is of another type than armscan writes.
+    """
     there = study.user_attrs
     if not {SPACE, FIXED, DASHBOARD_OBJECTIVES} <= there.keys():
         return False
+    StudyAttributes.read(f"{study.study_name}.user_attrs", there)
     return [direction.name.lower() for direction in study.directions] == [*there[DASHBOARD_OBJECTIVES].values()]
 
 
@@ -96,6 +102,7 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
     there = study.user_attrs
     if not is_ours(study):
         raise StudyError(f"study.name is {settings.name!r}, but that study in its storage was not made by armscan")
+    check_trials(study)
     whose = f"the study {settings.name} in {settings.storage if '://' not in settings.storage else 'its storage'}"
     other = "; give study.name another value"
     for key, what in ((SPACE, "searches another space"), (DASHBOARD_OBJECTIVES, "has other objectives")):
