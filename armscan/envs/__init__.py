@@ -3,6 +3,7 @@
 from armscan.envs.actions import COMPONENTS, PROJECTIONS, ActionBounds
 from armscan.envs.env import ArmscanEnv
 from armscan.envs.factory import EnvFactory, make_armscan_env, make_armscan_vector_env
+from armscan.envs.metric_slice import MetricSliceObservation
 from armscan.envs.observation_registry import MergedObservation
 from armscan.envs.observations import ActionRewardObservation, ClusterObservation, Observation, SliceGeometry, View
 from armscan.envs.scene import RandomTransform, Scene
@@ -25,6 +26,7 @@ __all__ = [
     "FrameStack",
     "ManipulatorAction",
     "MergedObservation",
+    "MetricSliceObservation",
     "MultiBoxSpace",
     "Observation",
     "RandomTransform",

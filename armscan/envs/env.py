@@ -45,6 +45,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     | `cluster` | `clusters`: number, pixels, mean centre of bones, tendons, artery, normalised | (12,) |
     | `slice` | `slice`: the labels, 0 to 4, uint8 | (across, depth) |
     | `slice_channels` | `channels`: where bones, tendons, artery are, 0 or 1, uint8 | (3, across, depth) |
+    | `slice_metric` | `shares`: of each pixel in mm, what bones, tendons, artery fill, uint8 | (3, across, depth) |
     | a list of them | all of them | |
 
     ## Rewards

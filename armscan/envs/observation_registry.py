@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from gymnasium import spaces
 
 from armscan.anatomy import PUBLISHED_TARGETS
+from armscan.envs.metric_slice import MetricSliceObservation
 from armscan.envs.observations import (
     ActionRewardObservation,
     ClusterObservation,
@@ -72,6 +73,7 @@ NAMED_OBSERVATIONS: dict[str, type[Observation]] = {
     "cluster": ClusterObservation,
     "slice": SliceObservation,
     "slice_channels": SliceChannelsObservation,
+    "slice_metric": MetricSliceObservation,
 }
 
 

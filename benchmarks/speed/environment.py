@@ -134,6 +134,9 @@ def main() -> None:
             volumes, observation="slice_channels", stack=1, memory=0
         ),
         "one, slice_channels at full size, stack and memory": one_environment(volumes, observation="slice_channels"),
+        "one, slice_metric at 60 x 40, no stack": one_environment(
+            volumes, observation="slice_metric", stack=1, memory=0
+        ),
         "one, on a single volume": one_environment([first]),
         f"one, on that volume {TIMES_AS_LARGE} times as large": one_environment([larger(first)]),
         to_plain: plain_pipeline(first),

@@ -13,7 +13,7 @@ from gymnasium.wrappers import FlattenObservation, NormalizeReward, RecordEpisod
 from gymnasium.wrappers.vector import RecordEpisodeStatistics as VectorRecordEpisodeStatistics
 
 import armscan
-from armscan.envs import ClusterObservation, SliceChannelsObservation, SliceObservation
+from armscan.envs import ClusterObservation, MetricSliceObservation, SliceChannelsObservation, SliceObservation
 
 ENV_IDS = [env_id for env_id in gym.registry if env_id.startswith("armscan/")]
 CROP, SHAPE = (201, 70), (24, 20)
@@ -27,6 +27,7 @@ OBSERVATIONS = {
     "channels": "slice_channels",
     "channels_cropped": SliceChannelsObservation(crop=CROP),
     "channels_reduced": SliceChannelsObservation(crop=CROP, shape=SHAPE),
+    "metric": MetricSliceObservation(field_of_view_mm=(97.2, 44.0), pixel_mm=(4.05, 2.2)),
     "merged_vectors": ["action_reward", "cluster"],
     "merged_with_image": ["cluster", SliceObservation(crop=CROP, shape=SHAPE)],
     "merged_images": [SliceChannelsObservation(shape=SHAPE), "slice", ClusterObservation(normalised=False)],
@@ -104,7 +105,7 @@ def play(env, n_steps=4):
 # An excluded part of a stack requires a stack.
 LAYOUTS = [(form, stack) for form in FORMS for stack in STACKS if (form, stack) != ("dict_part", "one")]
 CHOICES = (list(OBSERVATIONS), PROJECTIONS, LAYOUTS, list(MEMORIES))
-# A covering array: of any two choices, every pair of values is in one of its 72 rows.
+# A covering array: of any two choices, every pair of values is in one of its 78 rows.
 COVERING = [
     (observation, projection, LAYOUTS[(i + j) % len(LAYOUTS)], CHOICES[3][(i + 2 * j) % len(MEMORIES)])
     for (i, observation), (j, projection) in itertools.product(enumerate(OBSERVATIONS), enumerate(PROJECTIONS))

@@ -98,7 +98,7 @@ def test_merged_observations_refuse_duplicate_keys():
 def test_with_action_reward_names_what_there_is():
     with pytest.raises(
         InvalidValueError,
-        match="observation is 'slices', but it must be action_reward, cluster, slice or slice_channels",
+        match="observation is 'slices', but it must be action_reward, cluster, slice, slice_channels or slice_metric",
     ):
         with_action_reward("slices")
 
