@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any
-
-import torch
-from torch import nn
+from typing import TYPE_CHECKING, Any
 
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_bool, check_choice
+
+if TYPE_CHECKING:
+    from torch import nn
 
 DEVICES = ("auto", "cpu", "cuda")
 PRECISIONS = ("float32", "bfloat16")
@@ -37,13 +37,13 @@ class Compute:
         check_choice("device", self.device, DEVICES)
         check_choice("compute.precision", self.precision, PRECISIONS)
         check_bool("compute.compile", self.compile)
-        if self.device == "cuda" and not torch.cuda.is_available():
+        if self.device == "cuda" and not _has_cuda():
             raise InvalidValueError("device is 'cuda', but torch finds no CUDA device here; it must be 'cpu' or 'auto'")
 
     @property
     def torch_device(self) -> str:
         """The device that tensors are on: `cpu` or `cuda`."""
-        return "cuda" if self.device == "cuda" or (self.device == "auto" and torch.cuda.is_available()) else "cpu"
+        return "cuda" if self.device == "cuda" or (self.device == "auto" and _has_cuda()) else "cpu"
 
     @property
     def is_plain(self) -> bool:
@@ -53,6 +53,8 @@ class Compute:
     def apply_to(self, network: nn.Module) -> None:
         """Make a network compute in this way from now on; its inputs and outputs stay of 32 bits."""
         if self.precision == "bfloat16":
+            import torch
+
             forward = network.forward
             device = self.torch_device
 
@@ -67,6 +69,8 @@ class Compute:
 
 def plain_copy(network: nn.Module) -> nn.Module:
     """Return a copy of a network that computes in 32 bits on the CPU, undoing `Compute.apply_to`."""
+    import torch
+
     # The copy of what was compiled is not.
     copied = deepcopy(network)
     vars(copied).pop("forward", None)
@@ -74,6 +78,14 @@ def plain_copy(network: nn.Module) -> nn.Module:
 
 
 def _in_32_bits(output: Any) -> Any:
+    import torch
+
     if isinstance(output, tuple):
         return tuple(map(_in_32_bits, output))
     return output.float() if isinstance(output, torch.Tensor) else output
+
+
+def _has_cuda() -> bool:
+    import torch
+
+    return torch.cuda.is_available()

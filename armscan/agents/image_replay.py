@@ -10,8 +10,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from tianshou.data import Batch
 
+from armscan.agents.convolutions import images_of
 from armscan.agents.frame_store import FrameStore, Pixels
-from armscan.agents.multimodal import images_of
 from armscan.agents.replay import Replay, Tree
 
 OBSERVATIONS = ("obs", "obs_next")

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import chain, pairwise
-from typing import Any
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from gymnasium import spaces
-from tianshou.utils.net.common import ModuleWithVectorOutput
-from tianshou.utils.net.continuous import ContinuousActorProbabilistic as Actor
-from tianshou.utils.torch_utils import torch_device
-from torch import nn
 
-from armscan.agents.networks import MOST_UNITS, check_weights, gaussian_actor, init_linear, linear_weights
+from armscan.agents.convolutions import CONVOLUTIONS, count_features, images_of, smallest_side_px
+from armscan.agents.networks import MOST_UNITS, check_weights, linear_weights
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_ints
 
-# Kernel and stride of each convolution.
-CONVOLUTIONS = ((8, 4), (4, 2), (3, 1))
+if TYPE_CHECKING:
+    from tianshou.utils.net.continuous import ContinuousActorProbabilistic as Actor
+    from torch import nn
+
+    from armscan.agents.multimodal_modules import MultimodalBody
 
 
 class Multimodal:
@@ -76,106 +75,25 @@ class Multimodal:
             channels = [int(np.prod(box.shape[:-2])), *self.filters]
             kernels = (kernel**2 for kernel, _ in CONVOLUTIONS)
             n_weights += sum(n_in * n * size for (n_in, n), size in zip(pairwise(channels), kernels, strict=True))
-            n_features += _n_features(box, self.filters)
+            n_features += count_features(box, self.filters)
         return n_weights + linear_weights([n_features, *self.head_sizes])
 
     def actor(self, observation_space: spaces.Space[Any], n_free: int, log_std: float | None) -> Actor:
         """See `Network.actor`."""
-        return gaussian_actor(MultimodalBody(self, observation_space), n_free, log_std)
+        from armscan.agents.network_modules import gaussian_actor
+
+        return gaussian_actor(self.body(observation_space), n_free, log_std)
 
     def critic(self, observation_space: spaces.Space[Any], n_action: int = 0) -> nn.Module:
         """See `Network.critic`."""
-        return init_linear(MultimodalCritic(MultimodalBody(self, observation_space, n_action)))
+        from armscan.agents.multimodal_modules import MultimodalCritic
+        from armscan.agents.network_modules import init_linear
 
+        return init_linear(MultimodalCritic(self.body(observation_space, n_action)))
 
-def smallest_side_px() -> int:
-    """Return the smallest side of an image that the convolutions leave a pixel of."""
-    side = 1
-    for kernel, stride in reversed(CONVOLUTIONS):
-        side = (side - 1) * stride + kernel
-    return side
+    def body(self, observation_space: spaces.Space[Any], n_action: int = 0) -> MultimodalBody:
+        """Return all of the network but its output, of a critic of actions with `n_action` components."""
+        from armscan.agents.multimodal_modules import MultimodalBody
 
-
-def images_of(space: spaces.Space[Any]) -> dict[str, spaces.Box]:
-    """Return the images among the parts of an observation, by name: those of bytes, with two axes or more."""
-    parts = space.spaces if isinstance(space, spaces.Dict) else {}
-    return {
-        name: box
-        for name, box in parts.items()
-        if isinstance(box, spaces.Box) and box.dtype == np.uint8 and len(box.shape) >= 2
-    }
-
-
-class MultimodalBody(ModuleWithVectorOutput):
-    """All of the network but its output.
-
-    Args:
-        network: its sizes.
-        space: space of the observations.
-        n_action: components of the action that a critic judges, 0 for none.
-    """
-
-    def __init__(self, network: Multimodal, space: spaces.Space[Any], n_action: int = 0) -> None:
-        super().__init__(network.head_sizes[-1])
-        assert isinstance(space, spaces.Dict)
-        images = images_of(space)
-        self._vectors = [name for name in space if name not in images]
-        self._scales = {name: 1.0 / float(box.high.max()) for name, box in images.items()}
-        self.convolutions = nn.ModuleDict({name: _convolutions(box, network.filters) for name, box in images.items()})
-        n_features = sum(_n_features(box, network.filters) for box in images.values())
-        n_vector = sum(int(np.prod(space[name].shape or ())) for name in self._vectors) + n_action
-        self.vector = _linear_layers(n_vector, network.vector_sizes)
-        self.head = _linear_layers(n_features + network.vector_sizes[-1], network.head_sizes)
-
-    def forward(self, obs: Any, state: Any = None, info: Any = None, act: Any = None) -> tuple[torch.Tensor, Any]:
-        """Return the features of a batch of observations, shape (n, head_sizes[-1]), and the state as it came.
-
-        Args:
-            obs: the parts by name, each shape (n, ...).
-            state: state of recurrent networks, unused.
-            info: unused.
-            act: the actions to be judged, shape (n, n_action).
-        """
-        device = torch_device(self)
-        vectors = [obs[name] for name in self._vectors] + ([] if act is None else [act])
-        flat = [torch.as_tensor(vector, dtype=torch.float32, device=device).flatten(1) for vector in vectors]
-        features = [self.vector(torch.cat(flat, dim=1))]
-        for name, convolutions in self.convolutions.items():
-            image = torch.as_tensor(obs[name], device=device)
-            # Frames, and a channel for each tissue, side by side as channels.
-            frames = image.reshape(image.shape[0], -1, *image.shape[-2:]).float() * self._scales[name]
-            features.append(convolutions(frames))
-        return self.head(torch.cat(features, dim=1)), state
-
-
-class MultimodalCritic(nn.Module):
-    """A critic of observations, or of observations with actions: a body and its output."""
-
-    def __init__(self, body: MultimodalBody) -> None:
-        super().__init__()
-        self.body = body
-        self.last = nn.Linear(body.get_output_dim(), 1)
-
-    def forward(self, obs: Any, act: Any = None, info: Any = None) -> torch.Tensor:
-        """Return the values, shape (n, 1)."""
-        features, _ = self.body(obs, act=act)
-        return torch.as_tensor(self.last(features))
-
-
-def _convolutions(box: spaces.Box, filters: Sequence[int]) -> nn.Sequential:
-    channels = pairwise([int(np.prod(box.shape[:-2])), *filters])
-    layers = [(nn.Conv2d(*each, *shape), nn.ReLU()) for each, shape in zip(channels, CONVOLUTIONS, strict=True)]
-    return nn.Sequential(*chain.from_iterable(layers), nn.Flatten())
-
-
-def _n_features(box: spaces.Box, filters: Sequence[int]) -> int:
-    """Return how many numbers the convolutions make of an image."""
-    sides = np.array(box.shape[-2:])
-    for kernel, stride in CONVOLUTIONS:
-        sides = (sides - kernel) // stride + 1
-    return filters[-1] * int(np.prod(sides))
-
-
-def _linear_layers(n_inputs: int, sizes: Sequence[int]) -> nn.Sequential:
-    layers = [(nn.Linear(n_before, n), nn.ReLU()) for n_before, n in pairwise([n_inputs, *sizes])]
-    return nn.Sequential(*chain.from_iterable(layers))
+        sizes = {"filters": self.filters, "vector_sizes": self.vector_sizes, "head_sizes": self.head_sizes}
+        return MultimodalBody(observation_space, n_action, **sizes)

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from gymnasium import spaces
-from tianshou.utils.net.common import ModuleWithVectorOutput, Net
-from tianshou.utils.net.continuous import ContinuousActorProbabilistic as Actor
-from tianshou.utils.net.continuous import ContinuousCritic
-from torch import nn
 
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_choice, check_ints
 
+if TYPE_CHECKING:
+    from tianshou.utils.net.continuous import ContinuousActorProbabilistic as Actor
+    from torch import nn
+
+
 # An actor and two critics, their lagging copies and the moments of their optimisers take 14 times a network's weights,
 # which is then 4 GB.
 MOST_UNITS, MOST_WEIGHTS = 16_384, 2**26
-ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "gelu": nn.GELU}
+# By the name of each, the layer of torch.nn.
+ACTIVATIONS = {"relu": "ReLU", "tanh": "Tanh", "elu": "ELU", "gelu": "GELU"}
 
 
 class NetworkChoice(Protocol):
@@ -78,15 +80,15 @@ class MLP:
 
     def actor(self, observation_space: spaces.Space[Any], n_free: int, log_std: float | None) -> Actor:
         """See `Network.actor`."""
-        return gaussian_actor(self._body(observation_space), n_free, log_std)
+        from armscan.agents.network_modules import gaussian_actor, mlp_body
+
+        return gaussian_actor(mlp_body(observation_space, self.hidden_sizes, self.activation), n_free, log_std)
 
     def critic(self, observation_space: spaces.Space[Any], n_action: int = 0) -> nn.Module:
         """See `Network.critic`."""
-        body = self._body(observation_space, action_shape=n_action, concat=n_action > 0)
-        return init_linear(ContinuousCritic(preprocess_net=body))
+        from armscan.agents.network_modules import mlp_body, mlp_critic
 
-    def _body(self, space: spaces.Space[Any], **action: Any) -> Net:
-        return Net(state_shape=space.shape or (), hidden_sizes=self.hidden_sizes, activation=self.activation, **action)
+        return mlp_critic(mlp_body(observation_space, self.hidden_sizes, self.activation, n_action))
 
 
 class NetworkByObservation:
@@ -138,25 +140,3 @@ def check_weights(network: Network, n_weights: int) -> None:
             f"network is {type(network).__name__.lower()} with {n_weights} weights, but there must be at most "
             f"{MOST_WEIGHTS}: take smaller layers, or smaller images (obs.shape)"
         )
-
-
-def gaussian_actor(body: ModuleWithVectorOutput, n_free: int, log_std: float | None) -> Actor:
-    """Return a Gaussian actor whose actions are near 0 at first; see `Network.actor`."""
-    actor = Actor(preprocess_net=body, action_shape=(n_free,), unbounded=True, conditioned_sigma=log_std is None)
-    if log_std is not None:
-        nn.init.constant_(actor.get_parameter("sigma_param"), log_std)
-    init_linear(actor)
-    # Andrychowicz et al. 2020 (arXiv:2006.05990), figure 24.
-    for name, weights in actor.mu.named_parameters():
-        if name.endswith("weight"):
-            weights.data.mul_(0.01)
-    return actor
-
-
-def init_linear(module: nn.Module) -> nn.Module:
-    """Initialise linear layers with orthogonal weights and no bias; returns the module."""
-    for layer in module.modules():
-        if isinstance(layer, nn.Linear):
-            nn.init.orthogonal_(layer.weight, gain=2**0.5)
-            nn.init.zeros_(layer.bias)
-    return module

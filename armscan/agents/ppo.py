@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-from tianshou.algorithm.modelfree import ppo
-from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
-from tianshou.algorithm.optim import AdamOptimizerFactory
-from tianshou.trainer import OnPolicyTrainer, OnPolicyTrainerParams
-from torch.distributions import Independent, Normal
+from typing import TYPE_CHECKING
 
 from armscan.agents.hyperparameters import PolicyParameters, check_batch, check_collection, number
-from armscan.agents.image_replay import replay_for
-from armscan.agents.policy import clip_action
+from armscan.agents.networks import Network
 from armscan.agents.protocols import AgentSetup
-from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
 from armscan.errors import InvalidValueError
+
+if TYPE_CHECKING:
+    from armscan.agents.tianshou_learner import TianshouLearner
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +69,19 @@ class PPO(PolicyParameters):
         network = self.network.chosen_for(setup.observation_space)
         n_collected = check_collection(self.env_steps_per_collection, self.num_envs, setup)
         check_batch(self.batch_size, n_collected, "the environment steps of a collection")
+        return self._learner(setup, network, n_collected)
+
+    def _learner(self, setup: AgentSetup, network: Network, n_collected: int) -> TianshouLearner:
+        from tianshou.algorithm.modelfree import ppo
+        from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
+        from tianshou.algorithm.optim import AdamOptimizerFactory
+        from tianshou.trainer import OnPolicyTrainer, OnPolicyTrainerParams
+        from torch.distributions import Independent, Normal
+
+        from armscan.agents.image_replay import replay_for
+        from armscan.agents.policy import clip_action
+        from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
+
         envs, device = training_envs(setup, self.num_envs), setup.compute.torch_device
         actor = network.actor(
             setup.observation_space,

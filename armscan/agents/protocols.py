@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
 from armscan.agents.compute import Compute
-from armscan.agents.policy import Policy
 from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
 from armscan.volumes.plane import FloatArray
+
+if TYPE_CHECKING:
+    from armscan.agents.policy import Policy
 
 VectorEnvFactory = Callable[[int], VectorEnv[Any, Any, Any]]
 

@@ -4,14 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
-
-import torch
-from tianshou.algorithm.algorithm_base import OffPolicyAlgorithm, TrainingStats
-from tianshou.algorithm.modelfree import sac
-from tianshou.algorithm.optim import AdamOptimizerFactory
-from tianshou.data import CollectStatsBase
-from tianshou.trainer import OffPolicyTrainer, OffPolicyTrainerParams
+from typing import TYPE_CHECKING, Any
 
 from armscan.agents.hyperparameters import (
     PolicyParameters,
@@ -22,10 +15,12 @@ from armscan.agents.hyperparameters import (
     number,
     round_up,
 )
-from armscan.agents.image_replay import replay_for
+from armscan.agents.networks import Network
 from armscan.agents.protocols import AgentSetup
-from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
 from armscan.errors import InvalidValueError
+
+if TYPE_CHECKING:
+    from armscan.agents.tianshou_learner import TianshouLearner
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +79,20 @@ class SAC(PolicyParameters):
         check_updates(self.utd_ratio, setup, learning_starts=n_random)
         n_kept = buffer_capacity(self.buffer_size, self.num_envs, setup)
         check_batch(self.batch_size, n_kept, "which is all that training.env_steps leaves to draw from")
+        return self._learner(setup, network, n_random=n_random, n_collected=n_collected, n_kept=n_kept)
+
+    def _learner(
+        self, setup: AgentSetup, network: Network, *, n_random: int, n_collected: int, n_kept: int
+    ) -> TianshouLearner:
+        import torch
+        from tianshou.algorithm.modelfree import sac
+        from tianshou.algorithm.optim import AdamOptimizerFactory
+        from tianshou.trainer import OffPolicyTrainerParams
+
+        from armscan.agents.even_updates import EvenUpdatesTrainer
+        from armscan.agents.image_replay import replay_for
+        from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
+
         envs, device = training_envs(setup, self.num_envs), setup.compute.torch_device
         space, n_free = setup.observation_space, len(setup.action_names)
         actor = network.actor(space, n_free, log_std=None)
@@ -122,36 +131,3 @@ class SAC(PolicyParameters):
             parameters=self,
             setup=setup,
         )
-
-
-class EvenUpdatesTrainer(OffPolicyTrainer):
-    """Tianshou's trainer, which would round the gradient steps of every collection by itself, and refuse to have none.
-
-    What is due is counted from the first collection on, so that it follows from the environment steps alone: a
-    training that goes on later takes the same gradient steps as one that was never cut off. No progress bar is shown.
-
-    Args:
-        algorithm: algorithm that is trained.
-        params: parameters of the trainer.
-        learning_starts: environment steps before the first collection.
-    """
-
-    def __init__(
-        self, algorithm: OffPolicyAlgorithm[Any], params: OffPolicyTrainerParams, learning_starts: int
-    ) -> None:
-        super().__init__(algorithm, params)
-        self._learning_starts = learning_starts
-
-    def _update_step(self, collect_stats: CollectStatsBase) -> TrainingStats:
-        """Take the gradient steps that are due since the collection before; returns the last one's figures."""
-        collector = self.params.training_collector
-        n_env_steps = collector.collect_step - self._learning_starts
-        n_due = self._n_due(n_env_steps) - self._n_due(n_env_steps - collect_stats.n_collected_steps)
-        stats = TrainingStats()
-        for _ in range(n_due):
-            stats = self._sample_and_update(collector.buffer)
-        return stats
-
-    def _n_due(self, n_env_steps: int) -> int:
-        # Rounded: products that are whole come out as just below it here and there.
-        return round(self.params.update_step_num_gradient_steps_per_sample * n_env_steps)

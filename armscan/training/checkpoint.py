@@ -11,8 +11,6 @@ import re
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-import torch
-
 from armscan.errors import CheckpointError
 from armscan.utils.files import atomic_write
 
@@ -29,6 +27,7 @@ def save_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) ->
         state: state of the learner.
         facts: numbers and texts about it, such as how many steps it has taken.
     """
+    import torch
 
     def write(file: BinaryIO) -> None:
         # Summed up from the file, so that a large replay buffer is never in memory as one file beside itself.
@@ -53,6 +52,8 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         CheckpointError: if the file is missing, damaged, of a newer armscan, or something else.
     """
+    import torch
+
     try:
         with path.open("rb") as file:
             loaded = torch.load(_verified(file, path), map_location="cpu", weights_only=True)
@@ -79,6 +80,8 @@ def load_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         CheckpointError: as `load_checkpoint` does, or if it holds something else, or weights that are not finite.
     """
+    import torch
+
     weights, facts = load_checkpoint(path)
     if not isinstance(weights, dict) or not isinstance(facts, dict):
         raise CheckpointError(f"{path}: holds no weights")

@@ -6,7 +6,7 @@ import torch
 from gymnasium import spaces
 
 from armscan.agents import MLP, SAC, Compute, Multimodal, NetworkByObservation
-from armscan.agents.multimodal import MultimodalBody, smallest_side_px
+from armscan.agents.convolutions import smallest_side_px
 from armscan.envs import EnvFactory, SliceChannelsObservation, SliceObservation
 from armscan.errors import InvalidValueError
 from tests.agents.conftest import SMALL_MULTIMODAL, SMALL_SAC, setup_for
@@ -82,7 +82,7 @@ def test_multimodal_is_the_published_network():
         "memory": spaces.Box(-1, 1, (6,)),
         "reward": spaces.Box(-1, 0, (4, 1)),
     }
-    body = MultimodalBody(Multimodal(), spaces.Dict(boxes), n_action=2)
+    body = Multimodal().body(spaces.Dict(boxes), n_action=2)
     shapes = [tuple(layer.weight.shape) for layer in body.modules() if hasattr(layer, "weight")]
     assert shapes[:3] == [(32, 12, 8, 8), (64, 32, 4, 4), (64, 64, 3, 3)]
     # Stacked actions and rewards, the memory, and the action that a critic judges.
@@ -91,7 +91,7 @@ def test_multimodal_is_the_published_network():
 
 def test_multimodal_brings_labels_to_0_to_1(phantom):
     space = space_of(phantom, SliceObservation(shape=(36, 36)))
-    body = MultimodalBody(SMALL_MULTIMODAL, space)
+    body = SMALL_MULTIMODAL.body(space)
     seen = []
     body.convolutions["slice"].register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
     observation = {name: np.repeat(box.high[None], 5, axis=0) for name, box in space.items()}

@@ -1,0 +1,42 @@
+"""Tianshou's off-policy trainer, with a fractional update-to-data ratio."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tianshou.algorithm.algorithm_base import OffPolicyAlgorithm, TrainingStats
+from tianshou.data import CollectStatsBase
+from tianshou.trainer import OffPolicyTrainer, OffPolicyTrainerParams
+
+
+class EvenUpdatesTrainer(OffPolicyTrainer):
+    """Tianshou's trainer, which would round the gradient steps of every collection by itself, and refuse to have none.
+
+    What is due is counted from the first collection on, so that it follows from the environment steps alone: a
+    training that goes on later takes the same gradient steps as one that was never cut off. No progress bar is shown.
+
+    Args:
+        algorithm: algorithm that is trained.
+        params: parameters of the trainer.
+        learning_starts: environment steps before the first collection.
+    """
+
+    def __init__(
+        self, algorithm: OffPolicyAlgorithm[Any], params: OffPolicyTrainerParams, learning_starts: int
+    ) -> None:
+        super().__init__(algorithm, params)
+        self._learning_starts = learning_starts
+
+    def _update_step(self, collect_stats: CollectStatsBase) -> TrainingStats:
+        """Take the gradient steps that are due since the collection before; returns the last one's figures."""
+        collector = self.params.training_collector
+        n_env_steps = collector.collect_step - self._learning_starts
+        n_due = self._n_due(n_env_steps) - self._n_due(n_env_steps - collect_stats.n_collected_steps)
+        stats = TrainingStats()
+        for _ in range(n_due):
+            stats = self._sample_and_update(collector.buffer)
+        return stats
+
+    def _n_due(self, n_env_steps: int) -> int:
+        # Rounded: products that are whole come out as just below it here and there.
+        return round(self.params.update_step_num_gradient_steps_per_sample * n_env_steps)

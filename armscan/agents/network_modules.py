@@ -1,0 +1,56 @@
+"""Modules of actors and critics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gymnasium import spaces
+from tianshou.utils.net.common import ModuleWithVectorOutput, Net
+from tianshou.utils.net.continuous import ContinuousActorProbabilistic as Actor
+from tianshou.utils.net.continuous import ContinuousCritic
+from torch import nn
+
+
+def mlp_body(space: spaces.Space[Any], hidden_sizes: list[int], activation: str, n_action: int = 0) -> Net:
+    """Return fully connected layers for flat observations, and beside them actions with `n_action` components.
+
+    Args:
+        space: space of one observation.
+        hidden_sizes: units of each hidden layer.
+        activation: name of the layer of `torch.nn` after each of them.
+        n_action: components of the action that a critic judges. Default: 0, none.
+    """
+    return Net(
+        state_shape=space.shape or (),
+        action_shape=n_action,
+        hidden_sizes=hidden_sizes,
+        activation=getattr(nn, activation),
+        concat=n_action > 0,
+    )
+
+
+def mlp_critic(body: Net) -> nn.Module:
+    """Return a critic of fully connected layers."""
+    return init_linear(ContinuousCritic(preprocess_net=body))
+
+
+def gaussian_actor(body: ModuleWithVectorOutput, n_free: int, log_std: float | None) -> Actor:
+    """Return a Gaussian actor whose actions are near 0 at first; see `Network.actor`."""
+    actor = Actor(preprocess_net=body, action_shape=(n_free,), unbounded=True, conditioned_sigma=log_std is None)
+    if log_std is not None:
+        nn.init.constant_(actor.get_parameter("sigma_param"), log_std)
+    init_linear(actor)
+    # Andrychowicz et al. 2020 (arXiv:2006.05990), figure 24.
+    for name, weights in actor.mu.named_parameters():
+        if name.endswith("weight"):
+            weights.data.mul_(0.01)
+    return actor
+
+
+def init_linear(module: nn.Module) -> nn.Module:
+    """Initialise linear layers with orthogonal weights and no bias; returns the module."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.orthogonal_(layer.weight, gain=2**0.5)
+            nn.init.zeros_(layer.bias)
+    return module
