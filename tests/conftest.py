@@ -24,7 +24,7 @@ settings.load_profile("armscan")
 
 DATA = Path(__file__).parent / "data"
 # Tests that start servers, clusters or browsers, or compare six real runs, are left to `make test-full`.
-FULL_FIXTURES = {"postgres_programs", "small_disk", "cluster", "look", "browser", "runs"}
+FULL_FIXTURES = {"postgres_programs", "artifacts_disk", "cluster", "look", "browser", "runs"}
 # Fixtures that take seconds to make and are shared by a module: its tests that use one run on one worker.
 SHARED_FIXTURES = ("runs", "made", "server", "cluster")
 

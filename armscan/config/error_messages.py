@@ -11,6 +11,7 @@ from yaml import YAMLError
 
 from armscan.config.legacy import rename_hint
 from armscan.errors import ArmscanError, listed
+from armscan.utils.files import FULL_DISK
 
 
 def one_line_message(error: BaseException) -> str | None:
@@ -41,6 +42,8 @@ def one_line_message(error: BaseException) -> str | None:
             return f"a file of the configuration cannot be read: {text}"
         case OSError() if error.filename is not None:
             return f"{error.filename}: {error.strerror}"
+        case OSError() if error.errno in FULL_DISK:
+            return f"a file cannot be written: {error.strerror}"
     return None
 
 

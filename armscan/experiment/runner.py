@@ -10,6 +10,7 @@ import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -39,8 +40,10 @@ from armscan.utils.files import (
     LAST_CHECKPOINT,
     LEARNING_CURVE_FILE,
     VIDEO_FILE,
+    atomic_write,
     check_free,
     folder_lock,
+    named_if_full,
 )
 
 # First seeds of the episodes that are played for each purpose, so that none is played for two.
@@ -90,7 +93,8 @@ def run_tracked(
     """
     tell = partial(print, *([f"[{job_label}]"] if job_label else []), flush=True)
     tell(f"run {tracked.run_id}: {tracked.name}")
-    with _resume_hint_on_error(tracked.run_id, tracking_uri, folder, is_told=job_label is None), tracked:
+    hint = _resume_hint_on_error(tracked.run_id, tracking_uri, folder, is_told=job_label is None)
+    with hint, tracked, named_if_full(folder):
         result = None
         if isinstance(setup.agent, Learner):
             at_once, every = setup.agent.env_steps_at_once, setup.budget.eval_every_env_steps
@@ -161,7 +165,7 @@ def keep_results(
 def write_evaluations(evaluations: Mapping[str, Evaluation], folder: Path) -> None:
     """Write evaluations with all their episodes into a run's folder, by the name of their volumes."""
     contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
-    (folder / EVALUATION_FILE).write_text(json.dumps(contents, indent=1))
+    atomic_write(folder / EVALUATION_FILE, methodcaller("write", json.dumps(contents, indent=1).encode()))
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ uploaded twice, because only the answer was lost, changes nothing in the store.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -22,7 +23,14 @@ from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, TrackingError
 from armscan.tracking.notes import NOTES_FOLDER, Note, forget
-from armscan.utils.files import OUTBOX_FOLDER, OUTBOX_SUFFIXES, atomic_write, cache_folder, truncate_torn_line
+from armscan.utils.files import (
+    OUTBOX_FOLDER,
+    OUTBOX_SUFFIXES,
+    atomic_write,
+    cache_folder,
+    named_if_full,
+    truncate_torn_line,
+)
 from armscan.utils.processes import ProcessInfo
 
 Entry = dict[str, Any]
@@ -195,10 +203,12 @@ class Outbox(OutboxFile):
             self.added.add(file_and_place(entry["file"])[0])
         with self._adding:
             size = os.fstat(self._appending.fileno()).st_size
-            if self._appending.write(line) != len(line):
+            with named_if_full(self.file):
+                n_written = self._appending.write(line)
+            if n_written != len(line):
                 # A full disk; half a line would be in the way of the next.
                 os.truncate(self._appending.fileno(), size)
-                raise OSError(f"{self.file}: cannot be written to: no space is left")
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.file))
 
     def mark(self, channel: Channel, end: int) -> None:
         """Note how far a channel is uploaded."""

@@ -191,10 +191,15 @@ class TrackedRun:
         """Close the run: FINISHED, KILLED where it was interrupted, FAILED after any other error."""
         if error is None:
             self.end("FINISHED")
-        elif is_interruption(error):
-            self.end("KILLED", reason="interrupted", wait_s=SHORT_WAIT_S)
-        else:
-            self.end("FAILED", reason=repr(error))
+            return
+        try:
+            if is_interruption(error):
+                self.end("KILLED", reason="interrupted", wait_s=SHORT_WAIT_S)
+            else:
+                self.end("FAILED", reason=repr(error))
+        # A full disk that has ended the run: its error is the one to tell, and the next start ends the run.
+        except OSError as failure:
+            log(f"run {self.run_id}: its end is not noted ({failure.strerror})")
 
     def go_on(self) -> None:
         """Mark the run as RUNNING again, also if it was ended after its last process had died."""

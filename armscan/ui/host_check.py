@@ -1,10 +1,10 @@
-"""Who may ask a server of this machine: only pages of its own address."""
+"""Who may ask a server of this machine, and what the files that it serves may do in a browser."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
@@ -13,10 +13,12 @@ if TYPE_CHECKING:
 # Of requests that browsers send for another page without asking the server first.
 FROM_ELSEWHERE = ("cross-site", "same-site")
 SAFE_METHODS = ("GET", "HEAD")
+# Of files that anybody may have put into a study: scripts in them do not run, and no type is guessed.
+ARTIFACTS, SANDBOX = "/artifacts/", (("Content-Security-Policy", "sandbox"), ("X-Content-Type-Options", "nosniff"))
 
 
 class HostCheck:
-    """A WSGI application that refuses requests for other hosts, and those of other pages.
+    """A WSGI application that refuses requests for other hosts, and those of other pages; artifacts are sandboxed.
 
     Without it, any web page could read and delete studies: by DNS rebinding, its own name leads to this machine.
     MLflow's server has the same check.
@@ -32,7 +34,8 @@ class HostCheck:
     def __call__(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         """Answer a request; 403 if it is refused."""
         if self._is_allowed(environ):
-            return self._application(environ, start_response)
+            is_artifact = environ.get("PATH_INFO", "").startswith(ARTIFACTS)
+            return self._application(environ, _sandboxed(start_response) if is_artifact else start_response)
         body = f"403: this server answers only {', '.join(self._hosts)}, and only pages of its own\n".encode()
         start_response("403 Forbidden", [("Content-Type", "text/plain"), ("Content-Length", str(len(body)))])
         return [body]
@@ -44,3 +47,12 @@ class HostCheck:
         is_safe = environ["REQUEST_METHOD"] in SAFE_METHODS
         is_from_elsewhere = not is_safe and environ.get("HTTP_SEC_FETCH_SITE") in FROM_ELSEWHERE
         return not is_from_elsewhere and all(any(fnmatchcase(name, host) for host in self._hosts) for name in named)
+
+
+def _sandboxed(start_response: StartResponse) -> StartResponse:
+    """Return what starts an answer with the headers of `SANDBOX`."""
+
+    def start(status: str, headers: list[tuple[str, str]], *error: Any) -> Any:
+        return start_response(status, [*headers, *SANDBOX], *error)
+
+    return start

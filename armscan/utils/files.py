@@ -44,6 +44,8 @@ OUTBOX_FOLDER = "tracking"
 OUTBOX_SUFFIXES = (".delivered.json", ".lock", ".jsonl")
 RUN_ID = "[0-9a-f]" * 32
 UNFINISHED = "unfinished"
+# No space is left, or none that this user may take.
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
 # How the address of a database in a file begins.
 SQLITE_PREFIX = "sqlite:///"
 
@@ -72,16 +74,43 @@ def atomic_write(path: Path, write: Callable[[BinaryIO], object]) -> None:
     path = path.resolve()
     unfinished = _unfinished(path)
     try:
-        with unfinished.open("wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        if path.exists():
-            shutil.copymode(path, unfinished)
-        unfinished.replace(path)
+        with named_if_full(path):
+            with unfinished.open("wb") as file:
+                write(file)
+                file.flush()
+                os.fsync(file.fileno())
+            if path.exists():
+                shutil.copymode(path, unfinished)
+            unfinished.replace(path)
         _sync_folder(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def named_if_full(path: Path) -> Iterator[None]:
+    """Name what is written in the error of a full disk, which only says so itself where a file is opened.
+
+    Args:
+        path: a file, or the folder of several.
+
+    Raises:
+        OSError: with the path, in the place of any error that a full disk has led to.
+    """
+    try:
+        yield
+    except Exception as error:
+        full = _full_disk(error)
+        if full is None or full.filename is not None:
+            raise
+        raise OSError(full.errno, full.strerror, str(path)) from error
+
+
+def _full_disk(error: BaseException | None) -> OSError | None:
+    """Return the error of a full disk that an error is, or that it came of; None if there is none."""
+    while error is not None and not (isinstance(error, OSError) and error.errno in FULL_DISK):
+        error = error.__cause__ or error.__context__
+    return error
 
 
 def check_writable(path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import subprocess
 import sys
 import threading
 import time
@@ -20,8 +19,8 @@ from armscan.tracking.client import reason_in, why_away
 from armscan.tracking.notes import notes
 from armscan.tracking.outbox import file_of
 from armscan.utils.files import cache_folder
+from tests.support.disks import small_disk
 from tests.support.mlflow_server import mlflow_server
-from tests.support.requirements import unavailable
 from tests.support.waiting import HANG_S, wait_until
 
 N_EPOCHS = 30
@@ -225,21 +224,15 @@ def test_figures_are_kept_where_files_cannot_be_because_the_disk_is_full(tmp_pat
 
 
 @pytest.fixture
-def small_disk(tmp_path):
-    """A folder on a disk of its own, of 256 KiB; and what makes that larger."""
-    folder = tmp_path / "server" / "artifacts"
-    folder.mkdir(parents=True)
-    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(folder)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
-        unavailable("a small disk cannot be mounted here: it needs root")
-    yield folder, lambda: subprocess.run(["mount", "-o", "remount,size=16m", str(folder)], check=True)
-    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+def artifacts_disk(tmp_path):
+    """A disk for the server's artifacts, of 256 KiB."""
+    with small_disk(tmp_path / "server" / "artifacts", "256k") as disk:
+        yield disk
 
 
-def test_run_ends_where_the_servers_disk_is_full_and_its_files_are_delivered_later(small_disk, tmp_path, capfd):
-    artifacts, make_larger = small_disk
+def test_run_ends_where_the_servers_disk_is_full_and_its_files_are_delivered_later(artifacts_disk, tmp_path, capfd):
     with mlflow_server(tmp_path / "server", f"sqlite:///{tmp_path}/runs.db") as server:
-        assert server.artifacts == artifacts
+        assert server.artifacts == artifacts_disk.folder
         store, experiment_id = open_store(server.uri, experiment="test", artifacts="-", wait_s=20.0)
         tracked = begun((store, experiment_id), tmp_path / "run")
         weights = tmp_path / "run" / "best.pt"
@@ -251,7 +244,7 @@ def test_run_ends_where_the_servers_disk_is_full_and_its_files_are_delivered_lat
         assert histories(server.uri, tracked.run_id) == {"x": [(7, 1.0)]}
         client = MlflowClient(server.uri)
         assert client.get_run(tracked.run_id).info.status == "FINISHED"
-        make_larger()
+        artifacts_disk.enlarge("16m")
         assert main(["runs", "sync", str(tmp_path / "run")]) == 0
         kept = client.download_artifacts(tracked.run_id, "best.pt", str(tmp_path))
         assert Path(kept).read_bytes() == weights.read_bytes()

@@ -1,5 +1,6 @@
 """Files that are there whole or not at all, and folders that one process holds."""
 
+import errno
 import subprocess
 import sys
 
@@ -76,3 +77,19 @@ def test_folder_is_free_again_when_its_process_was_killed(tmp_path):
     process.wait()
     with folder_lock(tmp_path):
         atomic_write(tmp_path / "a", lambda file: file.write(b"x"))
+
+
+@pytest.mark.parametrize("is_hidden", [False, True], ids=["itself", "behind another"])
+def test_error_of_a_full_disk_names_the_file(tmp_path, is_hidden):
+    full = OSError(errno.ENOSPC, "No space left on device")
+
+    def write(file):
+        if is_hidden:
+            # As libraries do that write an archive's end to a full disk.
+            raise RuntimeError("unexpected pos") from full
+        raise full
+
+    with pytest.raises(OSError, match="No space left on device") as named:
+        atomic_write(tmp_path / "a", write)
+    assert named.value.filename == str(tmp_path / "a")
+    assert list(tmp_path.iterdir()) == []

@@ -75,7 +75,8 @@ class StudyState:
         now, busy_s, until = datetime.now(), 0.0, datetime.min
         spans = [(trial.datetime_start, trial.datetime_complete or now) for trial in self.all if trial.datetime_start]
         for start, end in sorted(spans):
-            if end > until:
+            # Not so where the clock was turned back meanwhile.
+            if end > max(start, until):
                 busy_s += (end - max(start, until)).total_seconds()
                 until = end
         return busy_s / 3600

@@ -20,8 +20,8 @@ from armscan.errors import StorageAwayError
 from armscan.utils.retry import RetryPolicy
 
 T = TypeVar("T")
-# Of a SQLite file that another process has locked, or that cannot be read for now.
-AWAY_IN_SQLITE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_IOERR")
+# Of a SQLite file that another process has locked, that cannot be read for now, or whose disk is full.
+AWAY_IN_SQLITE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_IOERR", "SQLITE_FULL")
 # One of a PostgreSQL database's advisory locks.
 ADVISORY_LOCK = 0xA235CA
 # A lost machine holds the lock for so long, until its connection is closed.

@@ -10,6 +10,7 @@ import re
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import BaseJournalBackend
 from optuna.storages.journal._storage import JournalOperation
 
-from armscan.errors import StudyError
-from armscan.utils.files import truncate_torn_line
+from armscan.errors import StorageAwayError, StudyError
+from armscan.utils.files import FULL_DISK, truncate_torn_line
+from armscan.utils.retry import RetryPolicy
 
 # How every line of a journal begins.
 BEGINNING = b'{"op_code"'
@@ -56,6 +58,10 @@ def open_journal(path: Path, *, is_written: bool) -> JournalStorage:
         raise StudyError(f"that file is no journal of Optuna: {error}") from error
 
 
+def _why_full(error: BaseException) -> str | None:
+    return error.strerror if isinstance(error, OSError) and error.errno in FULL_DISK else None
+
+
 @dataclass(frozen=True)
 class Position:
     """A position between two lines of a journal.
@@ -86,6 +92,7 @@ class JournalFile(BaseJournalBackend):
         self._n_studies = self._n_trials = 0
         self.lock_file = path.with_name(f".{path.name}.lock")
         self._lock = FileLock(self.lock_file)
+        self._retry_policy = RetryPolicy("the storage", f"study.storage is {str(path)!r}", _why_full, StorageAwayError)
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -114,7 +121,10 @@ class JournalFile(BaseJournalBackend):
                 yield operation
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """See `BaseJournalBackend`."""
+        """See `BaseJournalBackend`; a full disk is waited for as a database that is away."""
+        self._retry_policy.call(partial(self._append, logs))
+
+    def _append(self, logs: list[dict[str, Any]]) -> None:
         with self.locked():
             # Others may have appended some since.
             total = [self._read, *(position for _, position in self._lines())][-1].sum
@@ -123,10 +133,16 @@ class JournalFile(BaseJournalBackend):
                 line = json.dumps(operation, separators=(",", ":")).encode()[:-1]
                 total = zlib.crc32(line, total)
                 lines.append(b'%b,"sum":"%08x"}\n' % (line, total))
-            with self._path.open("ab") as file:
-                file.write(b"".join(lines))
-                file.flush()
-                os.fsync(file.fileno())
+            end = self._path.stat().st_size
+            try:
+                with self._path.open("ab") as file:
+                    file.write(b"".join(lines))
+                    file.flush()
+                    os.fsync(file.fileno())
+            except OSError:
+                # Some lines may be there on a full disk, and all are written again.
+                os.truncate(self._path, end)
+                raise
 
     def _lines(self) -> Iterator[tuple[bytes, Position]]:
         """Iterate over the whole lines that have not been read, each with the position behind it."""

@@ -1,0 +1,71 @@
+"""Disks that are full under a run's folder, and under its tracking store."""
+
+import sqlite3
+import subprocess
+import sys
+
+import pytest
+
+from tests.experiment.test_resume import COMMAND, LONGER, after_epochs, assert_ended_alike, finish
+from tests.support.disks import small_disk
+from tests.support.waiting import HANG_S, wait_until
+from tests.test_run import armscan_run, runs_in
+
+pytestmark = pytest.mark.slow
+FULL = "No space left on device"
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A disk of 20 MB."""
+    with small_disk(tmp_path / "disk", "20m") as disk:
+        yield disk
+
+
+def run_until_full(disk, *words, cwd):
+    """Runs the command, fills the disk after its first epoch; returns its exit code and what it has printed."""
+    printed, told = cwd / "printed", cwd / "told"
+    with printed.open("w") as output, told.open("w") as errors:
+        process = subprocess.Popen([sys.executable, *COMMAND, *words], cwd=cwd, stdout=output, stderr=errors)
+    wait_until(lambda: after_epochs(1)(printed.read_text()), process=process, log=told.read_text, poll_s=0.01)
+    disk.fill()
+    return process.wait(HANG_S), printed.read_text(), told.read_text()
+
+
+def test_run_whose_folder_is_full_ends_in_one_line_and_goes_on_when_there_is_space(disk, tmp_path):
+    code, _, told = run_until_full(disk, *LONGER, f"hydra.run.dir={disk.folder}/run", cwd=tmp_path)
+    assert code == 2, told
+    (run,) = runs_in(tmp_path)[1]
+    hint, line = told.splitlines()
+    assert hint == f"resume with: python -m armscan.run resume={run.info.run_id}"
+    assert line.startswith(f"error: {disk.folder}/run")
+    assert line.endswith(f": {FULL}")
+    disk.empty()
+    finish(run.info.run_id, tmp_path)
+    assert armscan_run(*LONGER, cwd=tmp_path).returncode == 0
+    assert_ended_alike(tmp_path)
+
+
+def test_run_goes_on_while_the_disk_of_its_store_is_full_and_sync_delivers_the_rest(disk, tmp_path):
+    words = [*LONGER, f"tracking.uri=sqlite:///{disk.folder}/mlruns.db", "tracking.wait_s=2"]
+    code, printed, told = run_until_full(disk, *words, cwd=tmp_path)
+    assert (code, told) == (0, "")
+    assert "cannot be reached or written to" in printed
+    assert "delivers the rest" in printed
+    with sqlite3.connect(disk.folder / "mlruns.db") as database:
+        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    refused = armscan_run(*LONGER, f"tracking.uri=sqlite:///{disk.folder}/other.db", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert len(refused.stderr.splitlines()) == 1
+    assert refused.stderr.startswith(f"error: tracking.uri is 'sqlite:///{disk.folder}/other.db', but ")
+    disk.empty()
+    synced = subprocess.run(
+        [sys.executable, "-m", "armscan", "runs", "sync", "outputs"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert synced.returncode == 0, synced.stdout + synced.stderr
+    assert armscan_run(*words, cwd=tmp_path).returncode == 0
+    assert_ended_alike(disk.folder)

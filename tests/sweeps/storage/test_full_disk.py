@@ -1,0 +1,78 @@
+"""Disks that are full under the storage of a study: it waits, and no trial is lost or run twice."""
+
+import multiprocessing
+
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from armscan.errors import StorageAwayError
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import Limits
+from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.study import make_study
+from armscan.utils import retry
+from tests.support.disks import small_disk
+from tests.support.waiting import HANG_S, wait_until
+from tests.sweeps.scheduling.test_scheduler import work
+from tests.sweeps.study.test_study import settings
+
+pytestmark = pytest.mark.full
+N_TRIALS = 40
+FULL = ("No space left on device", "database or disk is full")
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A disk of 20 MB."""
+    with small_disk(tmp_path / "disk", "20m") as disk:
+        yield disk
+
+
+@pytest.fixture(params=["{}/a.journal", "sqlite:///{}/a.db"], ids=["journal", "sqlite"])
+def uri(request, disk):
+    return request.param.format(disk.folder)
+
+
+def test_study_waits_while_its_disk_is_full_and_loses_no_trial(disk, uri, capfd):
+    def make_scheduler(**limits):
+        storage = open_storage(uri)
+        study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
+        return TrialScheduler(study, storage, Limits(**limits))
+
+    scheduler, context = make_scheduler(n_trials=N_TRIALS), multiprocessing.get_context("fork")
+    workers = [context.Process(target=work, args=(make_scheduler, N_TRIALS)) for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    wait_until(lambda: len(scheduler.state().finished) >= 10)
+    told = []
+
+    def is_waiting():
+        # One worker at least: it may hold the lock that the other waits for.
+        told.append(capfd.readouterr().out)
+        return any(f"the storage is away ({reason}): waiting" in "".join(told) for reason in FULL)
+
+    disk.fill()
+    wait_until(is_waiting)
+    disk.empty()
+    for worker in workers:
+        worker.join(HANG_S)
+    assert [worker.exitcode for worker in workers] == [0, 0]
+    trials = make_scheduler(n_trials=N_TRIALS).study.trials
+    assert [trial.state for trial in trials] == [TrialState.COMPLETE] * N_TRIALS
+    assert len({trial.params["x"] for trial in trials}) == N_TRIALS
+
+
+def test_study_on_a_disk_that_stays_full_is_answered_in_one_line(disk, uri, monkeypatch):
+    make_study(open_storage(uri), settings(storage=uri), {})
+    monkeypatch.setattr(retry, "RETRY_S", 0.5)
+    storage = open_storage(uri)
+    study = make_study(storage, settings(storage=uri), {})
+    disk.fill()
+    with pytest.raises(StorageAwayError) as given_up:
+        study.set_user_attr("note", "x" * 2**20)
+    line = str(given_up.value)
+    assert line.startswith(f"study.storage is '{uri}', but it has been away for 0.5 s: ")
+    assert line.endswith(FULL)
+    disk.empty()
+    assert make_study(open_storage(uri), settings(storage=uri), {}).trials == []
