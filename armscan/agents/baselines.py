@@ -56,7 +56,8 @@ class Exhaustive:
     with the best reward.
 
     Components that are free but not swept are held at 0 degrees or 0 mm: the plane straight across the arm with the
-    whole hand in the picture. (The middle of tx, normalised 0, would push half of the hand out of it.)
+    whole hand in the picture. (The middle of tx, normalised 0, would push half of the hand out of it.) It never stops
+    an episode by itself.
 
     Raises:
         InvalidValueError: if a value is impossible.
@@ -91,7 +92,7 @@ class Exhaustive:
             InvalidValueError: if a component to be swept is not free, or more than two are.
         """
         free = setup.action_names
-        swept = free if self.swept is None else tuple(name for name in COMPONENTS if name in self.swept)
+        swept = tuple(name for name in COMPONENTS if name in (free if self.swept is None else self.swept))
         if fixed := [name for name in swept if name not in free]:
             raise InvalidValueError(
                 f"agent.swept is {list(swept)}, but {listed(fixed)} is not free; projection leaves only "

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from armscan.agents.protocols import AgentSetup
-from armscan.envs.actions import ActionBounds
+from armscan.envs.actions import STOP, ActionBounds
 from armscan.envs.rules import Observed
 from armscan.utils.validation import check_choice, check_int
 from armscan.volumes.plane import FloatArray
@@ -73,7 +73,7 @@ class OptunaAgent:
         if self._trial is not None:
             self._study.tell(self._trial, reward)
         self._trial = trial = self._study.ask()
-        return np.array([trial.suggest_float(name, -1.0, 1.0) for name in self._names])
+        return np.array([-1.0 if name == STOP else trial.suggest_float(name, -1.0, 1.0) for name in self._names])
 
 
 def _sampler(search: OptunaSearch, seed: int) -> BaseSampler:

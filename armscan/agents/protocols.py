@@ -84,7 +84,7 @@ class AgentSetup:
     Args:
         make_envs: factory of the requested number of training environments, without autoreset.
         observation_space: observation space of one environment.
-        action_names: names of the free components of an action, in order, such as `("rz", "ty")`.
+        action_names: names of the components of an action, in order, such as `("rz", "ty")`, or `("rz", "ty", "stop")`.
         total_env_steps: budget of the training in environment steps.
         seed: seed of the environments, networks and replay buffer.
         compute: device and precision of the tensors.

@@ -56,10 +56,10 @@ class TianshouVectorEnv(BaseVectorEnv):
     def step(self, action: Any, id: Ids = None) -> tuple[Any, ...]:  # noqa: A002
         """Take a step in all environments."""
         assert id is None or len(np.atleast_1d(id)) == self.env_num, "the environments are only stepped all at once"
-        observations, rewards, terminated, truncated, _ = self._envs.step(np.asarray(action))
-        # Nothing but success terminates an episode.
-        self.n_ended += int(np.count_nonzero(terminated | truncated))
-        self.n_successes += int(np.count_nonzero(terminated))
+        observations, rewards, terminated, truncated, infos = self._envs.step(np.asarray(action))
+        has_ended = terminated | truncated
+        self.n_ended += int(np.count_nonzero(has_ended))
+        self.n_successes += int(np.count_nonzero(has_ended & infos["is_success"]))
         return _batched(observations), rewards, terminated, truncated, self._no_info(np.arange(self.env_num))
 
     def seed(self, seed: int | list[int] | None = None) -> list[list[int] | None]:

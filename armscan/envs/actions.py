@@ -19,6 +19,8 @@ PROJECTIONS: dict[str, tuple[str, ...]] = {
     "zy": ("rz", "ty"),
     "full": COMPONENTS,
 }
+# The component, after those of the plane, by which an agent ends an episode where `ends` is `on_stop`: above 0.
+STOP = "stop"
 MAX_TRANSLATION_MM = 1e6
 
 

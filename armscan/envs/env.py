@@ -9,7 +9,6 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from armscan.envs.actions import COMPONENTS
 from armscan.envs.episode import Episode, begin, check_actions, info_of, look, wanted_volume
 from armscan.envs.rules import Observed, Rules, Volumes
 from armscan.envs.scene import Scene
@@ -30,12 +29,14 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     anew (absolute, not relative to where it was); the slice under it is looked up and its landmarks are clustered.
 
     ## Action space
-    `Box(-1, 1, (n_free,))`: the free components of (rz, rx, tx, ty), normalised. Rotations are a * bound degrees,
+    `Box(-1, 1, (n_action,))`: the free components of (rz, rx, tx, ty), normalised. Rotations are a * bound degrees,
     translations (a + 1) / 2 * bound mm. The components that the projection does not leave free stay at the optimal
-    plane's. Values outside [-1, 1] are clipped; a NaN or infinity, or another shape, raises `InvalidValueError`.
+    plane's. Where the agent ends the episode itself (`ends="on_stop"`), a last component follows, `stop`: above 0, this
+    plane is its answer. Values outside [-1, 1] are clipped; a NaN or infinity, or another shape, raises
+    `InvalidValueError`.
 
     ## Observation space
-    The parts of the chosen observation, then `action`, the last one (n_free), and `reward` (1), of the current slice.
+    The parts of the chosen observation, then `action`, the last one (n_action), and `reward` (1), of the current slice.
     Where all of them are vectors, they come as one flat `Box` of 32-bit floats, otherwise as a `MultiBoxSpace`, a
     `Dict` of boxes; `flat` decides otherwise.
 
@@ -58,11 +59,18 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     -success_threshold: it still takes its first step, and `info["starts_solved"]` says so.
 
     ## Episode end
-    Terminated when the reward is above -success_threshold; truncated after `max_steps` steps.
+    | `ends` | terminated |
+    | --- | --- |
+    | `on_reward` | when the reward is above -success_threshold, on whatever plane |
+    | `on_budget` | never: the agent may look beside the plane that it wants, and is judged by its last one |
+    | `on_stop` | with the plane at which the agent says `stop`, rewarded or not |
+
+    Truncated after `max_steps` steps in any case. `is_success` says of each plane whether its reward is above
+    -success_threshold, so that at an episode's end it says whether this has succeeded.
 
     ## Info
     `volume` (name), `rotation_deg` (rz, rx), `translation_mm` (tx, ty), `counts` (clusters of bones, tendons, artery),
-    `is_success`, `starts_solved`, `action` (free components, normalised), `reward`, and the distance to the optimal
+    `is_success`, `starts_solved`, `action` (the last one, normalised), `reward`, and the distance to the optimal
     plane: `distance_mm` (of the slice's centre, along the optimal normal) and `distance_deg` (between the normals).
 
     Args:
@@ -76,7 +84,8 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
             is fitted to labelled planes, and is not yet, is fitted to those of these volumes.
         targets: clusters of bones, tendons and artery that the published reward wants.
         clustering: `pixels`, as published, `metric`, which serves every spacing, or an `armscan.anatomy.Tissues`.
-        success_threshold: the episode ends above -success_threshold.
+        success_threshold: a plane whose reward is above -success_threshold is a success.
+        ends: what ends an episode before its last step: `on_reward`, `on_budget` (nothing) or `on_stop`.
         max_steps: steps after which an episode is truncated.
         start: `middle` or `random`.
         rotation_bounds_deg: bounds of rz and rx.
@@ -114,8 +123,8 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """The free components of an action, in its order, such as `("rz", "ty")`."""
-        return tuple(COMPONENTS[component] for component in self.rules.free)
+        """The components of an action, in its order, such as `("rz", "ty")`, or `("rz", "ty", "stop")`."""
+        return self.rules.action_names
 
     @property
     def episode(self) -> Episode:
@@ -161,7 +170,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
             raise ResetNeededError("the episode has ended or not begun: call reset() before step()")
         episode.aim(check_actions(action, self.action_space.shape))
         observation, info = self._seen()
-        return observation, episode.view.reward, episode.is_solved, episode.is_truncated, info
+        return observation, episode.view.reward, episode.is_terminated, episode.is_truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture of the current step, shape (512, 860, 3); None in `human`, whose window has it already."""

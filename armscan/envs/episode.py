@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from armscan.envs.observations import View
-from armscan.envs.rules import Rules
+from armscan.envs.rules import ON_REWARD, ON_STOP, Rules
 from armscan.envs.scene import Scene
 from armscan.errors import InvalidValueError, listed
 from armscan.utils.validation import check_choice
@@ -33,14 +33,15 @@ class Episode:
         self.rules = rules
         self.scene = scene
         self.n_steps = -1
-        self.is_solved = self.starts_solved = self.is_truncated = False
+        self.is_solved = self.starts_solved = self.is_terminated = self.is_truncated = False
         self.rewards: list[float] = []
         self.aim(start)
 
     def aim(self, action: FloatArray) -> None:
-        """Place the plane; `action` holds the free components, normalised and within [-1, 1]."""
+        """Place the plane; `action` holds the free components, and `stop` if there is one, all within [-1, 1]."""
         normalised = self.scene.optimum_normalised.tolist()
-        for component, value in zip(self.rules.free, action.tolist(), strict=True):
+        free = self.rules.free
+        for component, value in zip(free, action[: len(free)].tolist(), strict=True):
             normalised[component] = value
         self.action = action
         self._distance: tuple[float, float] | None = None
@@ -55,7 +56,11 @@ class Episode:
         self.is_solved = self.rules.is_solved(view)
         if self.n_steps == 0:
             self.starts_solved = self.is_solved
-        self.is_truncated = not self.is_solved and self.n_steps >= self.rules.max_steps
+        if self.rules.ends == ON_REWARD:
+            self.is_terminated = self.is_solved
+        elif self.rules.ends == ON_STOP:
+            self.is_terminated = bool(self.action[-1] > 0.0)
+        self.is_truncated = not self.is_terminated and self.n_steps >= self.rules.max_steps
 
     @property
     def distance(self) -> tuple[float, float]:
@@ -67,7 +72,7 @@ class Episode:
     @property
     def is_running(self) -> bool:
         """Whether a step can be taken; an episode that starts solved still takes its first."""
-        return self.n_steps == 0 or not (self.is_solved or self.is_truncated)
+        return self.n_steps == 0 or not (self.is_terminated or self.is_truncated)
 
 
 # What `info` holds under each key, and the type of its array, None where it is a text, a number or a truth value.
@@ -99,11 +104,14 @@ def begin(rules: Rules, rngs: Sequence[np.random.Generator], volume_name: str | 
     """
     drawn = [volume_name or rules.names[int(rng.integers(len(rules.names)))] for rng in rngs]
     scenes = rules.draw_scenes(drawn, rngs)
-    n_free = len(rules.free)
-    return [
-        Episode(rules, scene, np.zeros(n_free) if rules.start == "middle" else rng.uniform(-1.0, 1.0, n_free))
-        for scene, rng in zip(scenes, rngs, strict=True)
-    ]
+    return [Episode(rules, scene, _start(rules, rng)) for scene, rng in zip(scenes, rngs, strict=True)]
+
+
+def _start(rules: Rules, rng: np.random.Generator) -> FloatArray:
+    start = np.zeros(len(rules.action_names))
+    if rules.start == "random":
+        start[: len(rules.free)] = rng.uniform(-1.0, 1.0, len(rules.free))
+    return start
 
 
 def look(rules: Rules, episodes: Sequence[Episode]) -> None:

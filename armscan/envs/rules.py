@@ -20,7 +20,7 @@ from armscan.anatomy import (
     check_targets,
     check_tissues,
 )
-from armscan.envs.actions import ActionBounds, free_components
+from armscan.envs.actions import COMPONENTS, STOP, ActionBounds, free_components
 from armscan.envs.observation_registry import with_action_reward
 from armscan.envs.observations import Observation, SliceGeometry, View, observe_all, smallest_shape
 from armscan.envs.scene import RandomTransform, Scene, SceneSampler
@@ -31,6 +31,7 @@ from armscan.volumes import LabelVolume, load_phantoms, read_dataset
 from armscan.volumes.plane import ManipulatorAction
 
 STARTS = ("middle", "random")
+ON_REWARD, ON_BUDGET, ON_STOP = ENDS = ("on_reward", "on_budget", "on_stop")
 DEFAULT_PHANTOMS = range(4)
 MAX_DRAWS = 1000
 NO_ACTION = np.zeros(0)
@@ -54,6 +55,7 @@ class Rules:
         targets: Sequence[int] = PUBLISHED_TARGETS,
         clustering: str | Tissues = "pixels",
         success_threshold: float = 0.05,
+        ends: str = ON_REWARD,
         max_steps: int = 50,
         start: str = "middle",
         rotation_bounds_deg: tuple[float, float] = (180.0, 180.0),
@@ -63,6 +65,7 @@ class Rules:
         self.volumes = named_volumes(volumes)
         self.names = list(self.volumes)
         self.success_threshold = check_float("success_threshold", success_threshold, above=0.0, at_most=1.0)
+        self.ends = check_choice("ends", ends, ENDS)
         self.max_steps = check_int("max_steps", max_steps, at_least=1)
         self.start = check_choice("start", start, STARTS)
         self.tissues = check_tissues(clustering)
@@ -80,13 +83,14 @@ class Rules:
         self._place = {name: place for place, name in enumerate(self.names)}
         self._check_optimal_planes()
         self.free = free_components(projection)
-        self.action_space = spaces.Box(-1.0, 1.0, (len(self.free),), np.float32)
+        self.action_names = (*(COMPONENTS[i] for i in self.free), *([STOP] if ends == ON_STOP else []))
+        self.action_space = spaces.Box(-1.0, 1.0, (len(self.action_names),), np.float32)
         self._geometries = {
             volume.name: SliceGeometry(volume.slice_shape, volume.pixel_mm) for volume in self.volumes.values()
         }
         self._smallest_shape = smallest_shape(list(self._geometries.values()))
         self._observation = with_action_reward(observation, getattr(self.reward, "targets", PUBLISHED_TARGETS))
-        self._boxes = boxes = self._observation.spaces(list(self._geometries.values()), len(self.free))
+        self._boxes = boxes = self._observation.spaces(list(self._geometries.values()), len(self.action_names))
         are_vectors = all(len(box.shape) == 1 for box in boxes.values())
         self._is_flat = are_vectors if flat is None else check_bool("flat", flat)
         self.observation_space: spaces.Box | MultiBoxSpace = (
@@ -138,7 +142,7 @@ class Rules:
         )
 
     def is_solved(self, view: View) -> bool:
-        """Whether a view's reward ends an episode."""
+        """Whether a view's reward is a success."""
         return view.reward > -self.success_threshold
 
     def observe(self, view: View) -> Observed:

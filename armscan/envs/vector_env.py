@@ -102,19 +102,21 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         episodes = [self._episode(i) for i in range(self.num_envs)]
         look(self.rules, episodes)
         rewards = np.array([0.0 if over else e.view.reward for e, over in zip(episodes, is_over, strict=True)])
-        terminated = np.array([episode.is_solved for episode in episodes]) & ~is_over
+        terminated = np.array([episode.is_terminated for episode in episodes]) & ~is_over
         truncated = np.array([episode.is_truncated for episode in episodes]) & ~is_over
         return self._observed(), rewards, terminated, truncated, self._infos(np.arange(self.num_envs))
 
     @property
     def optimal_actions(self) -> FloatArray:
-        """The optimal plane of each current episode: its free components, normalised, shape (num_envs, n_free).
+        """The optimal action of each current episode, normalised, shape (num_envs, n_action), to stop there included.
 
         Privileged: neither observations nor `info` give it, and an agent that looked it up would have nothing to find.
         It is for learning from the labelled planes of training volumes.
         """
         free = list(self.rules.free)
-        return np.array([self._episode(i).scene.optimum_normalised[free] for i in range(self.num_envs)])
+        optima = np.ones((self.num_envs, len(self.rules.action_names)))
+        optima[:, : len(free)] = [self._episode(i).scene.optimum_normalised[free] for i in range(self.num_envs)]
+        return optima
 
     @property
     def _action_shape(self) -> tuple[int, ...]:

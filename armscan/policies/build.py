@@ -17,6 +17,7 @@ import armscan
 from armscan.agents import Learner
 from armscan.agents.policy import Policy, batch_of
 from armscan.agents.torch_export import OBSERVATION
+from armscan.envs.actions import STOP
 from armscan.envs.rules import Observed
 from armscan.errors import ExportError, is_interruption
 from armscan.policies.model import ONNX_FILE, Arrays, arrays_of, model_sha256, write_model
@@ -112,10 +113,13 @@ def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]
         run_id: MLflow run ID.
     """
     rules = config["env"]
-    turns = dict(zip(("rz", "rx"), rules["rotation_bounds_deg"], strict=True))
     ways: dict[str, Any] = {"tx": "the volume's size across", "ty": "the volume's size along the arm"}
     if rules["translation_bounds_mm"] is not None:
         ways = dict(zip(ways, rules["translation_bounds_mm"], strict=True))
+    turns = zip(("rz", "rx"), rules["rotation_bounds_deg"], strict=True)
+    means = {name: f"times {bound} degrees" for name, bound in turns}
+    means |= {name: f"(a + 1) / 2 times {bound}, in mm" for name, bound in ways.items()}
+    means[STOP] = "above 0: the episode ends with this plane"
     return {
         "armscan": armscan.__version__,
         "run": run_id,
@@ -123,10 +127,7 @@ def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]
         "observation": config["obs"],
         "stack": config["stack"],
         "memory": config["memory"],
-        "action": {
-            name: f"times {turns[name]} degrees" if name in turns else f"(a + 1) / 2 times {ways[name]}, in mm"
-            for name in env.get_wrapper_attr("action_names")
-        },
+        "action": {name: means[name] for name in env.get_wrapper_attr("action_names")},
     }
 
 

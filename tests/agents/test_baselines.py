@@ -93,6 +93,17 @@ def test_sweep_holds_the_other_free_components_at_the_plane_straight_across(phan
     assert len(np.unique(swept[:, 3])) == 20
 
 
+@pytest.mark.parametrize("swept", [None, ["ty"]])
+def test_sweep_never_stops_by_itself(phantom, swept):
+    env_factory, _ = ENV_FACTORIES["vector"]
+    agent = Exhaustive(swept=swept, step_mm=20.0).agent(
+        setup_for(env_factory, phantom, action_names=("rz", "ty", "stop"))
+    )
+    seen = planes(agent, 30)
+    assert seen.shape == (30, 3)
+    assert (seen[:, 2] == -1.0).all()
+
+
 def test_sweep_stays_where_a_component_cannot_move(phantom):
     swept = agent_of(Exhaustive(swept=["rz", "ty"]), phantom, "zy").planes(ActionBounds((0.0, 0.0), (10.0, 0.0)))
     np.testing.assert_array_equal(swept, [[0.0, 0.0]])

@@ -58,6 +58,14 @@ def test_search_beats_random_planes_where_the_reward_is_smooth(phantom, sampler,
     assert last["search"] > last["random"] / 2
 
 
+def test_search_never_stops_by_itself(phantom):
+    env_factory, _ = ENV_FACTORIES["vector"]
+    agent = OptunaSearch().agent(setup_for(env_factory, phantom, action_names=("rz", "ty", "stop")))
+    planes, _ = played(agent, 5, seed=0)
+    assert (planes[:, 2] == -1.0).all()
+    assert (np.abs(planes[:, :2]) < 1.0).all()
+
+
 def test_search_is_told_every_reward_but_the_starts(phantom):
     agent = agent_of(OptunaSearch(), phantom, 1)
     _, rewards = played(agent, 5, seed=0)

@@ -47,14 +47,15 @@ def test_tianshou_vector_env_resets_only_those_it_is_asked_for(make):
     np.testing.assert_array_equal(observed[0, -3:-1], [0, 0])
 
 
-def test_tianshou_vector_env_counts_episodes_and_those_that_succeed(make, phantom):
-    envs = make(success_threshold=0.6)
+@pytest.mark.parametrize("ends", ["on_reward", "on_budget", "on_stop"])
+def test_tianshou_vector_env_counts_episodes_and_those_that_succeed(make, phantom, ends):
+    envs = make(success_threshold=0.6, ends=ends)
     envs.reset()
     rng, n_ended, n_successes = np.random.default_rng(0), 0, 0
     for _ in range(12):
-        _, rewards, terminated, truncated, _ = envs.step(rng.uniform(-1, 1, (3, 2)))
+        _, rewards, terminated, truncated, _ = envs.step(rng.uniform(-1, 1, (3, 3 if ends == "on_stop" else 2)))
         is_over = terminated | truncated
-        # An episode succeeds on a rewarded plane, and ends there.
+        # An episode succeeds that ends on a rewarded plane.
         n_ended, n_successes = n_ended + is_over.sum(), n_successes + (rewards[is_over] > -0.6).sum()
         if is_over.any():
             envs.reset(np.flatnonzero(is_over))

@@ -41,6 +41,8 @@ MIXED = {
     "vector": {},
     "remembering": {"projection": "zy", "stack": 3, "memory": 2, "stack_memory": True},
     "image": {"observation": ["cluster", SliceChannelsObservation(shape=SHAPE)], "projection": "full"},
+    "on_budget": {"ends": "on_budget", "projection": "full"},
+    "on_stop": {"ends": "on_stop", "projection": "zy", "stack": 2, "memory": 2, "start": "random"},
     "images": {
         "observation": "slice",
         "stack": 2,
@@ -137,6 +139,13 @@ def make_mixed(wrist, variant, **changes):
     return gym.make(armscan.ENV_ID, **{"volumes": [wrist], "max_steps": 3} | MIXED[variant] | changes)
 
 
+@pytest.mark.parametrize("variant", ["on_budget", "on_stop"])
+def test_env_conforms_where_the_last_plane_is_judged(wrist, variant):
+    env = make_mixed(wrist, variant)
+    check_env(Presented(env), skip_render_check=True)
+    assert data_equivalence(play(pickle.loads(pickle.dumps(env))), play(env), exact=True)
+
+
 def test_env_conforms_where_it_is_drawn(wrist, unseen_windows):
     """What the checker wants of pictures; the one check that costs too much to run over every combination."""
     check_env(Presented(make_mixed(wrist, "images", render_mode="rgb_array")))
@@ -205,7 +214,7 @@ def test_gymnasium_records_a_video_of_it(wrist, variant, tmp_path):
     assert [path.stat().st_size > 1000 for path in tmp_path.glob("film/*.mp4")] == [True]
 
 
-@pytest.mark.parametrize("variant", ["vector", "remembering", "image"])
+@pytest.mark.parametrize("variant", ["vector", "remembering", "image", "on_budget", "on_stop"])
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_vector_env_conforms(wrist, env_id, variant):
     """Its spaces and shapes; that it gives what single environments give is tested beside it."""

@@ -85,6 +85,52 @@ def test_env_does_not_truncate_a_success_on_the_last_step(phantom):
     assert env.step(env.scene.optimum_normalised[3:])[2:4] == (True, False)
 
 
+def test_env_on_budget_goes_on_after_a_rewarded_plane_and_judges_the_last(phantom):
+    env = ArmscanEnv([phantom], projection="full", ends="on_budget", max_steps=3)
+    for last_is_optimal in (True, False):
+        env.reset(seed=0)
+        optimum, beside = env.scene.optimum_normalised, np.full(4, -1.0)
+        planes = [optimum, beside, optimum] if last_is_optimal else [beside, optimum, beside]
+        steps = [env.step(plane) for plane in planes]
+        assert [step[2:4] for step in steps] == [(False, False), (False, False), (False, True)]
+        assert [step[4]["is_success"] for step in steps] == [plane is optimum for plane in planes]
+        with pytest.raises(ResetNeededError):
+            env.step(optimum)
+
+
+def test_env_on_stop_ends_with_the_plane_at_which_the_agent_stops(phantom):
+    env = ArmscanEnv([phantom], projection="full", ends="on_stop", max_steps=3)
+    assert env.action_names == ("rz", "rx", "tx", "ty", "stop")
+    for stop_at in (0, 1, 2, None):
+        _, info = env.reset(seed=0)
+        assert info["action"].tolist() == [0.0] * 5
+        planes = [np.full(4, -1.0), env.scene.optimum_normalised, np.full(4, 1.0)]
+        for n, plane in enumerate(planes):
+            _, reward, terminated, truncated, info = env.step(np.append(plane, 0.1 if n == stop_at else 0.0))
+            assert (terminated, truncated) == (n == stop_at, n == 2 and stop_at != 2)
+            assert info["is_success"] == (reward > -0.05) == (n == 1)
+            if terminated:
+                break
+
+
+@pytest.mark.parametrize("start", ["middle", "random"])
+def test_env_shows_the_same_however_an_episode_ends(phantom, start):
+    """Rewards and observations are the same; the action's last component stands beside the others."""
+    rules = {"projection": "zy", "observation": "slice_channels", "start": start}
+    shown = {}
+    for ends in ("on_reward", "on_budget", "on_stop"):
+        env = ArmscanEnv([phantom], ends=ends, **rules)
+        observed = [(env.reset(seed=2)[0], 0.0)]
+        for plane in ([-0.9, -0.9], [0.8, 0.9]):
+            action = [*plane, -1.0] if ends == "on_stop" else plane
+            observed.append(env.step(np.array(action))[:2])
+        shown[ends] = [
+            (each["channels"].tolist(), each["action"][:2].tolist(), each["reward"].tolist(), reward)
+            for each, reward in observed
+        ]
+    assert shown["on_reward"] == shown["on_budget"] == shown["on_stop"]
+
+
 def test_env_keeps_the_fixed_components_at_the_optimum(phantom):
     env = ArmscanEnv([phantom], projection="y")
     env.reset(seed=3)
@@ -174,6 +220,7 @@ def test_reset_takes_the_volume_as_an_option(dataset):
     [
         ({"success_threshold": 0}, "success_threshold is 0"),
         ({"success_threshold": "a"}, "success_threshold is 'a'"),
+        ({"ends": "at_last"}, "ends is 'at_last', but it must be on_reward, on_budget or on_stop"),
         ({"max_steps": 0}, "max_steps is 0"),
         ({"max_steps": 2.5}, "max_steps is 2.5"),
         ({"start": "end"}, "start is 'end', but it must be middle or random"),

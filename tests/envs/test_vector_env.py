@@ -17,6 +17,8 @@ VARIANTS = [
     {"projection": "zy", "stack": 2, "memory": 2, "stack_memory": True, "start": "random"},
     {"observation": "slice_channels", "projection": "full", "stack": 2, "stack_exclude": ["action"], "memory": 2},
     {"observation": ["cluster", "slice"], "projection": ["rz", "tx"], "memory": 1},
+    {"ends": "on_budget", "projection": "full"},
+    {"ends": "on_stop", "projection": "zy", "stack": 2, "memory": 2, "start": "random", "observation": "slice_metric"},
     {"clustering": "metric", "observation": "action_reward", "transform": None},
 ]
 
