@@ -14,7 +14,7 @@ from armscan.agents.networks import Network
 from armscan.agents.policy import Batch, Policy, batch_of, clip_action
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.supervised_buffer import SupervisedBuffer
-from armscan.agents.tianshou_learner import diverged, is_finite, load_into
+from armscan.agents.tianshou_learner import diverged, is_finite, load_into, prepare_torch
 from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
@@ -56,7 +56,7 @@ class RegressionLearner:
         self._examples = SupervisedBuffer(size, setup.observation_space, n_free)
         self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
         self._compute, self._device = setup.compute, setup.compute.torch_device
-        torch.manual_seed(setup.seed)
+        prepare_torch(setup.seed)
         self._network = network.actor(setup.observation_space, n_free, log_std=-0.5).to(self._device)
         self._optimiser = torch.optim.Adam(self._network.parameters(), lr=parameters.lr)
         self._n_env_steps = self._n_epochs = 0

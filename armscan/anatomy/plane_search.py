@@ -13,7 +13,6 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from armscan.anatomy.rewards import PUBLISHED_TARGETS, LandmarkReward, Reward
 from armscan.anatomy.scanner import Scanner
@@ -186,6 +185,8 @@ def find_optimal_plane(
 
 def largest_best_region(rewards: FloatArray) -> NDArray[np.int64]:
     """Return the indices, shape (n, 3), of the largest connected region of planes that score best."""
+    from scipy import ndimage
+
     regions, _ = ndimage.label(rewards >= rewards.max() - SAME_REWARD, NEIGHBOURS)
     largest = np.bincount(regions.ravel())[1:].argmax() + 1
     return np.argwhere(regions == largest)

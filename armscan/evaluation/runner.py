@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from textwrap import shorten
 
-import torch
-
 from armscan.agents import Agent, Learner
 from armscan.anatomy import USUAL_PIXEL_MM
 from armscan.config.command_hints import resume_command
@@ -77,7 +75,6 @@ def apply(
     Raises:
         ArmscanError: if volumes are missing or damaged, or the agent cannot be applied to them.
     """
-    torch.set_num_threads(1)
     # Elsewhere, of an agent's own volumes only those matter that its reward is fitted to.
     parts = ("training",) if data else PARTS
     own = cache(partial(own_split, subject, parts))

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 
-import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.agents import Agent, AgentSetup, Learner
-from armscan.config.defaults import CLUSTER
+from armscan.agents import Agent, AgentSetup, Algorithm, Learner
+from armscan.config.defaults import CLUSTER, to_plain
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError, listed
+from armscan.tracking import check_settings
 from armscan.training import Budget, CheckpointProvenance, Fingerprints, Split, TrainingDomain
 from armscan.training.domain import smallest_slice, with_crops
 from armscan.training.rollout import Env
@@ -90,7 +90,6 @@ def set_up(config: DictConfig) -> Experiment:
         InvalidValueError: if something in it is not allowed, or the agent cannot act in one of the environments.
     """
     silence_library_warnings()
-    torch.set_num_threads(1)
     experiment = build_experiment(config)
     envs = (experiment.training_env, experiment.validation_env, experiment.test_env, experiment.video_env)
     trained = TrainingDomain.of(envs[0])
@@ -113,11 +112,11 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
     Raises:
         InvalidValueError: if something in it is not allowed.
     """
-    check_sections(config)
+    check_words(config)
     seed = check_seed("seed", config.seed)
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
-    split = split or instantiate(config.data, _convert_="object")
     budget = instantiate(config.training, _convert_="object")
+    split = split or instantiate(config.data, _convert_="object")
     smallest = smallest_slice([*split.training.values(), *split.validation.values(), *split.test.values()])
     env_factory = make_env_factory(apply_crop(config, smallest, smallest), split.training)
     agent = make_agent(config, env_factory, split.training, total_env_steps=budget.env_steps, seed=seed)
@@ -130,6 +129,22 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
         seed=seed,
         smallest_slice_px=smallest,
     )
+
+
+def check_words(config: DictConfig) -> None:
+    """Check all that can be checked before a volume is read or a library of learning is loaded.
+
+    Raises:
+        InvalidValueError: if a value is not allowed.
+        MissingMandatoryValue: if one that must be given is not.
+    """
+    check_sections(config)
+    to_plain(config)
+    check_seed("seed", config.seed)
+    check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
+    for section in (config.training, config.env, config.compute):
+        instantiate(section, _convert_="object")
+    make_algorithm(config)
 
 
 def apply_crop(config: DictConfig, trained_px: tuple[int, int], here_px: tuple[int, int]) -> DictConfig:
@@ -151,6 +166,7 @@ def make_agent(
     config: DictConfig, env_factory: EnvFactory, volumes: Mapping[str, LabelVolume], *, total_env_steps: int, seed: int
 ) -> Agent:
     """Return the agent, which has learned nothing yet, for environments on these volumes."""
+    algorithm = make_algorithm(config)
     env = env_factory.make_env(dict(volumes))
     setup = AgentSetup(
         make_envs=partial(env_factory.make_vector_env, volumes=dict(volumes), autoreset_mode="Disabled"),
@@ -160,12 +176,7 @@ def make_agent(
         seed=seed,
         compute=instantiate(config.compute, _convert_="object"),
     )
-    algorithm = instantiate(config.agent, _convert_="object")
-    if not callable(getattr(algorithm, "agent", None)):
-        raise InvalidValueError(
-            f"agent is {algorithm!r}, but it must have the method of Algorithm, agent: give agent._target_ such a class"
-        )
-    agent: Agent = algorithm.agent(setup)
+    agent = algorithm.agent(setup)
     if hasattr(agent, "learn") and not isinstance(agent, Learner):
         missing = [name for name in dir(Learner) if not name.startswith("_") and not hasattr(agent, name)]
         raise InvalidValueError(
@@ -173,6 +184,20 @@ def make_agent(
             f"{listed(missing)}"
         )
     return agent
+
+
+def make_algorithm(config: DictConfig) -> Algorithm:
+    """Return the algorithm that makes the agent.
+
+    Raises:
+        InvalidValueError: if the section `agent` describes none, or a hyperparameter is not allowed.
+    """
+    algorithm: Algorithm = instantiate(config.agent, _convert_="object")
+    if not callable(getattr(algorithm, "agent", None)):
+        raise InvalidValueError(
+            f"agent is {algorithm!r}, but it must have the method of Algorithm, agent: give agent._target_ such a class"
+        )
+    return algorithm
 
 
 def check_keys(config: DictConfig) -> None:
@@ -188,6 +213,7 @@ def check_keys(config: DictConfig) -> None:
     ):
         if unread := [key for key in node if key not in allowed]:
             raise InvalidValueError(f"there is no key {unread[0]!r} {where}, but only {listed(allowed)}")
+    check_settings(**to_plain(config.tracking))
 
 
 def check_sections(config: DictConfig) -> None:

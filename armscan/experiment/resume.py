@@ -10,10 +10,9 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
-from mlflow.entities import Run
 from omegaconf import OmegaConf
 
 from armscan.agents import Learner
@@ -24,7 +23,15 @@ from armscan.experiment.build import set_up
 from armscan.experiment.job import GRID_TAG
 from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
-from armscan.tracking import TrackedRun, TrackingStore, check_version, find_run, open_existing_store, sync
+from armscan.tracking import (
+    TrackedRun,
+    TrackingStore,
+    check_run_id,
+    check_version,
+    find_run,
+    open_existing_store,
+    sync,
+)
 from armscan.training import Fingerprints, check_unchanged, resume_from_checkpoint
 from armscan.utils.files import (
     CONFIG_FILE,
@@ -36,6 +43,9 @@ from armscan.utils.files import (
     sha256,
 )
 from armscan.utils.strict_yaml import load_yaml
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
 
 
 def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -> None:
@@ -56,6 +66,7 @@ def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -
     """
     trust = TRUST in words
     wanted, uri = _read([word for word in words if word != TRUST])
+    check_run_id(wanted)
     client = open_existing_store(uri)
     run = find_run(client, wanted)
     if GRID_TAG not in run.data.tags:

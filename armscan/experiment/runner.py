@@ -21,7 +21,6 @@ from armscan.experiment.build import Experiment, check_keys, set_up
 from armscan.experiment.console import print_results, print_where_to_look
 from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
-from armscan.policies.build import save_policy
 from armscan.tracking import TrackedRun, draw_learning_curve
 from armscan.training import (
     TEST,
@@ -107,13 +106,17 @@ def run_tracked(
             result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, earlier=earlier)
         tell(f"playing {setup.n_episodes} episodes on the training volumes, and as many on the test volumes")
         evaluations = final_evaluations(setup)
+        if job_label is None:
+            how = f"as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
+            print_results(f"results ({'deterministic policy, ' if result else ''}{how})", evaluations)
         record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)
         keep_results(tracked, result, evaluations, folder)
         if isinstance(setup.agent, Learner):
+            # Deferred: exporting a policy loads more than training does, and is the last that a run does.
+            from armscan.policies.build import save_policy
+
             save_policy(setup.agent, setup.test_env, tracked, folder, tell)
     if job_label is None:
-        how = f"deterministic policy, as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
-        print_results(f"results ({how})", evaluations)
         print_where_to_look(folder, tracking_uri, files=(LEARNING_CURVE_FILE, VIDEO_FILE) if result else (VIDEO_FILE,))
         print(f"evaluate  {armscan_command('evaluate', tracked.run_id, tracking=tracking_uri)}")
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}

@@ -6,8 +6,8 @@ A job's earlier run is known by its configuration and its volumes, which both ha
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mlflow.entities import Run
 from omegaconf import DictConfig
 
 from armscan.config.defaults import to_plain
@@ -19,6 +19,9 @@ from armscan.experiment.runner import run_experiment
 from armscan.tracking import TrackingStore, open_store
 from armscan.training import TEST, TRAINING
 from armscan.utils.files import LAST_CHECKPOINT
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
 
 Metrics = dict[str, dict[str, float]]
 

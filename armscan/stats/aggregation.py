@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import bootstrap, trim_mean
 
 from armscan.errors import InvalidValueError
 from armscan.stats.bootstrap import LEVEL, MOST_VALUES, N_RESAMPLES, Estimate
@@ -36,6 +35,8 @@ class Band(NamedTuple):
 
 def interquartile_mean(values: ArrayLike, axis: int | None = None) -> Any:
     """Return the mean without the lowest and the highest quarter, by default of all values; of fewer than four all."""
+    from scipy.stats import trim_mean
+
     return trim_mean(values, QUARTER, axis=axis)
 
 
@@ -117,6 +118,8 @@ def probability_of_improvement(ours: FloatArray, theirs: FloatArray) -> Estimate
 
 
 def _ends(samples: tuple[NDArray[Any], ...], statistic: Mean, *, seed: int = 0, **how: Any) -> tuple[Any, Any]:
+    from scipy.stats import bootstrap
+
     how |= {"n_resamples": N_RESAMPLES, "confidence_level": LEVEL, "method": "percentile"}
     interval = bootstrap(samples, statistic, rng=np.random.default_rng(seed), **how).confidence_interval
     return interval.low, interval.high

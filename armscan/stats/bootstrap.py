@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binomtest
 
 from armscan.errors import InvalidValueError
 from armscan.volumes.plane import FloatArray
@@ -100,6 +99,8 @@ def wilson(n_successes: int, n_trials: int) -> Estimate:
     """Return a rate with Wilson's interval, as if all trials were independent."""
     if n_trials == 0:
         return Estimate(math.nan, math.nan, math.nan)
+    from scipy.stats import binomtest
+
     interval = binomtest(n_successes, n_trials).proportion_ci(LEVEL, method="wilson")
     return Estimate(n_successes / n_trials, float(interval.low), float(interval.high))
 

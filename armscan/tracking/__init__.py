@@ -7,6 +7,7 @@ from armscan.tracking.lookup import (
     EVALUATED_TAG,
     VERSION_TAG,
     FoundRun,
+    check_run_id,
     check_version,
     find_run,
     load_run,
@@ -15,7 +16,7 @@ from armscan.tracking.outbox import take_over
 from armscan.tracking.plots import draw_learning_curve
 from armscan.tracking.run import TrackedRun
 from armscan.tracking.sanitize import flattened, tags_of
-from armscan.tracking.store import check_artifacts, open_existing_store, open_store
+from armscan.tracking.store import check_artifacts, check_settings, open_existing_store, open_store
 from armscan.tracking.sync import abandon, deliver_pending, note_end, sync
 
 __all__ = [
@@ -27,6 +28,8 @@ __all__ = [
     "TrackingStore",
     "abandon",
     "check_artifacts",
+    "check_run_id",
+    "check_settings",
     "check_version",
     "deliver_pending",
     "draw_learning_curve",

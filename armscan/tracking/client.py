@@ -6,18 +6,16 @@ import re
 import uuid
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, TypeVar
-
-from mlflow import MlflowClient
-from mlflow.entities import Run
-from mlflow.exceptions import MlflowException
-from requests import RequestException
-from sqlalchemy.exc import DBAPIError, OperationalError
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from armscan.config.credentials import mask_passwords
 from armscan.errors import TrackingAwayError
 from armscan.tracking.sanitize import tags_of
 from armscan.utils.retry import RetryPolicy
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import Run
 
 T = TypeVar("T")
 # What MLflow says of a store that it cannot reach, of one that fails, and of what is not there.
@@ -91,6 +89,10 @@ class TrackingStore:
 
 def why_away(error: BaseException) -> str | None:
     """Return why a store cannot be reached or written to for now; None where an error says anything else."""
+    from mlflow.exceptions import MlflowException
+    from requests import RequestException
+    from sqlalchemy.exc import DBAPIError, OperationalError
+
     match error:
         case MlflowException(error_code=code):
             is_away = code in AWAY

@@ -6,10 +6,9 @@ import json
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
-from mlflow.entities import Run
 from packaging.version import Version
 
 import armscan
@@ -17,9 +16,13 @@ from armscan.config.trust import stored_config
 from armscan.errors import TrackingError, listed
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.store import open_existing_store, store_errors
-from armscan.training import Fingerprints
 from armscan.utils.files import BEST_CHECKPOINT, CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
 from armscan.utils.strict_yaml import load_yaml
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+    from armscan.training import Fingerprints
 
 # What a run's agent was trained on, as `armscan.training.TrainingDomain` writes it.
 DOMAIN_TAG = "trained_on"
@@ -120,6 +123,7 @@ def load_run(uri: str, run_id: str) -> FoundRun:
     Raises:
         TrackingError: if no run is meant, or several are, or the store does not exist or cannot be used.
     """
+    check_run_id(run_id)
     client = open_existing_store(uri)
     with store_errors(uri):
         run = find_run(client, run_id)
@@ -151,10 +155,7 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
     Raises:
         TrackingError: if no run is meant, or several are.
     """
-    if not ID.fullmatch(run_id):
-        raise TrackingError(
-            f"the run is {run_id!r}, but it must be an id as MLflow shows it, or its beginning: up to 32 of 0-9 and a-f"
-        )
+    check_run_id(run_id)
     experiments = client.search_experiments(max_results=MAX_EXPERIMENTS)
     found = client.search_runs(
         [experiment.experiment_id for experiment in experiments],
@@ -168,6 +169,14 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
         raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the id")
     run: Run = found[0]
     return run
+
+
+def check_run_id(run_id: str) -> None:
+    """Raise `TrackingError` where a text cannot be an MLflow run ID or its beginning."""
+    if not ID.fullmatch(run_id):
+        raise TrackingError(
+            f"the run is {run_id!r}, but it must be an id as MLflow shows it, or its beginning: up to 32 of 0-9 and a-f"
+        )
 
 
 def check_version(run: Run) -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
-from armscan.training import EpochReport
+if TYPE_CHECKING:
+    from armscan.training import EpochReport
 
 
 def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: str) -> None:
@@ -19,6 +18,9 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
         path: the PNG file.
         title: above the picture.
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     steps = [report.n_env_steps for report in reports]
     figure = Figure(figsize=(8, 5.4), layout="constrained")
     FigureCanvasAgg(figure)

@@ -6,9 +6,7 @@ import os
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
-
-from mlflow.entities import Run
+from typing import TYPE_CHECKING, Any, Self
 
 from armscan.config.command_hints import armscan_command
 from armscan.errors import is_interruption
@@ -19,9 +17,13 @@ from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
 from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.uploader import Uploader
-from armscan.training import EpochReport
 from armscan.utils.files import RESULTS, RESUMED_DIFF_FILE, atomic_write
 from armscan.utils.log import log
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+    from armscan.training import EpochReport
 
 MODEL_FILE = "MLmodel"
 # Why a run ended before its end.

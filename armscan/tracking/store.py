@@ -10,13 +10,11 @@ import warnings
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 from filelock import FileLock
-from mlflow import MlflowClient
-from mlflow.exceptions import MlflowException
-from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.config.credentials import (
     SERVER_PASSWORD,
@@ -75,12 +73,14 @@ def open_store(
     Raises:
         TrackingError: if the store cannot be reached or used.
     """
-    _check_texts(uri=uri, experiment=experiment, artifacts=artifacts)
-    _check_address(uri)
-    check_float("tracking.wait_s", wait_s, at_least=0.0)
-    if system_metrics_s is not None:
-        check_float("tracking.system_metrics_s", system_metrics_s, above=0.0)
-    check_bool("tracking.policy", policy)
+    check_settings(
+        uri,
+        experiment=experiment,
+        artifacts=artifacts,
+        wait_s=wait_s,
+        system_metrics_s=system_metrics_s,
+        policy=policy,
+    )
     connected = partial(_store, wait_s=wait_s, system_metrics_s=system_metrics_s, retry_s=retry_s)
     with store_errors(uri):
         if not uri.startswith(SQLITE_PREFIX):
@@ -94,6 +94,18 @@ def open_store(
         with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
             store = connected(f"{SQLITE_PREFIX}{database}")
             return store, _experiment_in(store, experiment, artifacts)
+
+
+def check_settings(
+    uri: object, *, experiment: object, artifacts: object, wait_s: Any, system_metrics_s: Any = None, policy: Any = True
+) -> None:
+    """Raise `TrackingError` or `InvalidValueError` where settings of a store are not allowed; see `open_store`."""
+    _check_texts(uri=uri, experiment=experiment, artifacts=artifacts)
+    _check_address(str(uri))
+    check_float("tracking.wait_s", wait_s, at_least=0.0)
+    if system_metrics_s is not None:
+        check_float("tracking.system_metrics_s", system_metrics_s, above=0.0)
+    check_bool("tracking.policy", policy)
 
 
 def open_existing_store(uri: str) -> TrackingStore:
@@ -136,6 +148,8 @@ def _store(
     uri: str, *, wait_s: float, system_metrics_s: float | None = None, retry_s: float | None = None
 ) -> TrackingStore:
     """Return an open store; its client gets the driver and the password of a database."""
+    from mlflow import MlflowClient
+
     address = uri
     if uri.startswith("postgresql"):
         address = database_url(uri, TRACKING_PASSWORD).render_as_string(hide_password=False)
@@ -174,6 +188,9 @@ def store_errors(uri: str) -> Iterator[None]:
     """Turn the errors of a store into a `TrackingError` of one line, with short time-outs and no warnings."""
     for name, value in DEFAULTS.items():
         os.environ.setdefault(name, value)
+    from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
+
     if SERVER_PASSWORD not in os.environ and (password := read_password(SERVER_PASSWORD)):
         os.environ[SERVER_PASSWORD] = password
     # The making of a new database is told table by table.
@@ -193,6 +210,8 @@ def store_errors(uri: str) -> Iterator[None]:
 
 def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> str:
     """Return the id of an experiment, which is made where there is none."""
+    from mlflow.exceptions import MlflowException
+
     location = Path(artifacts).absolute().as_uri() if artifacts else None
     found = store.get_experiment_by_name(name)
     if found is None:

@@ -6,14 +6,8 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mlflow.system_metrics.metrics.cpu_monitor import CPUMonitor
-from mlflow.system_metrics.metrics.disk_monitor import DiskMonitor
-from mlflow.system_metrics.metrics.gpu_monitor import GPUMonitor
-from mlflow.system_metrics.metrics.network_monitor import NetworkMonitor
-
 # As MLflow names them; its UI shows these on a page of their own.
 PREFIX = "system/"
-MONITORS: tuple[type[Any], ...] = (CPUMonitor, DiskMonitor, NetworkMonitor, GPUMonitor)
 
 
 class SystemMetrics:
@@ -52,8 +46,14 @@ class SystemMetrics:
 
 
 def _monitors() -> list[Any]:
+    from mlflow.system_metrics.metrics.cpu_monitor import CPUMonitor
+    from mlflow.system_metrics.metrics.disk_monitor import DiskMonitor
+    from mlflow.system_metrics.metrics.gpu_monitor import GPUMonitor
+    from mlflow.system_metrics.metrics.network_monitor import NetworkMonitor
+
+    kinds: tuple[type[Any], ...] = (CPUMonitor, DiskMonitor, NetworkMonitor, GPUMonitor)
     monitors = []
-    for kind in MONITORS:
+    for kind in kinds:
         try:
             monitor = kind()
             # That of the CPU says how busy it was since this thread has looked last.

@@ -5,11 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from typing import Any
-
-from mlflow import MlflowClient
-from mlflow.entities import Metric, Param, RunTag
-from mlflow.exceptions import MlflowException
+from typing import TYPE_CHECKING, Any
 
 from armscan.config.trust import TRUST
 from armscan.errors import TrackingError, UntrustedError
@@ -18,8 +14,11 @@ from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
 from armscan.utils.log import log
 from armscan.utils.retry import FIRST_PAUSE_S
 
-# MLflow takes no more of each in one request.
-AT_ONCE: dict[str, tuple[int, type[Any]]] = {"metrics": (1000, Metric), "params": (100, Param), "tags": (100, RunTag)}
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+# Of each, the class in mlflow.entities, and how many MLflow takes in one request.
+AT_ONCE = {"metrics": ("Metric", 1000), "params": ("Param", 100), "tags": ("RunTag", 100)}
 ENTRIES_AT_ONCE = 200
 LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
 
@@ -150,10 +149,14 @@ def deliver(
 
 
 def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any]) -> None:
+    from mlflow import entities
+    from mlflow.exceptions import MlflowException
+
     run_id = outbox.address.run_id
     match kind:
         case "metrics" | "params" | "tags":
-            at_once, entity = AT_ONCE[kind]
+            name, at_once = AT_ONCE[kind]
+            entity = getattr(entities, name)
             rest = itertools.chain(*(each.items() if isinstance(each, dict) else each for each in values))
             while batch := [entity(*each) for each in itertools.islice(rest, at_once)]:
                 request: dict[str, Any] = {kind: batch}

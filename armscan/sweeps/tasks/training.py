@@ -18,7 +18,6 @@ from armscan.experiment.build import Experiment, build_experiment, check_keys, s
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
 from armscan.experiment.runner import VIDEO_SEED, final_evaluations, train_agent, write_evaluations
-from armscan.policies.build import save_policy
 from armscan.stats.aggregation import interquartile_mean
 from armscan.sweeps.scheduling.state import ENV_STEPS
 from armscan.sweeps.tasks.attempt import Attempt, volumes_of
@@ -102,6 +101,9 @@ def _concluded(setup: Experiment, tracked: TrackedRun, folder: Path) -> dict[str
     agent, seed = setup.agent, VIDEO_SEED + setup.seed
     record_episode(agent, setup.video_env, folder / VIDEO_FILE, seed=seed)
     assert isinstance(agent, Learner)
+    # Deferred: most trials export no policy.
+    from armscan.policies.build import save_policy
+
     save_policy(agent, setup.test_env, tracked, folder, log)
     metrics = {f"test/{name}": value for name, value in evaluations[TEST].metrics().items()}
     for volume, evaluation in evaluations[TEST].by_volume().items():

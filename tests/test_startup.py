@@ -1,0 +1,69 @@
+"""What a command imports before it answers; how long that takes is measured by benchmarks/speed/start.py."""
+
+import subprocess
+import sys
+
+import pytest
+
+LEARNING = {"torch", "tianshou", "ray", "tensorboard", "pettingzoo"}
+HEAVY = LEARNING | {"mlflow", "optuna", "matplotlib", "pandas", "plotly", "scipy.stats", "sqlalchemy"}
+# Runs one command after another, and says their exit codes and what is loaded afterwards.
+PROGRAM = """
+import os, sys
+from armscan.cli.main import main
+def code(words):
+    # Set by the command before, which a process has only one of.
+    os.environ.pop("HYDRA_FULL_ERROR", None)
+    try:
+        return main(words.split())
+    except SystemExit as error:
+        return error.code
+print(*[code(words) for words in sys.argv[1:]])
+print(*sys.modules)
+"""
+
+
+def after(folder, *commands):
+    """Return the exit codes of commands in a fresh process, what they said, and which modules it has loaded."""
+    ran = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *commands], cwd=folder, capture_output=True, text=True, check=True
+    )
+    *_, codes, modules = ran.stdout.splitlines()
+    return [int(code) for code in codes.split()], ran.stderr, set(modules.split())
+
+
+def test_words_that_are_wrong_are_answered_before_a_library_of_learning_or_tracking_is_loaded(tmp_path):
+    wrong = {
+        "training.env_steps=-1": "training.env_steps is -1",
+        "agent.lr=0": "agent.lr is 0",
+        "agent=ppo agent.clip_range=-1": "agent.clip_range is -1",
+        "network=mlp network.hidden_sizes=[0]": "network.hidden_sizes",
+        "env.max_steps=0": "max_steps is 0",
+        "tracking.wait_s=-1": "tracking.wait_s is -1",
+        "evaluation.episodes=0": "evaluation.episodes is 0",
+        "data=nifti": "data.path is not set",
+        "data=nifti data.path=nowhere": "nowhere",
+        "resume=zzzz": "the run is 'zzzz'",
+        "resume=abcd": "no run was tracked there",
+        "agent=sca": "agent is 'sca'",
+        "foo=1": "there is no key 'foo'",
+    }
+    codes, said, modules = after(tmp_path, *(f"run {words}" for words in wrong))
+    assert codes == [2] * len(wrong)
+    for line, part in zip(said.splitlines(), wrong.values(), strict=True):
+        assert part in line
+    assert not HEAVY & modules
+
+
+def test_runs_are_listed_and_compared_without_a_library_of_learning(tmp_path):
+    (tmp_path / "mlruns.db").touch()
+    codes, said, modules = after(tmp_path, "runs list", "report --runs abcd", "evaluate abcd")
+    assert codes == [2, 2, 2]
+    assert said.count("no store of MLflow") == 3
+    assert not LEARNING & modules
+
+
+@pytest.mark.parametrize("command", ["runs", "report", "ui", "data", "evaluate", "policy"])
+def test_help_needs_nothing_else(command, tmp_path):
+    _, _, modules = after(tmp_path, f"{command} --help")
+    assert not (HEAVY | {"numba", "hydra"}) & modules
