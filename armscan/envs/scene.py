@@ -9,17 +9,26 @@ import numpy as np
 
 from armscan.envs.actions import ActionBounds
 from armscan.errors import InvalidValueError, OptimalPlaneError
-from armscan.utils.validation import check_choice, check_float
+from armscan.utils.validation import check_bool, check_choice, check_float
+from armscan.volumes.deformation import DeformingTransform
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, plane_distance, shift_into
 from armscan.volumes.volume import LabelVolume
 
 MAX_SHIFT_MM = 10_000.0
 CENTRES = ("middle", "first_voxel")
+# Of scale, stretch and shear: with less, no draw can come near to a flat volume.
+MAX_DEFORMATION = 0.3
+# What a shear moves, and along which axis it grows: nothing along the normal, or the labelled plane would move.
+SHEARED = ((0, 2), (2, 0), (0, 1), (2, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomTransform:
-    """The rigid motions that a volume is moved by at reset, each component drawn uniformly.
+    """The motions and deformations of a volume at reset, each component drawn uniformly.
+
+    The deformations make other wrists of one: they are about the middle of the labelled slice, keep the labelled plane
+    where it is, and cost nothing, because a slice is looked up through them. Pixels stay as large as they are, so that
+    the landmarks of a larger wrist are larger, in pixels as in mm.
 
     Args:
         rz_deg: rotation about Z within +- this.
@@ -28,6 +37,11 @@ class RandomTransform:
         ty_mm: translation along Y within +- this.
         centre: what the rotation leaves in place: `middle` of the volume, or `first_voxel`, as published, which pushes
             the hand out of the picture.
+        scale: the volume's size in all directions alike is 1 +- this times as large, from 0 to 0.3.
+        stretch: its size across, along the labelled normal and in depth, each for itself, likewise.
+        shear: shift for each mm along another axis within +- this, from 0 to 0.3: across and in depth with the way
+            along the normal, and with each other.
+        mirror: whether half of the episodes show the other hand.
     """
 
     rz_deg: float = 10.0
@@ -35,6 +49,10 @@ class RandomTransform:
     tx_mm: float = 10.0
     ty_mm: float = 10.0
     centre: str = "middle"
+    scale: float = 0.0
+    stretch: float = 0.0
+    shear: float = 0.0
+    mirror: bool = False
 
     def __post_init__(self) -> None:
         for name in ("rz_deg", "rx_deg"):
@@ -42,13 +60,36 @@ class RandomTransform:
         for name in ("tx_mm", "ty_mm"):
             check_float(f"transform {name}", getattr(self, name), at_least=0.0, at_most=MAX_SHIFT_MM)
         check_choice("transform centre", self.centre, CENTRES)
+        for name in ("scale", "stretch", "shear"):
+            check_float(f"transform {name}", getattr(self, name), at_least=0.0, at_most=MAX_DEFORMATION)
+        check_bool("transform mirror", self.mirror)
 
     def draw(self, volume: LabelVolume, rng: np.random.Generator) -> RigidTransform:
-        """Draw one motion of a volume."""
+        """Draw one motion of a volume, and its deformation if there is one."""
         limits = np.array([self.rz_deg, self.rx_deg, self.tx_mm, self.ty_mm])
         rz, rx, tx, ty = rng.uniform(-limits, limits)
         centre_mm = volume.centre_mm if self.centre == "middle" else (0.0, 0.0, 0.0)
-        return RigidTransform((rz, rx), (tx, ty), centre_mm)
+        if not (self.scale or self.stretch or self.shear or self.mirror):
+            return RigidTransform((rz, rx), (tx, ty), centre_mm)
+        assert volume.optimal_action is not None
+        return DeformingTransform(
+            (rz, rx),
+            (tx, ty),
+            centre_mm,
+            plane=volume.optimal_action,
+            about_mm=(volume.centre_mm[0], volume.centre_mm[2]),
+            deformation=self._deformation(rng),
+        )
+
+    def _deformation(self, rng: np.random.Generator) -> FloatArray:
+        """Draw how a volume is deformed in the frame of its labelled plane (across, along the normal, in depth)."""
+        deformation = np.diag(rng.uniform(1.0 - self.stretch, 1.0 + self.stretch, 3))
+        deformation *= rng.uniform(1.0 - self.scale, 1.0 + self.scale)
+        for row, column in SHEARED:
+            deformation[row, column] = rng.uniform(-self.shear, self.shear)
+        if self.mirror and rng.random() < 0.5:
+            deformation[:, 0] *= -1.0
+        return deformation
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Labelmap volumes, their files and manifests, phantom wrists, and the slicing plane."""
 
 from armscan.volumes.dataset import Dataset, open_dataset, read_dataset
+from armscan.volumes.deformation import DeformingTransform
 from armscan.volumes.labelmap import LABEL_NAMES, LANDMARK_LABELS, LabelMap
 from armscan.volumes.manifest import MANIFEST_NAMES, record_planes
 from armscan.volumes.markups import read_markup, write_markup
@@ -15,6 +16,7 @@ __all__ = [
     "LANDMARK_LABELS",
     "MANIFEST_NAMES",
     "Dataset",
+    "DeformingTransform",
     "LabelMap",
     "LabelVolume",
     "ManipulatorAction",

@@ -31,7 +31,7 @@ def rotation_matrix(rz_deg: float, rx_deg: float) -> FloatArray:
 
 
 @numba.njit(cache=True)
-def _composed(
+def composed(
     outer: FloatArray, outer_mm: FloatArray, inner: FloatArray, inner_mm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return (M, b) of the affine map p -> outer (inner p + inner_mm) + outer_mm."""
@@ -136,7 +136,7 @@ class RigidTransform:
 
     def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
         """Return (M, b) with T(plane(p)) = M p + b: from the plane's frame into the unmoved volume."""
-        return _composed(self.matrix, self.offset_mm, action.matrix, action.offset_mm)
+        return composed(self.matrix, self.offset_mm, action.matrix, action.offset_mm)
 
     def inverse_plane(self, action: ManipulatorAction) -> ManipulatorAction:
         """Return the plane of the moved volume that shows what `action` shows of the unmoved one.

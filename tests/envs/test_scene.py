@@ -73,6 +73,84 @@ def test_random_transform_stays_within_its_limits(phantom):
     assert drawn[0].centre_mm == phantom.centre_mm
 
 
+DEFORMED = {"scale": 0.08, "stretch": 0.05, "shear": 0.09, "mirror": True}
+
+
+def test_deformations_keep_the_labelled_plane(phantom):
+    """Every point of the moved optimum shows a point of the labelled plane, and a plane beside it none."""
+    points = np.random.default_rng(0).uniform(0.0, 90.0, (20, 3)) * [1, 0, 1]
+    normal, origin = phantom.optimal_action.normal, phantom.optimal_action.offset_mm
+    for scene in draw(phantom, np.random.default_rng(0), 10, transform=RandomTransform(rx_deg=5.0, **DEFORMED)):
+        matrix, offset_mm = scene.plane_map(scene.optimum)
+        np.testing.assert_allclose((points @ matrix.T + offset_mm - origin) @ normal, 0.0, atol=1e-6)
+        (rz, rx), (tx, ty) = scene.optimum.rotation, scene.optimum.translation
+        matrix, offset_mm = scene.plane_map(ManipulatorAction((rz, rx), (tx, ty + 1.0)))
+        assert np.abs((points @ matrix.T + offset_mm - origin) @ normal).min() > 0.8
+
+
+def test_deformations_leave_the_motions_as_they_are(phantom):
+    """The same seed moves a volume as it did; and draws other deformations than the next one."""
+    moved = draw(phantom, np.random.default_rng(5), transform=RandomTransform())[0]
+    deformed = [draw(phantom, np.random.default_rng(seed), transform=RandomTransform(**DEFORMED))[0] for seed in (5, 6)]
+    assert deformed[0].optimum == moved.optimum
+    assert not np.allclose(deformed[0].transform.deformation, deformed[1].transform.deformation)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("scale", lambda f: np.allclose(f, f[0, 0] * np.eye(3))),
+        ("stretch", lambda f: np.allclose(f, np.diag(f.diagonal())) and len(set(f.diagonal())) == 3),
+        ("shear", lambda f: (f.diagonal() == 1.0).all() and (f[[0, 0, 2, 2], [1, 2, 0, 1]] != 0.0).all()),
+        ("mirror", lambda f: (np.abs(f) == np.eye(3)).all()),
+    ],
+)
+def test_each_deformation_does_one_thing(phantom, name, shape):
+    transform = RandomTransform(**{name: DEFORMED[name]})
+    rng = np.random.default_rng(1)
+    drawn = np.array([transform.draw(phantom, rng).deformation for _ in range(60)])
+    assert all(shape(deformation) for deformation in drawn)
+    spread = np.abs(np.abs(drawn) - np.eye(3)).max()
+    assert spread == 0.0 if name == "mirror" else 0.8 * DEFORMED[name] < spread <= DEFORMED[name]
+    assert {np.sign(deformation[0, 0]) for deformation in drawn} == ({-1.0, 1.0} if name == "mirror" else {1.0})
+
+
+def test_a_mirrored_volume_shows_the_labelled_slice_mirrored(phantom):
+    transform = RandomTransform(rz_deg=0.0, tx_mm=0.0, ty_mm=0.0, mirror=True)
+    rng = np.random.default_rng(0)
+    labelled = phantom.slice(phantom.optimal_action)
+    shown = [phantom.slice(phantom.optimal_action, transform=transform.draw(phantom, rng)) for _ in range(20)]
+    is_mirrored = [not np.array_equal(each, labelled) for each in shown]
+    assert 0 < sum(is_mirrored) < 20
+    for each, mirrored in zip(shown, is_mirrored, strict=True):
+        # A point halfway between two voxels may fall to either.
+        assert (each == (labelled[::-1] if mirrored else labelled)).mean() > 0.99
+
+
+def test_a_scaled_volume_shows_its_tissues_scaled(phantom):
+    transform = RandomTransform(rz_deg=0.0, tx_mm=0.0, ty_mm=0.0, scale=0.2)
+    rng = np.random.default_rng(0)
+    labelled = (phantom.slice(phantom.optimal_action) > 0).sum()
+    for _ in range(5):
+        moved = transform.draw(phantom, rng)
+        shown = (phantom.slice(phantom.optimal_action, transform=moved) > 0).sum()
+        assert shown / labelled == pytest.approx(moved.deformation[0, 0] ** 2, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"scale": 0.5}, "transform scale is 0.5, but it must be .* 0.3"),
+        ({"stretch": -0.1}, "transform stretch is -0.1"),
+        ({"shear": "a"}, "transform shear is 'a'"),
+        ({"mirror": 1}, "transform mirror is 1"),
+    ],
+)
+def test_impossible_deformations_are_refused(arguments, message):
+    with pytest.raises(InvalidValueError, match=message):
+        RandomTransform(**arguments)
+
+
 def test_random_transform_about_the_first_voxel_as_published(phantom):
     drawn = RandomTransform(centre="first_voxel").draw(phantom, np.random.default_rng(0))
     np.testing.assert_array_equal(drawn.offset_mm, [*drawn.translation, 0.0])

@@ -7,7 +7,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from torch.utils.data import DataLoader, Dataset
 
 import armscan
-from armscan.envs import ArmscanVectorEnv
+from armscan.envs import ArmscanVectorEnv, RandomTransform
 from armscan.errors import InvalidValueError, ResetNeededError
 from armscan.volumes import LabelVolume
 
@@ -19,6 +19,7 @@ VARIANTS = [
     {"observation": ["cluster", "slice"], "projection": ["rz", "tx"], "memory": 1},
     {"ends": "on_budget", "projection": "full"},
     {"ends": "on_stop", "projection": "zy", "stack": 2, "memory": 2, "start": "random", "observation": "slice_metric"},
+    {"projection": "full", "transform": RandomTransform(rx_deg=5.0, scale=0.1, stretch=0.1, shear=0.1, mirror=True)},
     {"clustering": "metric", "observation": "action_reward", "transform": None},
 ]
 

@@ -1,0 +1,55 @@
+"""Deformations of a volume that keep a plane where it is: other wrists, looked up and never resampled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from armscan.errors import InvalidValueError
+from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, composed
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeformingTransform(RigidTransform):
+    """A rigid motion T of a volume that is deformed about a plane first; the moved volume is V'(q) = V(D(T(q))).
+
+    D keeps the plane as a set of points. In the plane's frame (across, along its normal, in depth), from the point
+    `about_mm` on, the volume's point x comes to lie at F x, F being `deformation`, so that a lookup at x takes F^-1 x.
+    `inverse_plane` holds for this plane: that another one is bent away by the shears along the arm is left out.
+
+    Args:
+        plane: the plane that is kept.
+        about_mm: the point of the plane that stays in place, (across, depth) in its frame.
+        deformation: F, shape (3, 3); its second row is zero but for the stretch along the normal.
+
+    Raises:
+        InvalidValueError: if `deformation` moves the plane, or squeezes the volume flat.
+    """
+
+    plane: ManipulatorAction
+    about_mm: tuple[float, float]
+    deformation: FloatArray
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        matrix = self.deformation
+        if matrix.shape != (3, 3) or matrix[1, [0, 2]].any() or not abs(np.linalg.det(matrix)) > 0.0:
+            raise InvalidValueError(
+                f"deformation is {matrix.tolist()}, but it must be 3 x 3, not flat, with zeros beside the middle of "
+                "its second row"
+            )
+
+    @cached_property
+    def _lookup(self) -> tuple[FloatArray, FloatArray]:
+        """(A, b) of D(q) = A q + b in the volume's frame."""
+        frame = self.plane.matrix
+        matrix: FloatArray = frame @ np.linalg.inv(self.deformation) @ frame.T
+        across_mm, depth_mm = self.about_mm
+        kept_mm = frame @ np.array([across_mm, 0.0, depth_mm]) + self.plane.offset_mm
+        return matrix, kept_mm - matrix @ kept_mm
+
+    def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
+        """Return (M, b) with D(T(plane(p))) = M p + b: from the plane's frame into the volume as it is."""
+        return composed(*self._lookup, *super().plane_map(action))
