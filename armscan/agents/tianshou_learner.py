@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import tianshou.trainer
 import torch
+from tianshou.algorithm import algorithm_base
 from tianshou.algorithm.algorithm_base import Policy as TianshouPolicy
-from tianshou.data import Batch, Collector
+from tianshou.data import Batch, Collector, collector
 from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
 from armscan.agents.epoch_metrics import EpochMetrics
@@ -22,6 +25,10 @@ from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
 from armscan.errors import CheckpointError, DivergedError
 from armscan.volumes.plane import FloatArray
+
+# Tianshou measures how long it takes on the wall clock, and raises an error where that is turned back meanwhile.
+for _module in (algorithm_base, collector, tianshou.trainer):
+    vars(_module)["time"] = SimpleNamespace(time=time.perf_counter, sleep=time.sleep)
 
 
 class TianshouLearner:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import TypeVar
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.agents import Agent, AgentSetup, Algorithm, Learner
+from armscan.agents import Agent, AgentSetup, Algorithm, Compute, Learner
 from armscan.config.defaults import CLUSTER, to_plain
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError, listed
@@ -21,6 +22,7 @@ from armscan.utils.log import silence_library_warnings
 from armscan.utils.validation import check_int, check_seed
 from armscan.volumes import LabelVolume
 
+T = TypeVar("T")
 SECTIONS = ("data", "obs", "reward", "agent", "network", "tracking", "env", "training", "evaluation", "compute")
 SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
 EVALUATION_KEYS = ("episodes",)
@@ -115,8 +117,8 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
     check_words(config)
     seed = check_seed("seed", config.seed)
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
-    budget = instantiate(config.training, _convert_="object")
-    split = split or instantiate(config.data, _convert_="object")
+    budget = _made(config, "training", Budget)
+    split = split or _made(config, "data", Split)
     smallest = smallest_slice([*split.training.values(), *split.validation.values(), *split.test.values()])
     env_factory = make_env_factory(apply_crop(config, smallest, smallest), split.training)
     agent = make_agent(config, env_factory, split.training, total_env_steps=budget.env_steps, seed=seed)
@@ -142,9 +144,18 @@ def check_words(config: DictConfig) -> None:
     to_plain(config)
     check_seed("seed", config.seed)
     check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
-    for section in (config.training, config.env, config.compute):
-        instantiate(section, _convert_="object")
+    _made(config, "training", Budget)
+    _made(config, "compute", Compute)
+    instantiate(config.env, _convert_="object")
     make_algorithm(config)
+
+
+def _made(config: DictConfig, section: str, kind: type[T]) -> T:
+    """Return what a section of the configuration builds, which must be of this class."""
+    made = instantiate(config[section], _convert_="object")
+    if not isinstance(made, kind):
+        raise InvalidValueError(f"{section} builds {made!r}, but it must build a {kind.__name__}")
+    return made
 
 
 def apply_crop(config: DictConfig, trained_px: tuple[int, int], here_px: tuple[int, int]) -> DictConfig:
@@ -174,7 +185,7 @@ def make_agent(
         action_names=env.get_wrapper_attr("action_names"),
         total_env_steps=total_env_steps,
         seed=seed,
-        compute=instantiate(config.compute, _convert_="object"),
+        compute=_made(config, "compute", Compute),
     )
     agent = algorithm.agent(setup)
     if hasattr(agent, "learn") and not isinstance(agent, Learner):

@@ -6,7 +6,6 @@ of the run is touched.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 from omegaconf import OmegaConf
+from pydantic import TypeAdapter, ValidationError
 
 from armscan.agents import Learner
 from armscan.config.defaults import RESUME, TRACKING_URI, default_tracking
@@ -32,7 +32,7 @@ from armscan.tracking import (
     open_existing_store,
     sync,
 )
-from armscan.training import Fingerprints, check_unchanged, resume_from_checkpoint
+from armscan.training import Fingerprints, check_unchanged, fingerprints_in, resume_from_checkpoint
 from armscan.utils.files import (
     CONFIG_FILE,
     LAST_CHECKPOINT,
@@ -73,11 +73,27 @@ def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -
         resume_run(client, run.info.run_id, trust=trust)
         return
     _check_unfinished(run)
-    grid = json.loads(run.data.tags[GRID_TAG])
+    grid = _grid_of(run)
     if not trust:
         _check_grid(run, grid, uri)
     _enter_working_folder(run)
     repeat_grid(grid)
+
+
+def _grid_of(run: Run) -> list[str]:
+    """Return the words that a grid is repeated with."""
+    try:
+        return TypeAdapter(list[str]).validate_json(_tag(run, GRID_TAG), strict=True)
+    except ValidationError as error:
+        raise ResumeError(f"run {run.info.run_id}: its tag {GRID_TAG} holds no words of a command line") from error
+
+
+def _tag(run: Run, name: str) -> str:
+    """Return a tag that each run of armscan has."""
+    try:
+        return str(run.data.tags[name])
+    except KeyError as error:
+        raise ResumeError(f"run {run.info.run_id} has no tag {name}, as each run of armscan run has") from error
 
 
 def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
@@ -85,7 +101,7 @@ def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
     where = f"run {run.info.run_id}"
     check_stored_words(words, uri, where=where)
     # Its `conf/` and `sweeps/` are part of the configuration.
-    folder = Path(run.data.tags["working_folder"])
+    folder = Path(_tag(run, "working_folder"))
     if folder.resolve() != Path.cwd().resolve():
         raise UntrustedError(
             f"{where}: it was started in {folder}, whose configuration could execute code of others; repeat the "
@@ -154,7 +170,8 @@ def _folder_of(run: Run) -> Path:
     folder = Path(tags["folder"])
     if not folder.is_dir():
         raise ResumeError(
-            f"run {run_id} cannot be resumed: its folder {folder} is not there; it last ran on the host {tags['host']}"
+            f"run {run_id} cannot be resumed: its folder {folder} is not there; it last ran on the host "
+            f"{_tag(run, 'host')}"
         )
     return folder
 
@@ -178,7 +195,7 @@ def _started_with(run: Run, file: Path, what: str) -> bytes:
         contents = file.read_bytes()
     except OSError as error:
         raise ResumeError(f"{file}: the run's {what} cannot be read ({error.strerror})") from error
-    if sha256(contents) != run.data.tags[SHA256_TAGS[file.name]]:
+    if sha256(contents) != _tag(run, SHA256_TAGS[file.name]):
         raise ResumeError(
             f"{file}: is not the {what} that run {run.info.run_id} was started with: changed, or another run's"
         )
@@ -199,17 +216,20 @@ def _check_volumes(run: Run, folder: Path, now: Fingerprints) -> None:
     """Raise `ChangedVolumesError` where a run would go on with other volumes, whether it has a checkpoint or not."""
     # Of runs that were started before it was kept, the checkpoint says so.
     if SHA256_TAGS[VOLUMES_FILE] in run.data.tags:
-        then = json.loads(_started_with(run, folder / VOLUMES_FILE, "record of its volumes"))
+        record = folder / VOLUMES_FILE
+        then = fingerprints_in(_started_with(run, record, "record of its volumes"), str(record))
         check_unchanged(then, now, f"run {run.info.run_id} was started with")
 
 
 def _enter_working_folder(run: Run) -> None:
     """Go to where the run was started, from where its configuration names files."""
-    folder = run.data.tags["working_folder"]
+    folder = _tag(run, "working_folder")
     try:
         os.chdir(folder)
-    except OSError as error:
+    # Also for what no path can have.
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
         raise ResumeError(
             f"run {run.info.run_id} was started in {folder}, from where its configuration names files, but one cannot "
-            f"go there ({error.strerror})"
+            f"go there ({reason})"
         ) from error

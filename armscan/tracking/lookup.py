@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from packaging.version import Version
+from packaging.version import InvalidVersion, Version
 
 import armscan
 from armscan.config.trust import stored_config
@@ -88,8 +87,10 @@ class FoundRun:
         """
         if SHA256_TAGS[VOLUMES_FILE] not in self.tags:
             return None
-        volumes: Fingerprints = json.loads(self._started_with(VOLUMES_FILE, folder))
-        return volumes
+        # Deferred: a mistake on the command line is answered before it is loaded.
+        from armscan.training import fingerprints_in
+
+        return fingerprints_in(self._started_with(VOLUMES_FILE, folder), f"run {self.run_id}: its {VOLUMES_FILE}")
 
     def text(self, file: str, folder: Path) -> str | None:
         """Return what an artifact says, fetched into `folder`; None where the run has none of this name."""
@@ -180,9 +181,13 @@ def check_run_id(run_id: str) -> None:
 
 
 def check_version(run: Run) -> None:
-    """Raise `TrackingError` where a run was made by a newer version, which may have kept it otherwise."""
+    """Raise `TrackingError` where a run was made by a newer version, which may have kept it otherwise, or by none."""
     version = run.data.tags.get(VERSION_TAG, armscan.__version__)
-    if Version(version).release > Version(armscan.__version__).release:
+    try:
+        is_newer = Version(version).release > Version(armscan.__version__).release
+    except InvalidVersion as error:
+        raise TrackingError(f"run {run.info.run_id}: its tag {VERSION_TAG} is {version[:50]!r}, no version") from error
+    if is_newer:
         raise TrackingError(
             f"run {run.info.run_id} was made by armscan {version}, but this is {armscan.__version__}: "
             "it needs that version or a newer one"

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from armscan.config.command_hints import armscan_command
-from armscan.errors import is_interruption
+from armscan.errors import TrackingError, is_interruption
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import DIFF_SUM, environment_tags, source, source_tags
 from armscan.tracking.notes import forget
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MODEL_FILE = "MLmodel"
 # Why a run ended before its end.
 FAILURE_TAG = "failure"
-MAX_REASON_CHARS = 5000
+MAX_REASON_CHARS, MAX_DIGITS = 5000, 9
 # For a store that is away, where somebody waits for this process to end.
 SHORT_WAIT_S = 2.0
 
@@ -106,7 +106,9 @@ class TrackedRun:
             tags: tags to set anew.
         """
         run = store.get_run(run_id)
-        n_resumed = int(run.data.tags.get("resumed", "0")) + 1
+        if not (resumed := run.data.tags.get("resumed", "0")).isdecimal():
+            raise TrackingError(f"run {run_id}: its tag resumed is {resumed[:50]!r}, but it must be a whole number")
+        n_resumed = int(resumed[:MAX_DIGITS]) + 1
         now = {**source_tags(), **environment_tags()}
         changed = {f"resumed.{key}": value for key, value in now.items() if run.data.tags.get(key) != value}
         had_outbox = file_of(folder, run_id).exists()

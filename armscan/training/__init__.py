@@ -4,7 +4,7 @@ from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from armscan.training.checkpointing import CheckpointProvenance, resume_from_checkpoint
 from armscan.training.domain import TrainingDomain
-from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint
+from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint, fingerprints_in
 from armscan.training.metrics import MetricEstimates
 from armscan.training.rollout import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation, evaluate
 from armscan.training.splits import PARTS, Split, mixed_data, nifti_data, phantom_data
@@ -35,6 +35,7 @@ __all__ = [
     "check_unchanged",
     "evaluate",
     "fingerprint",
+    "fingerprints_in",
     "load_checkpoint",
     "load_weights",
     "mixed_data",

@@ -57,7 +57,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         with path.open("rb") as file:
             loaded = torch.load(_verified(file, path), map_location="cpu", weights_only=True)
-            return loaded["state"], loaded["facts"]
+            return dict(loaded["state"]), dict(loaded["facts"])
     except FileNotFoundError as error:
         raise CheckpointError(f"{path}: there is no such checkpoint") from error
     except (CheckpointError, MemoryError):

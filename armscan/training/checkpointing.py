@@ -17,7 +17,7 @@ from armscan.agents.protocols import Learner
 from armscan.errors import CheckpointError
 from armscan.training.callbacks import EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
-from armscan.training.fingerprints import Fingerprints, check_unchanged
+from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprints_in
 from armscan.training.rollout import EpisodeResult, Evaluation
 from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
@@ -51,7 +51,8 @@ class CheckpointProvenance:
             raise CheckpointError(
                 f"{path}: is a checkpoint of run {facts.get('run_id')!r}, but this is {self.run_id!r}"
             )
-        check_unchanged(facts.get("volumes", {}), self.volumes, f"{path} was trained with")
+        volumes = fingerprints_in(facts.get("volumes", {}), str(path))
+        check_unchanged(volumes, self.volumes, f"{path} was trained with")
 
 
 def save_checkpoints(
@@ -85,7 +86,13 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
     state, facts = load_checkpoint(last)
     provenance.check(last, facts)
     reports = _read(facts.get("reports"), last)
-    learner.load_state(state)
+    try:
+        learner.load_state(state)
+    # The checksum is right, so somebody has written another state.
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(f"{last}: does not hold the state of this agent: {error!r}") from error
     best_report = [report for report in reports if report.is_best][-1]
     if best_report is reports[-1]:
         # A kill may have come before this was written.

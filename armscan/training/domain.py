@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 from gymnasium import spaces
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from armscan.envs.observation_registry import NAMED_OBSERVATIONS
 from armscan.errors import InvalidValueError
@@ -18,6 +18,7 @@ from armscan.volumes import LabelVolume
 
 # By which share a size may lie outside the range of the training volumes without a word about it.
 USUAL_DIFFERENCE = 0.1
+MAX_SHOWN_CHARS = 100
 Range = tuple[float, float]
 
 
@@ -60,8 +61,17 @@ class TrainingDomain:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Read what `to_json` wrote."""
-        return TypeAdapter(cls).validate_json(text)
+        """Read what `to_json` wrote.
+
+        Raises:
+            InvalidValueError: if it is anything else.
+        """
+        try:
+            return TypeAdapter(cls).validate_json(text)
+        except ValidationError as error:
+            raise InvalidValueError(
+                f"what an agent was trained on is {text[:MAX_SHOWN_CHARS]!r}: not readable"
+            ) from error
 
     def check_observed(self, other: TrainingDomain) -> None:
         """Raise `InvalidValueError` where other environments show something of another shape than these."""

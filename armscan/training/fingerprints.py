@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from armscan.errors import ChangedVolumesError
 from armscan.volumes import LabelVolume
@@ -19,6 +22,23 @@ def fingerprint(volume: LabelVolume) -> str:
     digest = hashlib.sha256(repr(rest).encode())
     digest.update(volume.labels.data)
     return digest.hexdigest()
+
+
+def fingerprints_in(record: bytes | Any, where: str) -> Fingerprints:
+    """Return the fingerprints of a record.
+
+    Args:
+        record: JSON text, or plain dictionaries, as somebody has stored it.
+        where: place of the record, for the message.
+
+    Raises:
+        ChangedVolumesError: if it is no record of volumes.
+    """
+    reader = TypeAdapter(Fingerprints)
+    try:
+        return reader.validate_json(record) if isinstance(record, bytes) else reader.validate_python(record)
+    except ValidationError as error:
+        raise ChangedVolumesError(f"{where}: is no record of volumes and their fingerprints") from error
 
 
 def check_unchanged(then: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], those_of: str) -> None:

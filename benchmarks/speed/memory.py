@@ -1,25 +1,30 @@
-"""Memory that 8 volumes add to 64 environments in one process.
+"""Memory that 8 volumes add to 64 environments in one process, and memory over a million steps.
 
     python -m benchmarks.speed.memory [FOLDER]
 
 What is counted is what the volumes add: the memory with them, less that of the same environments on small volumes.
+Over a million steps, resets included, the memory of a process stays what it was after the first tenth of them.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import psutil
 
 import armscan  # noqa: F401 - registers the environment
-from armscan.envs import make_armscan_vector_env
+from armscan.envs import make_armscan_env, make_armscan_vector_env
 from armscan.volumes import LabelVolume, ManipulatorAction, load_phantoms, read_dataset
 
 NUM_ENVS, N_VOLUMES, N_STEPS = 64, 8, 40
 RULES = {"projection": "zy", "transform": None, "success_threshold": 1.0}
+# Over a million steps: volumes moved at each reset, observations stacked, the best actions remembered.
+LONG_RULES = {"projection": "zy", "rotation_bounds_deg": (90.0, 45.0), "stack": 8, "memory": 4}
+N_LONG_STEPS, N_LOOKS = 10**6, 10
 
 
 def resident_bytes() -> int:
@@ -35,24 +40,46 @@ def small_volumes() -> list[LabelVolume]:
     return [LabelVolume(labels, (1.0, 1.0, 1.0), f"small-{i}", plane) for i in range(N_VOLUMES)]
 
 
-def bytes_when_stepping(volumes: Sequence[LabelVolume]) -> int:
+def bytes_when_stepping(volumes: Sequence[LabelVolume]) -> list[float]:
     """Step environments until every volume has been seen; return the bytes that the process then holds."""
     envs = make_armscan_vector_env(NUM_ENVS, volumes, **RULES)
     envs.reset(seed=0)
     envs.action_space.seed(0)
     for _ in range(N_STEPS):
         envs.step(envs.action_space.sample())
-    return resident_bytes()
+    return [float(resident_bytes())]
 
 
-def bytes_in_child(volumes: Sequence[LabelVolume]) -> int:
-    """Return the same for a fresh process."""
+def in_child(measure: Callable[..., list[float]], *args: object) -> list[float]:
+    """Return what a fresh process measures."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(bytes_when_stepping, (volumes,))
+        return pool.apply(measure, args)
+
+
+def bytes_over_steps(volumes: Sequence[LabelVolume], num_envs: int) -> list[float]:
+    """Take a million environment steps; return the bytes after each tenth, and the seconds of all.
+
+    Args:
+        volumes: volumes of the environments.
+        num_envs: number of environments side by side; 1 for the single environment.
+    """
+    envs = make_armscan_env(volumes, **LONG_RULES)
+    if num_envs > 1:
+        envs = make_armscan_vector_env(num_envs, volumes, **LONG_RULES)
+    envs.action_space.seed(0)
+    envs.reset(seed=0)
+    start_s, looks = time.perf_counter(), []
+    for _ in range(N_LOOKS):
+        for _ in range(N_LONG_STEPS // N_LOOKS // num_envs):
+            _, _, terminated, truncated, _ = envs.step(envs.action_space.sample())
+            if num_envs == 1 and (terminated or truncated):
+                envs.reset()
+        looks.append(float(resident_bytes()))
+    return [*looks, time.perf_counter() - start_s]
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     if len(sys.argv) > 1:
         volumes = list(read_dataset(sys.argv[1]).values())
     else:
@@ -60,8 +87,16 @@ def main() -> None:
     n_voxels = sum(volume.labels.size for volume in volumes)
     print(f"{len(volumes)} volumes, {n_voxels / 2**20:.0f} MiB of voxels as uint8; {NUM_ENVS} environments\n")
     print("| | MiB that the volumes add | times their voxels |\n| --- | --- | --- |")
-    added = bytes_in_child(volumes) - bytes_in_child(small_volumes())
-    print(f"| one process | {added / 2**20:.0f} | {added / n_voxels:.2f} |")
+    added = in_child(bytes_when_stepping, volumes)[0] - in_child(bytes_when_stepping, small_volumes())[0]
+    print(f"| one process | {added / 2**20:.0f} | {added / n_voxels:.2f} |\n", flush=True)
+    print("| MiB after steps | 100,000 | 500,000 | 1,000,000 | most | grown since 100,000 | minutes |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for num_envs in (1, NUM_ENVS):
+        *looks, seconds = in_child(bytes_over_steps, volumes, num_envs)
+        figures = (looks[0], looks[4], looks[-1], max(looks), looks[-1] - looks[0])
+        name = "one environment" if num_envs == 1 else f"{num_envs} environments side by side"
+        shown = " | ".join(f"{figure / 2**20:.1f}" for figure in figures)
+        print(f"| {name} | {shown} | {seconds / 60:.1f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -52,6 +52,15 @@ def test_learner_of_many_updates_a_collection_shows_no_bars_of_its_own(make_lear
 
 
 @by_reinforcement
+def test_learner_learns_while_the_wall_clock_is_turned_back(make_learner, monkeypatch):
+    hours = iter(range(10**6, 0, -1))
+    monkeypatch.setattr("time.time", lambda: 3600.0 * next(hours))
+    learner = make_learner()
+    learner.warm_up()
+    assert learner.learn(40)["speed/env_steps_per_s"] > 0
+
+
+@by_reinforcement
 def test_learner_reports_episodes_losses_and_speed(make_learner):
     learner = make_learner()
     learner.warm_up()

@@ -13,7 +13,8 @@ from armscan.experiment.resume import resume
 from armscan.policies.build import SUM_TAG
 from armscan.policies.model import CODE, model_sha256
 from armscan.tracking import open_store
-from armscan.utils.files import CONFIG_FILE, SHA256_TAGS, sha256
+from armscan.tracking.lookup import DOMAIN_TAG, VERSION_TAG
+from armscan.utils.files import CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
 from tests.cli.test_evaluate import GUESSER, tracked
 from tests.cli.test_policy import registered, store_of
 
@@ -95,6 +96,33 @@ def test_configuration_that_was_made_to_harm_is_one_line(armscan, tmp_path, text
     store_of(tmp_path).set_terminated(run_id, "KILLED")
     with pytest.raises(ResumeError, match="the run's configuration is damaged"):
         resume([f"resume={run_id}"], list)
+
+
+@pytest.mark.parametrize(
+    ("tag", "value", "line"),
+    [
+        (DOMAIN_TAG, "x", "no training domain can be read from 'x'"),
+        (DOMAIN_TAG, '{"observed": 3}', "no training domain can be read from"),
+        (VERSION_TAG, "x", f"its tag {VERSION_TAG} is 'x', no version"),
+    ],
+)
+def test_tag_that_is_not_what_armscan_writes_is_one_line(armscan, tmp_path, tag, value, line):
+    run_id = tracked(tmp_path)
+    store_of(tmp_path).set_tag(run_id, tag, value)
+    code, _, errors = answered(armscan, "evaluate", run_id)
+    assert (code, len(errors.splitlines())) == (2, 1)
+    assert line in errors
+
+
+@pytest.mark.parametrize("record", ["", "x", "[]", '{"test": 3}', '{"test": {"a": 3}}'])
+def test_record_of_volumes_that_is_none_is_one_line(armscan, tmp_path, record):
+    run_id = tracked(tmp_path)
+    (tmp_path / VOLUMES_FILE).write_text(record)
+    store_of(tmp_path).log_artifact(run_id, str(tmp_path / VOLUMES_FILE))
+    store_of(tmp_path).set_tag(run_id, SHA256_TAGS[VOLUMES_FILE], sha256(record.encode()))
+    code, _, errors = answered(armscan, "evaluate", run_id)
+    line = f"error: run {run_id}: its {VOLUMES_FILE}: is no record of volumes and their fingerprints"
+    assert (code, errors) == (2, line)
 
 
 def test_run_with_a_class_of_ones_own_is_evaluated_with_trust(armscan, tmp_path):

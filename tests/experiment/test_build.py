@@ -80,3 +80,11 @@ def test_build_refuses_an_agent_that_learns_but_lacks_what_training_needs(phanto
     config.agent = {"_target_": "tests.experiment.test_build.Unfinished"}
     with pytest.raises(InvalidValueError, match=r"agent is Unfinished, which learns, .* has no .*policy.* or weights"):
         build_experiment(config)
+
+
+@pytest.mark.parametrize("section", ["data", "training", "compute"])
+def test_section_that_builds_something_else_is_refused(phantom, monkeypatch, section):
+    config = config_of_sizes(phantom, monkeypatch)
+    config[section] = {}
+    with pytest.raises(InvalidValueError, match=f"^{section} builds {{}}, but it must build a "):
+        build_experiment(config)

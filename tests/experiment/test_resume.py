@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,8 @@ import armscan
 from armscan.experiment.job import GRID_TAG
 from armscan.tracking import open_store
 from armscan.training import load_checkpoint
-from armscan.utils.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, folder_lock
+from armscan.utils.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, folder_lock, sha256
+from tests.support.killed_at import Moment, commands
 from tests.support.waiting import HANG_S, wait_until
 from tests.test_run import SMALL, TIMES, armscan_run, job_process_ids, runs_in
 
@@ -153,6 +155,52 @@ def test_run_killed_again_and_again_ends_as_if_it_had_not_been(tmp_path, argumen
     assert_ended_alike(tmp_path)
 
 
+def moments(drawn):
+    """Twenty moments of one training, in the order in which it meets them, each in a process of its own."""
+    collecting, validating = "armscan.envs.vector_env:ArmscanVectorEnv.step", "armscan.envs.env:ArmscanEnv.step"
+    updating = "torch.optim:Adam.step"
+    soon = partial(drawn.uniform, 0.0, 0.01)
+    return [
+        # Before there is a checkpoint.
+        Moment(collecting, drawn.randrange(1, 7)),
+        Moment(collecting, drawn.randrange(7, 20), soon()),
+        Moment(updating, drawn.randrange(1, 50)),
+        Moment(updating, drawn.randrange(50, 200), soon()),
+        Moment(validating, drawn.randrange(1, 5)),
+        Moment(validating, drawn.randrange(5, 9), soon()),
+        # While the first is written: before its contents, in the middle, behind them, before and after its name.
+        Moment("torch:save"),
+        Moment("torch:save", 1, drawn.uniform(0.0, 0.003)),
+        Moment("os:fsync", drawn.randrange(3, 5)),
+        Moment("pathlib:Path.replace", 4),
+        Moment("armscan.training.checkpointing:save_checkpoint", 1, 900.0),
+        # Resumed, the best is written again; then the next epoch's.
+        Moment("torch:save", 1, drawn.uniform(0.0, 0.003)),
+        Moment("armscan.training.checkpointing:save_checkpoint", 2, 900.0),
+        Moment(collecting, drawn.randrange(1, 13), soon()),
+        # Between a checkpoint and its entry, and around the delivery of an entry.
+        Moment("armscan.tracking.run:TrackedRun.on_epoch"),
+        Moment("armscan.tracking.run:TrackedRun.on_epoch", 1, 900.0),
+        Moment("mlflow:MlflowClient.log_batch", drawn.randrange(1, 4), 900.0),
+        Moment(updating, drawn.randrange(1, 200)),
+        # When all is learned.
+        Moment("armscan.training.video:record_episode", 1, drawn.uniform(0.0, 0.05)),
+        Moment("armscan.experiment.runner:keep_results", 1, drawn.uniform(0.0, 0.1)),
+    ]
+
+
+@pytest.mark.slow
+def test_run_killed_at_twenty_moments_ends_with_the_same_weights_and_figures(tmp_path):
+    with commands(tmp_path) as command:
+        words = LONGER
+        for moment in moments(random.Random(18)):
+            assert command.run(words, moment) == -signal.SIGKILL, (moment, (tmp_path / "printed").read_text())
+            words = [f"resume={runs_in(tmp_path)[1][0].info.run_id}"]
+        assert command.run(words) == 0, (tmp_path / "printed").read_text()
+        assert command.run(LONGER) == 0
+    assert_ended_alike(tmp_path)
+
+
 @pytest.mark.slow
 def test_interrupted_run_says_how_to_go_on_and_only_one_process_may(tmp_path):
     with (tmp_path / "printed").open("w") as printed:
@@ -281,6 +329,29 @@ def test_resume_refuses_a_run_of_a_newer_version(answer, cut_off):
     client, run_id, _ = cut_off
     client.set_tag(run_id, "armscan.version", "99.1.0")
     assert f"was made by armscan 99.1.0, but this is {armscan.__version__}" in refused(answer, f"resume={run_id}")
+
+
+@pytest.mark.parametrize(
+    ("tag", "value", "line"),
+    [
+        ("armscan.version", "x", "its tag armscan.version is 'x', no version"),
+        ("config.sha256", None, "has no tag config.sha256"),
+        ("working_folder", None, "has no tag working_folder"),
+        ("working_folder", "/nowhere", "one cannot go there (No such file or directory)"),
+        ("working_folder", "a\0b", "one cannot go there (embedded null byte)"),
+        (GRID_TAG, "x", "its tag grid holds no words of a command line"),
+        (GRID_TAG, "{}", "its tag grid holds no words of a command line"),
+        (GRID_TAG, "[1]", "its tag grid holds no words of a command line"),
+    ],
+)
+def test_resume_refuses_a_run_whose_tags_are_not_those_of_armscan(answer, cut_off, tag, value, line):
+    client, run_id, folder = cut_off
+    client.set_tag(run_id, "config.sha256", sha256((folder / CONFIG_FILE).read_bytes()))
+    if value is None:
+        client.delete_tag(run_id, tag)
+    else:
+        client.set_tag(run_id, tag, value)
+    assert line in refused(answer, f"resume={run_id}")
 
 
 def test_resume_refuses_a_grid_that_has_finished(answer, cut_off):

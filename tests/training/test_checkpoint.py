@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import json
 import pickle
 
 import pytest
@@ -9,8 +10,9 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from armscan.errors import CheckpointError
-from armscan.training import load_checkpoint, save_checkpoint
+from armscan.errors import ChangedVolumesError, CheckpointError
+from armscan.training import CheckpointProvenance, load_checkpoint, resume_from_checkpoint, save_checkpoint
+from armscan.training.checkpointing import EPISODE_FIELDS
 
 
 def test_checkpoint_gives_back_what_was_saved(tmp_path):
@@ -109,10 +111,27 @@ def test_checkpoint_runs_no_code_from_the_file(tmp_path, capsys, is_zipped):
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize("content", [3, [1], {"state": {}}])
+@pytest.mark.parametrize("content", [3, [1], {"state": {}}, {"state": 3, "facts": {}}, {"state": {}, "facts": 3}])
 def test_checkpoint_that_holds_something_else_is_refused(tmp_path, content):
     file = io.BytesIO()
     torch.save(content, file)
     (tmp_path / "a.pt").write_bytes(with_a_right_sum(file.getvalue()))
     with pytest.raises(CheckpointError, match="is no checkpoint"):
         load_checkpoint(tmp_path / "a.pt")
+
+
+@pytest.mark.parametrize("error", [KeyError("replay"), TypeError("3"), AttributeError("numpy"), RuntimeError("shape")])
+def test_state_that_no_learner_takes_is_refused(tmp_path, error):
+    class Learner:
+        def load_state(self, state):
+            raise error
+
+    report = {"epoch": 1, "n_env_steps": 7, "wall_s": 1.0, "metrics": {}, "is_best": True}
+    reports = json.dumps([report | {"episodes": {name: [] for name in EPISODE_FIELDS}}])
+    facts = CheckpointProvenance().facts() | {"reports": reports}
+    save_checkpoint(tmp_path / "last.pt", {}, facts)
+    with pytest.raises(CheckpointError, match=r"last\.pt: does not hold the state of this agent: "):
+        resume_from_checkpoint(Learner(), tmp_path, CheckpointProvenance())
+    save_checkpoint(tmp_path / "last.pt", {}, facts | {"volumes": [3]})
+    with pytest.raises(ChangedVolumesError, match=r"last\.pt: is no record of volumes"):
+        resume_from_checkpoint(Learner(), tmp_path, CheckpointProvenance())

@@ -1,0 +1,44 @@
+"""A wall clock for processes of a test that can be set while they run; their monotonic clock goes on as it is."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+from tests.support.requirements import unavailable
+
+LIBRARIES = Path("/usr/lib")
+# libfaketime answers Python's own `time.sleep`, which names a monotonic moment, with an error.
+SLEEP = "import select, time\ntime.sleep = lambda seconds: select.select([], [], [], seconds) and None\n"
+
+
+class WallClock:
+    """A wall clock, by libfaketime.
+
+    Args:
+        folder: a folder of its own.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        libraries = sorted(LIBRARIES.glob("*/faketime/libfaketimeMT.so.1"))
+        if shutil.which("faketime") is None or not libraries:
+            unavailable("libfaketime is not installed: apt-get install faketime")
+        folder.mkdir()
+        (folder / "sitecustomize.py").write_text(SLEEP)
+        self._file = folder / "offset"
+        self.set(0)
+        # Of the processes that have this clock.
+        self.environment = os.environ | {
+            "LD_PRELOAD": str(libraries[0]),
+            "PYTHONPATH": os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]),
+            "FAKETIME_TIMESTAMP_FILE": str(self._file),
+            "FAKETIME_NO_CACHE": "1",
+            "FAKETIME_DONT_FAKE_MONOTONIC": "1",
+        }
+
+    def set(self, hours: int) -> None:
+        """Sets it to so many hours after the time that it is."""
+        written = self._file.with_suffix(".new")
+        written.write_text(f"{hours:+d}h\n")
+        written.replace(self._file)

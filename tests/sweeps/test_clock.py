@@ -1,0 +1,58 @@
+"""A study while the wall clock jumps: leases and waits are measured on clocks that do not."""
+
+import subprocess
+from datetime import datetime, timedelta
+
+import optuna
+import pytest
+from mlflow import MlflowClient
+from optuna.trial import TrialState, create_trial
+
+from armscan.sweeps.scheduling.state import StudyState
+from tests.support.clock import WallClock
+from tests.support.waiting import HANG_S, wait_until
+from tests.sweeps.test_command import COMMAND, TINY, trials_of
+
+N_TRIALS = 5
+
+
+@pytest.mark.slow
+def test_study_whose_clock_jumps_an_hour_either_way_finishes_every_trial_once(tmp_path):
+    clock, printed = WallClock(tmp_path / "clock"), tmp_path / "printed"
+    with printed.open("w") as output:
+        study = subprocess.Popen(
+            [*COMMAND, *TINY, f"study.n_trials={N_TRIALS}", "study.workers=2", "study.final_eval.top_k=0"],
+            cwd=tmp_path,
+            env=clock.environment,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
+
+    def finished():
+        return sum(trial.state.is_finished() for trial in trials_of(tmp_path))
+
+    hours = [1, -1, 0]
+    wait_until(lambda: trials_of(tmp_path), process=study, log=printed.read_text)
+    for number, jump in enumerate(hours):
+        wait_until(lambda number=number: finished() >= number, process=study, log=printed.read_text)
+        clock.set(jump)
+    assert study.wait(HANG_S) == 0, printed.read_text()
+    trials = trials_of(tmp_path)
+    assert [trial.state for trial in trials] == [TrialState.COMPLETE] * N_TRIALS
+    # The jumps are there to be seen, or nothing was tried.
+    began = [trial.datetime_start for trial in trials]
+    assert max(began) - min(began) > timedelta(minutes=55)
+    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
+    assert {run.info.status for run in runs} == {"FINISHED"}
+    assert len([run for run in runs if "trial" in run.data.tags and "seed" in run.data.tags]) == N_TRIALS
+
+
+def test_time_of_a_trial_during_which_the_clock_was_turned_back_is_not_counted():
+    study, start = optuna.create_study(), datetime(2026, 11, 22, 12)
+    for hours in (2, -1):
+        trial = create_trial(value=1.0)
+        trial.datetime_start, trial.datetime_complete = start, start + timedelta(hours=hours)
+        study.add_trial(trial)
+    assert StudyState.of(study.trials).busy_hours == 2.0
+    assert StudyState.of(study.trials[1:]).busy_hours == 0.0
