@@ -13,6 +13,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from armscan.cli.options import FILE_PATH, CommaSeparated, clustering_option, examples
+from armscan.errors import InvalidValueError
 
 if TYPE_CHECKING:
     from armscan.anatomy import FoundPlane
@@ -80,6 +81,9 @@ def label(
     if markup is not None and (volumes or overwrite):
         idle = "--volumes" if volumes else "--overwrite"
         raise click.UsageError(f"{idle} is for a search, but --markup and --volume say which plane and for what")
+    if pictures is None and Path(folder, PICTURES).is_symlink():
+        # Whoever has made the folder of the data would choose where pictures are written.
+        raise InvalidValueError(f"{Path(folder, PICTURES)}: is a link: name the folder of the pictures with --pictures")
     from armscan.anatomy import check_tissues
     from armscan.annotation.labelling import LabellingOptions
     from armscan.annotation.labelling import label as label_planes

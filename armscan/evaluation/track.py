@@ -83,7 +83,7 @@ def evaluate_and_track(
             tracked.log_metrics(named, n_env_steps=subject.n_env_steps)
         file = out or FOLDER / f"{file_name(f'{subject.name}-{data}')}-{tracked.run_id[:8]}{SUFFIX}"
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
-        atomic_write(file, lambda opened: opened.write(text.encode()))
+        atomic_write(file, lambda opened: opened.write(text.encode()), follow_link=True)
         tracked.log_files(file)
     return report, file
 

@@ -39,7 +39,7 @@ def record_video(applied: PreparedAgent, *, n_episodes: int, seed: int, out: Pat
         _record(applied, n_episodes, seed, *made)
         for source, file in zip(made, files, strict=True):
             with source.open("rb") as contents:
-                atomic_write(file, partial(shutil.copyfileobj, contents))
+                atomic_write(file, partial(shutil.copyfileobj, contents), follow_link=True)
     return files
 
 

@@ -170,6 +170,10 @@ class Outbox(OutboxFile):
     def __init__(self, file: Path, *, timeout_s: float = LOCK_TIMEOUT_S) -> None:
         # The lock would make the folder of a run again that was removed.
         file.stat()
+        # A stranger's folder may have links to any file of this user, which would be written to.
+        links = [each for each in (file.parent, *map(file.with_suffix, OUTBOX_SUFFIXES)) if each.is_symlink()]
+        if links:
+            raise TrackingError(f"{links[0]}: is a link, but outboxes are files of the run's own folder")
         # Also who is told to leave closes it, in another thread.
         self._lock = FileLock(file.with_suffix(LOCK), timeout=timeout_s, thread_local=False)
         try:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from armscan.utils.files import atomic_write
+
 if TYPE_CHECKING:
     from armscan.training import EpochReport
 
@@ -45,4 +47,4 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
     for axes in (lengths, successes):
         axes.grid(alpha=0.3)
     figure.suptitle(title)
-    figure.savefig(path, dpi=110)
+    atomic_write(path, lambda file: figure.savefig(file, dpi=110, format=path.suffix[1:]))

@@ -69,9 +69,7 @@ class TrainingDomain:
         try:
             return TypeAdapter(cls).validate_json(text)
         except ValidationError as error:
-            raise InvalidValueError(
-                f"what an agent was trained on is {text[:MAX_SHOWN_CHARS]!r}: not readable"
-            ) from error
+            raise InvalidValueError(f"no training domain can be read from {text[:MAX_SHOWN_CHARS]!r}") from error
 
     def check_observed(self, other: TrainingDomain) -> None:
         """Raise `InvalidValueError` where other environments show something of another shape than these."""

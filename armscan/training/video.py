@@ -142,6 +142,8 @@ def record_episode(agent: Agent, env: Env, path: Path, *, seed: int) -> None:
         _, info = env.reset(seed=seed + attempt, options={"volume": first})
         if not info["starts_solved"]:
             break
+    # Not what a link at this place leads to.
+    path.unlink(missing_ok=True)
     with VideoRecorder(path) as video:
         video.capture(agent, env, volume_name=first, seed=seed + attempt)
 

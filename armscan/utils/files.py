@@ -61,7 +61,7 @@ def sqlite_file(uri: str) -> Path:
     return Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
 
 
-def atomic_write(path: Path, write: Callable[[BinaryIO], object]) -> None:
+def atomic_write(path: Path, write: Callable[[BinaryIO], object], *, follow_link: bool = False) -> None:
     """Write a file beside its place and move it there: a reader sees the old one or the new one, never half of one.
 
     Once it has returned, neither a killed process nor a power cut loses the new one.
@@ -69,9 +69,10 @@ def atomic_write(path: Path, write: Callable[[BinaryIO], object]) -> None:
     Args:
         path: the file's place; its folder exists.
         write: writes the contents to the open file it is given.
+        follow_link: whether to replace the file that a link at this place leads to, and not the link. Default: False,
+            because a stranger's folder may have links to any file of this user.
     """
-    # Where the place is a link, the file that it leads to is replaced, not the link.
-    path = path.resolve()
+    path = _place(path, follow_link=follow_link)
     unfinished = _unfinished(path)
     try:
         with named_if_full(path):
@@ -79,12 +80,16 @@ def atomic_write(path: Path, write: Callable[[BinaryIO], object]) -> None:
                 write(file)
                 file.flush()
                 os.fsync(file.fileno())
-            if path.exists():
+            if path.exists() and not path.is_symlink():
                 shutil.copymode(path, unfinished)
             unfinished.replace(path)
         _sync_folder(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def _place(path: Path, *, follow_link: bool) -> Path:
+    return path.resolve() if follow_link else path.parent.resolve() / path.name
 
 
 @contextlib.contextmanager
@@ -114,7 +119,7 @@ def _full_disk(error: BaseException | None) -> OSError | None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise the `OSError` that `atomic_write` would meet at a place; leave nothing there."""
+    """Raise the `OSError` that `atomic_write` would meet at a place, where it follows links; leave nothing there."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     unfinished = _unfinished(path.resolve())

@@ -145,7 +145,7 @@ def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str
             text.write(json.dumps(entries if path.name == ENTRIES_ONLY else document, indent=1) + "\n")
         else:
             _round_trip().dump(document, text)
-        atomic_write(path, lambda file: file.write(text.getvalue().encode()))
+        atomic_write(path, lambda file: file.write(text.getvalue().encode()), follow_link=True)
     # ruamel.yaml refuses some odd texts that PyYAML reads, with exceptions of many types.
     except Exception as error:
         raise ManifestError(f"{path}: the manifest cannot be written ({error})") from error

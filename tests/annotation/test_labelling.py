@@ -133,6 +133,21 @@ def test_label_names_the_volumes_that_it_knows(bare, names, capsys):
     assert f"the volume is 'x', but it must be {names[0]} or {names[1]}" in refused([str(bare), "--volumes=x"], capsys)
 
 
+def test_label_writes_nowhere_that_a_link_in_the_folder_leads_to(bare, names, quick, capsys, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (bare / "labelling").symlink_to(elsewhere)
+    assert "labelling: is a link: name the folder of the pictures" in refused([str(bare)], capsys)
+    (bare / "labelling").unlink()
+    (bare / "labelling").mkdir()
+    picture = bare / "labelling" / f"{names[0]}.png"
+    picture.symlink_to(elsewhere / "precious")
+    (elsewhere / "precious").write_text("precious")
+    assert main(["data", "label", str(bare), f"--volumes={names[0]}"]) == 0
+    assert not picture.is_symlink()
+    assert (elsewhere / "precious").read_text() == "precious"
+
+
 def test_label_leaves_no_plane_where_its_picture_cannot_be_written(bare, names, quick, capsys):
     (bare / "file").touch()
     assert "no folder can be made there" in refused([str(bare), f"--pictures={bare}/file"], capsys)

@@ -133,3 +133,23 @@ def test_outbox_that_is_not_there_is_not_made(tmp_path):
     with pytest.raises(FileNotFoundError):
         Outbox(file_of(tmp_path / "gone", ADDRESS.run_id))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["outbox.jsonl", "outbox.delivered.json", "outbox.lock", ""])
+def test_outbox_that_is_a_link_is_not_opened_and_what_it_leads_to_stays(tmp_path, name):
+    folder, precious = tmp_path / "theirs" / "tracking", tmp_path / "precious"
+    folder.mkdir(parents=True)
+    file = folder / "outbox.jsonl"
+    precious.write_text("no line that ends")
+    if name:
+        file.write_text("{}\n")
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).symlink_to(precious)
+    else:
+        folder.rmdir()
+        (tmp_path / "other").mkdir()
+        folder.symlink_to(tmp_path / "other")
+        file.write_text("{}\n")
+    with pytest.raises(TrackingError, match="is a link, but outboxes are files of the run's own folder"):
+        Outbox(file, timeout_s=0.0)
+    assert precious.read_text() == "no line that ends"

@@ -27,10 +27,22 @@ def test_file_behind_a_link_is_replaced_with_its_mode_kept(tmp_path):
     (tmp_path / "target").write_bytes(b"old")
     (tmp_path / "target").chmod(0o640)
     (tmp_path / "link").symlink_to(tmp_path / "target")
-    atomic_write(tmp_path / "link", lambda file: file.write(b"new"))
+    atomic_write(tmp_path / "link", lambda file: file.write(b"new"), follow_link=True)
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "target").read_bytes() == b"new"
     assert (tmp_path / "target").stat().st_mode & 0o777 == 0o640
+
+
+def test_link_is_replaced_and_not_the_file_that_a_stranger_lets_it_lead_to(tmp_path):
+    (tmp_path / "target").write_bytes(b"old")
+    (tmp_path / "target").chmod(0o600)
+    for target in ("target", "missing"):
+        (tmp_path / "link").unlink(missing_ok=True)
+        (tmp_path / "link").symlink_to(tmp_path / target)
+        atomic_write(tmp_path / "link", lambda file: file.write(b"new"))
+        assert not (tmp_path / "link").is_symlink()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["link", "target"]
+    assert (tmp_path / "target").read_bytes() == b"old"
 
 
 def test_unfinished_files_of_a_killed_writer_are_removed(tmp_path):
