@@ -184,7 +184,7 @@ def moments(drawn):
         Moment("mlflow:MlflowClient.log_batch", drawn.randrange(1, 4), 900.0),
         Moment(updating, drawn.randrange(1, 200)),
         # When all is learned.
-        Moment("armscan.training.video:record_episode", 1, drawn.uniform(0.0, 0.05)),
+        Moment("armscan.training.video:VideoRecorder.capture", 1, drawn.uniform(0.0, 0.05)),
         Moment("armscan.experiment.runner:keep_results", 1, drawn.uniform(0.0, 0.1)),
     ]
 
