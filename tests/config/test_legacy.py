@@ -128,6 +128,6 @@ def test_old_and_new_runs_have_the_same_keys_in_a_comparison(legacy, tmp_path):
 
 
 def test_values_of_an_old_trial_are_given_by_their_new_names():
-    from armscan.sweeps.space.overrides import overrides_of
+    from armscan.sweeps.space.parameter import overrides_of
 
     assert overrides_of({"agent.updates_per_env_step": 0.5, "agent.lr": 0.1}) == ["agent.utd_ratio=0.5", "agent.lr=0.1"]

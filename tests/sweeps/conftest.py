@@ -4,9 +4,8 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.scheduling.outcome import PendingWrites, TrialOutcome
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import FAILURE, Limits
+from armscan.sweeps.scheduling.state import FAILURE, Limits, PendingWrites, TrialOutcome
 from armscan.sweeps.storage.storage import open_storage
 
 

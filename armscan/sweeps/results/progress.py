@@ -20,7 +20,7 @@ from armscan.errors import StorageAwayError
 from armscan.experiment.console import print_where_to_look
 from armscan.sweeps.results.summary import final_results, shown_of, values_of
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, StudyState
-from armscan.sweeps.space.overrides import overrides_of
+from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.study import best_trials
 from armscan.utils.retry import no_retry

@@ -24,7 +24,7 @@ from plotly import graph_objects
 from armscan.reports.html import chart, table, video_address, write_page
 from armscan.sweeps.results.summary import ConfigResult, final_results, shown_of, values_of
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINALIST, METRICS, RETRIED, RETRY_OF, StudyState
-from armscan.sweeps.space.overrides import overrides_of
+from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import FOLDER, RUN
 

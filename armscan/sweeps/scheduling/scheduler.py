@@ -14,7 +14,6 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.config.legacy import renamed
-from armscan.sweeps.scheduling.outcome import PendingWrites, TrialOutcome
 from armscan.sweeps.scheduling.state import (
     ATTEMPT,
     ENV_STEPS,
@@ -26,7 +25,9 @@ from armscan.sweeps.scheduling.state import (
     RETRIED,
     RETRY_OF,
     Limits,
+    PendingWrites,
     StudyState,
+    TrialOutcome,
     env_steps_of,
 )
 from armscan.sweeps.storage.storage import Storage

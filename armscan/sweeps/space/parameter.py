@@ -1,4 +1,4 @@
-"""A dimension of a search space: what is written of it, and what Optuna draws from it."""
+"""A dimension of a search space, and its values: as Optuna keeps them, and as the command line has them."""
 
 from __future__ import annotations
 
@@ -8,17 +8,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Self
 
+from hydra.core.override_parser.types import Quote, QuotedString
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import BaseTrial
 from pydantic import AfterValidator, Field
 
+from armscan.config.legacy import renamed
 from armscan.errors import InvalidValueError
-from armscan.sweeps.space.overrides import Value, as_kept
 from armscan.sweeps.space.section import Section
 
 # Whatever begins with one of these.
 NOT_SEARCHED = ("study", "sweep", "tracking", "hydra", "seed")
 KEY = re.compile(r"[A-Za-z_][\w/]*(\.\w+)*")
+PLAIN_TEXT = re.compile(r"(?!(?i:true|false|null|nan|inf)$)[A-Za-z_][\w./\-]*")
+Value = bool | int | float | str | None
 Number = int | Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -128,3 +131,30 @@ class Parameter:
         """The values that have to be allowed for all of them to be."""
         drawn: Any = self.distribution
         return tuple(drawn.choices) if isinstance(drawn, CategoricalDistribution) else (drawn.low, drawn.high)
+
+
+def as_kept(value: Any) -> Value:
+    """Return a value as Optuna keeps it: a number or a text; of a list how it is written."""
+    kept: Value = written(value) if isinstance(value, list | tuple | Mapping) else value
+    return kept
+
+
+def overrides_of(chosen: Mapping[str, Value]) -> list[str]:
+    """Return values as they are written on the command line, those of earlier versions by their new names."""
+    return [f"{name}={written(value)}" for name, value in renamed(chosen).items()]
+
+
+def written(value: Any) -> str:
+    """Return a value as Hydra reads it on the command line."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(written, value))}]"
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{written(each)}" for key, each in value.items()) + "}"
+    # Neither that of a list, nor one in which nothing but a text is read.
+    if isinstance(value, str) and not value.startswith(("[", "{")) and not PLAIN_TEXT.fullmatch(value):
+        return QuotedString(value, Quote.single).with_quotes()
+    return str(value)

@@ -10,8 +10,7 @@ from optuna.distributions import CategoricalDistribution, distribution_to_json
 from optuna.trial import BaseTrial
 
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.space.overrides import Value, as_kept
-from armscan.sweeps.space.parameter import Parameter
+from armscan.sweeps.space.parameter import Parameter, Value, as_kept
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from armscan.config.defaults import to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
 from armscan.errors import ArmscanError, InvalidValueError, StudyError, listed
-from armscan.sweeps.space.overrides import Value, overrides_of
+from armscan.sweeps.space.parameter import Value, overrides_of
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.settings import StudySettings

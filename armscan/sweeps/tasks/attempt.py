@@ -19,8 +19,7 @@ from optuna.trial import Trial
 from armscan.config.compose import compose
 from armscan.config.defaults import CLUSTER, to_plain
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.scheduling.outcome import PendingWrites
-from armscan.sweeps.scheduling.state import ENV_STEPS, RETRY_OF, SEEDS
+from armscan.sweeps.scheduling.state import ENV_STEPS, RETRY_OF, SEEDS, PendingWrites
 from armscan.tracking import TrackedRun
 from armscan.training import Split
 from armscan.utils.validation import check_float

@@ -11,9 +11,8 @@ from typing import Any
 
 from optuna.trial import FrozenTrial, Trial
 
-from armscan.sweeps.scheduling.outcome import PendingWrites, TrialOutcome
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import HOLDER, LEASE
+from armscan.sweeps.scheduling.state import HOLDER, LEASE, PendingWrites, TrialOutcome
 from armscan.utils.log import log
 from armscan.utils.processes import ProcessInfo
 

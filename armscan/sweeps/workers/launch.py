@@ -20,7 +20,7 @@ from armscan.config.sources import working_folder
 from armscan.errors import ArmscanError, AwayError, StorageAwayError, StudyError
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, silence_launcher
 from armscan.sweeps.results.progress import progress_display
-from armscan.sweeps.space.overrides import written
+from armscan.sweeps.space.parameter import written
 from armscan.sweeps.study.arguments import STORAGE, USUAL_LAUNCHER, WORKER_KEY, StudyCommand, fixed_by
 from armscan.sweeps.study.open import OpenedStudy
 from armscan.sweeps.workers.heartbeat import LivenessCheck

@@ -18,9 +18,8 @@ from armscan.config.command_hints import run_command
 from armscan.config.defaults import MULTIRUN, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.errors import StorageAwayError, TrackingAwayError
-from armscan.sweeps.scheduling.outcome import TrialOutcome
-from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF
-from armscan.sweeps.space.overrides import overrides_of
+from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF, TrialOutcome
+from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.components import make_sampler, read_settings
 from armscan.sweeps.study.open import Phase, note_run, open_for_work, show_picture
 from armscan.sweeps.study.study import enqueue_final_trials

@@ -5,7 +5,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from armscan.errors import InvalidValueError
-from armscan.sweeps.space.overrides import overrides_of, written
+from armscan.sweeps.space.parameter import overrides_of, written
 from armscan.sweeps.space.space import Space
 
 DESCRIBED = {

@@ -4,7 +4,7 @@ import optuna
 import pytest
 
 from armscan.errors import InvalidValueError, TrackingError
-from armscan.sweeps.space.overrides import overrides_of
+from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.space.space import Space
 from armscan.tracking.outbox import file_of
 

@@ -16,9 +16,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.errors import StorageAwayError
 from armscan.sweeps.results import progress as screen
-from armscan.sweeps.scheduling.outcome import PendingWrites, TrialOutcome
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import LEASE, RETRY_OF, Limits
+from armscan.sweeps.scheduling.state import LEASE, RETRY_OF, Limits, PendingWrites, TrialOutcome
 from armscan.sweeps.storage.database import why_away
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.workers import heartbeat as lease
