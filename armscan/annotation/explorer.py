@@ -71,11 +71,7 @@ class Explorer:
         self.choose(name)
 
     def choose(self, name: str) -> None:
-        """Go to the middle of a volume.
-
-        Raises:
-            InvalidValueError: if there is no volume of that name.
-        """
+        """Go to the middle of a volume."""
         self.volume = self.volumes[check_choice("volume", name, list(self.volumes))]
         self.optimum = reachable_optimum(self.volume)
         self.rewards.clear()

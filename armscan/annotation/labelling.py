@@ -57,9 +57,6 @@ def label(request: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
     Returns:
         The volumes, with the plane that each had before, and the planes that are now in the manifest; and for which
         volumes none was found.
-
-    Raises:
-        ArmscanError: if the request or a file cannot be used.
     """
     dataset = open_dataset(request.data, require_manifest=False)
     volumes = _wanted(request, dataset)

@@ -29,13 +29,7 @@ def resume_command(run_id: str, tracking_uri: str, *, trust: bool = False) -> st
 
 
 def armscan_command(*words: str, tracking: str | None = None, storage: str | None = None) -> str:
-    """Return a command of the program `armscan`, with the stores that are not the default ones.
-
-    Args:
-        *words: the command and its arguments, such as `runs`, `sync`, `outputs`.
-        tracking: the tracking store; default: that of the configuration.
-        storage: the storage of studies; default: that of the configuration.
-    """
+    """Return a command of the program `armscan`, with the stores that are not the default ones."""
     stores = ["--storage", storage] if storage is not None and storage != default_storage() else []
     stores += ["--tracking", tracking] if tracking is not None and tracking != default_tracking()["uri"] else []
     return shlex.join(["armscan", *words, *stores])

@@ -33,12 +33,7 @@ MIN_MASKED_CHARS = 4
 
 
 def check_address(name: str, uri: str) -> None:
-    """Raise `InvalidValueError` if the address of a service contains a password.
-
-    Args:
-        name: the option, config key or variable that the address comes from.
-        uri: the address; a file has no password.
-    """
+    """Raise `InvalidValueError` if an address contains a password; `name` says where the address comes from."""
     if PASSWORD.match(uri) is None:
         return
     if uri.startswith("http"):
@@ -57,11 +52,7 @@ def check_words(words: Sequence[str]) -> None:
 
 
 def read_password(variable: str) -> str | None:
-    """Return a password from an environment variable, or from the file that `{variable}_FILE` names; None if unset.
-
-    Raises:
-        InvalidValueError: if the file cannot be read.
-    """
+    """Return a password from an environment variable, or from the file that `{variable}_FILE` names; None if unset."""
     if password := os.environ.get(variable):
         return password
     name = variable + FILE_SUFFIX
@@ -79,12 +70,7 @@ def read_password(variable: str) -> str | None:
 
 
 def database_url(uri: str, variable: str) -> URL:
-    """Return the URL of a database with its driver and, where there is one, its password.
-
-    Args:
-        uri: address of a SQLite or PostgreSQL database.
-        variable: environment variable of the password; libpq reads ~/.pgpass itself.
-    """
+    """Return the URL of a database with its driver and, where this variable or its file sets one, its password."""
     # Deferred: most commands do not need it.
     from sqlalchemy import make_url
 

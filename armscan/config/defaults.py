@@ -32,11 +32,7 @@ PHANTOM = "phantom"
 
 
 def to_plain(config: DictConfig | ListConfig) -> dict[str, Any]:
-    """Return a configuration, or a section of one, as plain dictionaries, lists, numbers and texts, all resolved.
-
-    Raises:
-        MissingMandatoryValue: if a value that must be given is not.
-    """
+    """Return a configuration, or a section of one, as plain dictionaries, lists, numbers and texts, all resolved."""
     return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
 
 

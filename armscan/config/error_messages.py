@@ -15,11 +15,7 @@ from armscan.utils.files import FULL_DISK
 
 
 def one_line_message(error: BaseException) -> str | None:
-    """Return what a user did wrong and what is allowed instead; None if the error is no user's mistake.
-
-    Args:
-        error: the exception, of any class.
-    """
+    """Return what a user did wrong and what is allowed instead; None if the error is no user's mistake."""
     if (ours := _ours(error)) is not None:
         return str(ours)
     text = " ".join(str(error).split())

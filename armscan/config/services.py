@@ -51,11 +51,7 @@ def address_of(name: str, default: str | None = None) -> str:
 
 
 def local_addresses() -> dict[str, str]:
-    """Return the addresses in `services_file` by service; empty if there is no such file.
-
-    Raises:
-        InvalidValueError: if the file contains anything else, or an address with a password.
-    """
+    """Return the addresses in `services_file` by service; empty if there is no such file."""
     file = services_file()
     try:
         addresses = yaml.safe_load(file.read_bytes()) or {}

@@ -48,11 +48,7 @@ def own_folders() -> dict[str, Path]:
 
 
 def config_file(name: str) -> Path:
-    """Return the file of a configuration.
-
-    Args:
-        name: its path in `conf`, such as `tracking/mlflow.yaml`.
-    """
+    """Return the file of a configuration by its path in `conf`, such as `tracking/mlflow.yaml`."""
     own = own_folders().get(CONF)
     return own / name if own is not None and (own / name).is_file() else config_folder() / name
 

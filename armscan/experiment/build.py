@@ -85,9 +85,6 @@ class Experiment:
 def set_up(config: DictConfig) -> Experiment:
     """Build an experiment with the environments of its evaluations, and check them, before tracking starts.
 
-    Args:
-        config: the composed configuration.
-
     Raises:
         InvalidValueError: if something in it is not allowed, or the agent cannot act in one of the environments.
     """
@@ -105,15 +102,7 @@ def set_up(config: DictConfig) -> Experiment:
 
 
 def build_experiment(config: DictConfig, split: Split | None = None) -> Experiment:
-    """Build an experiment from its composed configuration.
-
-    Args:
-        config: the composed configuration.
-        split: its volumes, if they have been read already. Default: None, they are read.
-
-    Raises:
-        InvalidValueError: if something in it is not allowed.
-    """
+    """Build an experiment from its composed configuration, on volumes that have been read already, or read here."""
     check_words(config)
     seed = check_seed("seed", config.seed)
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)

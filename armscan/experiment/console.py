@@ -41,12 +41,7 @@ def print_results(title: str, evaluations: Mapping[str, Evaluation]) -> None:
 
 
 def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -> None:
-    """Print the table of a multirun's jobs.
-
-    Args:
-        outcomes: outcome of each job, by its number.
-        run_ids: MLflow run ID of each job that started a run, by its number.
-    """
+    """Print the table of a multirun's jobs: outcomes, and MLflow run IDs, by the jobs' numbers."""
     table = Table(title=f"jobs ({TEST})", title_justify="left")
     for heading in ("job", "run", "overrides", "outcome", "success rate", "mean steps"):
         table.add_column(heading)

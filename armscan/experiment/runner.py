@@ -52,10 +52,6 @@ VALIDATION_SEED, TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED, VIDEO_SEED = 10**6, 2
 def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict[str, float]]:
     """Train (if it is a `Learner`), evaluate and track an agent.
 
-    Args:
-        config: the composed configuration.
-        invocation: how it was asked for.
-
     Returns:
         The metrics of the final evaluations, by the name of their volumes.
     """

@@ -19,11 +19,7 @@ IMPORTED = {
 
 
 def check_launcher(name: str) -> None:
-    """Check that a launcher can do its work on this machine.
-
-    Raises:
-        InvalidValueError: if something that it needs is not installed.
-    """
+    """Raise `InvalidValueError` if something that a launcher needs is not installed on this machine."""
     extra, packages = IMPORTED.get(name, ("", ()))
     for package in packages:
         if find_spec(package) is None:

@@ -152,9 +152,6 @@ def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Ma
 
     Returns:
         The runs of those that got as far as that, in the order of the jobs.
-
-    Raises:
-        TrackingError: if the store is away for longer than a run waits for it at its end.
     """
     from armscan.tracking import note_end, open_store, sync
 

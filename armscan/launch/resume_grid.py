@@ -27,13 +27,7 @@ Metrics = dict[str, dict[str, float]]
 
 
 def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
-    """Return the metrics of a job's finished run; resume an interrupted one, or run the job.
-
-    Args:
-        config: of the job.
-        invocation: how it was asked for.
-        job: the job.
-    """
+    """Return the metrics of a job's finished run; resume an interrupted one, or run the job."""
     check_keys(config)
     setup, tracking = set_up(config), to_plain(config.tracking)
     client, experiment_id = open_store(**tracking)

@@ -105,13 +105,7 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
 
 
 def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]:
-    """Return what stays with a model: where it comes from, what it has seen, what its actions stand for.
-
-    Args:
-        config: resolved configuration of the run.
-        env: environment of the configuration.
-        run_id: MLflow run ID.
-    """
+    """Return what stays with a model: where it comes from, what it has seen, what its actions stand for."""
     rules = config["env"]
     ways: dict[str, Any] = {"tx": "the volume's size across", "ty": "the volume's size along the arm"}
     if rules["translation_bounds_mm"] is not None:

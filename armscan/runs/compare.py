@@ -64,11 +64,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of the metrics of two runs.
-
-    Args:
-        differences: the difference of each metric that the first run has.
-    """
+    """Comparison of the metrics of two runs: the difference of each metric that the first run has."""
 
     differences: tuple[Difference, ...]
 
@@ -97,13 +93,7 @@ class Comparison:
 
 
 def compare_runs(store: TrackingStore, first_id: str, second_id: str) -> Comparison:
-    """Compare the metrics of two runs, but for those of time and machine.
-
-    Args:
-        store: the store that both are in.
-        first_id: MLflow run ID of the earlier run.
-        second_id: MLflow run ID of the later run.
-    """
+    """Compare the metrics of two runs of a store, the earlier one first, but for those of time and machine."""
     first, second = (_histories(store, run_id) for run_id in (first_id, second_id))
     return Comparison(tuple(difference(name, then, second.get(name, {})) for name, then in sorted(first.items())))
 

@@ -37,13 +37,7 @@ class PruneItem:
 
 
 def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneItem]:
-    """Return what is to become of runs; touch nothing.
-
-    Args:
-        client: their store.
-        runs: the selected runs.
-        what: `CHECKPOINTS` or `FOLDERS`.
-    """
+    """Return what is to become of the `CHECKPOINTS` or `FOLDERS` of runs; touch nothing."""
     everything = {run.info.run_id: run for run in search(client, experiment_ids(client))}
     noted = defaultdict(set)
     for run_id, run in everything.items():

@@ -82,11 +82,7 @@ def _projection_params(text: str) -> tuple[str, ...]:
 
 
 def experiment_ids(client: TrackingStore, name: str | None = None) -> list[str]:
-    """Return the ids of all experiments of a store, or of the one of a name.
-
-    Raises:
-        InvalidValueError: if there is none of that name.
-    """
+    """Return the ids of all experiments of a store, or of the one of a name, which must exist."""
     experiments = all_pages(client.search_experiments)
     found = [each.experiment_id for each in experiments if name in (None, each.name)]
     if not found and name is not None:

@@ -40,12 +40,7 @@ class RunSkippedError(ArmscanError):
 
 @dataclass(frozen=True)
 class OwnFolder:
-    """A folder of this machine that verifiably is a run's.
-
-    Args:
-        path: the folder.
-        run_id: the run's ID.
-    """
+    """A folder of this machine that verifiably is a run's."""
 
     path: Path
     run_id: str

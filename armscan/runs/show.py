@@ -29,13 +29,7 @@ MAX_VALUE_CHARS = 200
 
 
 def show(client: TrackingStore, run: Run, uri: str) -> None:
-    """Print how a run was started and ended, its figures, files, children, and what can be done with it.
-
-    Args:
-        client: its store.
-        run: the run.
-        uri: MLflow tracking URI, as somebody would type it.
-    """
+    """Print how a run was started and ended, its figures, files, children, and what can be done with it."""
     console, entry = Console(), RunRow(client, run)
     tags = {name: value for name, value in run.data.tags.items() if value}
     _print_pairs(console, "", _facts(run, entry))

@@ -44,12 +44,7 @@ def format_start(run: Run) -> str:
 
 
 def write_rows(rows: Sequence[RunRow], form: str) -> None:
-    """Print runs.
-
-    Args:
-        rows: the rows, in their order.
-        form: `table`, `csv` or `json`.
-    """
+    """Print runs, in the order of their rows, as `table`, `csv` or `json`."""
     if form == "table":
         Console().print(_table(rows))
         return

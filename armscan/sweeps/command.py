@@ -21,7 +21,7 @@ from armscan.utils.log import silence_library_warnings
 
 
 def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:
-    """Run a study, or shows what it would run.
+    """Run a study, or show what it would run.
 
     Args:
         words: of the command line.
@@ -29,11 +29,6 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
 
     Returns:
         The exit code: 0 where there is a result, 1 where too many trials failed.
-
-    Raises:
-        InvalidValueError: if the words are not allowed.
-        StudyError: see `open_for_work`.
-        TrackingError: likewise.
     """
     given = StudyCommand.read(words)
     silence_library_warnings()

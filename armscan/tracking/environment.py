@@ -122,12 +122,7 @@ def _diff(tree: Path) -> bytes:
 
 
 def _git(folder: Path, *arguments: str, index: Path | None = None, given: bytes = b"") -> bytes:
-    """Return what git answers, given something to read.
-
-    Raises:
-        OSError: if there is no git.
-        SubprocessError: if it fails.
-    """
+    """Return what git answers, given something to read."""
     # A hook of another repository would have its say here.
     variables = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     if index is not None:

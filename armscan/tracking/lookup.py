@@ -147,11 +147,7 @@ def load_run(uri: str, run_id: str) -> FoundRun:
 
 
 def find_run(client: TrackingStore, run_id: str) -> Run:
-    """Return the run of an id.
-
-    Args:
-        client: the store.
-        run_id: MLflow run ID, or its first characters, in any experiment of the store.
+    """Return the run of an MLflow run ID, or of its first characters, in any experiment of a store.
 
     Raises:
         TrackingError: if no run is meant, or several are.

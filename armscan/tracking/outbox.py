@@ -88,21 +88,13 @@ class OutboxFile:
         return self.file.parent.parent
 
     def entries(self) -> Iterator[Entry]:
-        """Iterate over all entries, uploaded or not.
-
-        Raises:
-            TrackingError: if a line is damaged.
-        """
+        """Iterate over all entries, uploaded or not."""
         with self.file.open("rb") as lines:
             for line in lines:
                 yield self._read(line)
 
     def next_entries(self, channel: Channel, at_most: int) -> tuple[list[Entry], int]:
-        """Return the next entries to upload.
-
-        Args:
-            channel: their channel.
-            at_most: maximum number of entries.
+        """Return the next entries of a channel to upload.
 
         Returns:
             The entries, and the position behind them, for `mark`.

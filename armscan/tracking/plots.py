@@ -13,13 +13,7 @@ if TYPE_CHECKING:
 
 
 def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: str) -> None:
-    """Draw steps to success and success rate by environment step.
-
-    Args:
-        reports: of the training's epochs.
-        path: the PNG file.
-        title: above the picture.
-    """
+    """Draw steps to success and success rate by environment step, as a PNG file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -70,17 +70,7 @@ class TrackedRun:
         folder: Path,
         parent_id: str | None = None,
     ) -> Self:
-        """Make a new run.
-
-        Args:
-            store: the store that it is made in.
-            experiment_id: MLflow experiment ID.
-            name: what the UI calls the run.
-            config: the resolved configuration; its leaves become parameters.
-            tags: further tags.
-            folder: the run's folder.
-            parent_id: the run that this one is a child of. Default: None, no parent.
-        """
+        """Make a new run; the leaves of its resolved configuration become parameters."""
         parent = {"mlflow.parentRunId": parent_id} if parent_id else {}
         run = store.create_run(experiment_id, name=name, tags={**source_tags(), **tags, **parent})
         tracked = cls.joined(store, run.info.run_id, name=name, folder=folder)
@@ -96,15 +86,7 @@ class TrackedRun:
     def reopen(
         cls, store: TrackingStore, run_id: str, *, folder: Path, config: Mapping[str, Any], tags: Mapping[str, str]
     ) -> Self:
-        """Open a run again that was interrupted, as if nothing had happened to it.
-
-        Args:
-            store: the run's store.
-            run_id: MLflow run ID.
-            folder: the run's folder.
-            config: the configuration that it was started with; parameters that are missing are logged.
-            tags: tags to set anew.
-        """
+        """Open a run again that was interrupted, as if nothing had happened; parameters that it lacks are logged."""
         run = store.get_run(run_id)
         if not (resumed := run.data.tags.get("resumed", "0")).isdecimal():
             raise TrackingError(f"run {run_id}: its tag resumed is {resumed[:50]!r}, but it must be a whole number")

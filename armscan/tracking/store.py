@@ -109,11 +109,7 @@ def check_settings(
 
 
 def open_existing_store(uri: str) -> TrackingStore:
-    """Open a tracking store to look for a run in it, and make nothing.
-
-    Raises:
-        TrackingError: if there is none, or it cannot be used.
-    """
+    """Open a tracking store to look for a run in it, and make nothing; raise `TrackingError` if there is none."""
     _check_texts(uri=uri)
     _check_address(uri)
     if uri.startswith(SQLITE_PREFIX):

@@ -160,11 +160,6 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
     """Mark the runs of dead processes in a folder tree as FAILED.
 
     What the store does not get now is in their folders.
-
-    Args:
-        folder: folder tree, such as a trial's.
-        store: the store that they are in.
-        reason: why they failed.
     """
     for file in outbox_files(folder):
         try:
@@ -180,15 +175,7 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
 
 
 def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
-    """Note how a run has ended, for `sync` to deliver, without asking its store.
-
-    Args:
-        folder: the run's folder.
-        run_id: MLflow run ID.
-        uri: MLflow tracking URI.
-        status: status as MLflow calls it.
-        tags: tags to set.
-    """
+    """Note how a run has ended, for `sync` to deliver, without asking its store."""
     with contextlib.closing(Outbox.begin(folder, Address(run_id, absolute(uri)))) as outbox:
         if tags:
             outbox.add(tags=tags_of(tags))

@@ -24,12 +24,7 @@ LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
 
 
 class Uploader:
-    """A thread that uploads a run's entries as they are added.
-
-    Args:
-        outbox: the run's outbox.
-        store: the run's tracking store.
-    """
+    """A thread that uploads a run's entries to its store as they are added to its outbox."""
 
     def __init__(self, outbox: Outbox, store: TrackingStore) -> None:
         self._outbox, self._store = outbox, store

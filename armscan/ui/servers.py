@@ -41,15 +41,7 @@ class _Quiet(WSGIRequestHandler):
 
 
 def check_port(option: str, port: int) -> None:
-    """Check that a server of this machine can use a port.
-
-    Args:
-        option: the command-line option that sets the port, for the message.
-        port: the port on 127.0.0.1.
-
-    Raises:
-        InvalidValueError: if it cannot be used.
-    """
+    """Raise `InvalidValueError` unless a server of this machine can use a port, which `option` sets."""
     try:
         socket.create_server((HOST, port)).close()
     except OSError as error:
@@ -85,10 +77,6 @@ def start_dashboard(
 @contextlib.contextmanager
 def mlflow_server(uri: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
     """Serve MLflow's UI inside the context, which begins once the server answers.
-
-    Args:
-        uri: the address of a database with runs, without a password.
-        port: the port on 127.0.0.1.
 
     Raises:
         TrackingError: if the server does not answer in time, or ends by itself; the end of its log is printed.

@@ -34,11 +34,6 @@ def show(
         mlflow_port: port of MLflow's UI.
         dashboard_port: port of Optuna's dashboard.
         named: options that were given on the command line, `--storage` or `--tracking`; these stores must exist.
-
-    Raises:
-        InvalidValueError: if there is nothing to show, or a port is taken.
-        StudyError: if the storage cannot be used.
-        TrackingError: if the tracking store cannot be used, or MLflow's server ends by itself.
     """
     # Deferred: a mistake on the command line should be answered before this is loaded.
     from armscan.sweeps.storage.storage import existing_storage

@@ -157,11 +157,7 @@ def is_made_by_run(name: str) -> bool:
 
 
 def check_free(folder: Path) -> None:
-    """Look whether a new run may make its files in a folder; those of an earlier run are in nobody's way.
-
-    Raises:
-        FolderTakenError: if there is one that no run has left there.
-    """
+    """Raise `FolderTakenError` if a run's file in a folder was left by no run; an earlier run's is in nobody's way."""
     # An earlier run that was never tracked has left what it was started with: the first three, always together.
     outboxes = (folder / OUTBOX_FOLDER).glob(RUN_ID + OUTBOX_SUFFIXES[-1])
     if any(outboxes) or all((folder / name).is_file() for name in STARTED_WITH[:3]):
@@ -182,11 +178,7 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextlib.contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Keep every other process from working in the folder of a run; the system frees what a dead process held.
-
-    Raises:
-        FolderInUseError: if another process holds it.
-    """
+    """Hold the folder of a run until this process ends or leaves; raise `FolderInUseError` if another one holds it."""
     try:
         with FileLock(folder / LOCK_FILE, timeout=0):
             yield

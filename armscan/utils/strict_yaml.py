@@ -16,9 +16,6 @@ MOST_NODES = 1_000_000
 def load_yaml(text: str | bytes) -> Any:
     """Return the contents of a YAML file.
 
-    Args:
-        text: text of the file.
-
     Raises:
         ValueError: if it is nested or repeats itself more than any file of armscan, or a mapping has a key twice.
         yaml.YAMLError: if it is no YAML, or holds anything but plain values.

@@ -127,13 +127,7 @@ class TrialScheduler:
         return len(state.failed)
 
     def requeue(self, trial: Trial, lease: Mapping[str, Any], writes: PendingWrites | None = None) -> None:
-        """Requeue a worker's own trial, for any worker to resume.
-
-        Args:
-            trial: the worker's trial.
-            lease: of the worker, with the trial's progress.
-            writes: those about the trial that are still pending. Default: None, for none.
-        """
+        """Requeue a worker's own trial, with its lease and what is still to be written, for any worker to resume."""
         storage, trial_id = self.study._storage, trial._trial_id
 
         def requeue() -> None:

@@ -117,12 +117,7 @@ class Limits(Section):
         return None
 
     def broken(self, state: StudyState, reset: Collection[int]) -> str | None:
-        """Return why failures end the study; None if they do not.
-
-        Args:
-            state: the state of the study.
-            reset: the numbers of trials whose failures are ignored.
-        """
+        """Return why failures end the study, those of trials with the numbers `reset` ignored; None if they do not."""
         failed = [trial for trial in state.failed if trial.number not in reset]
         if len(failed) > self.max_failures:
             return f"{len(failed)} trials have failed, and at most {self.max_failures} may: {_reason(failed[-1])}"

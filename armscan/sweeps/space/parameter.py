@@ -75,11 +75,7 @@ class Parameter:
 
     @classmethod
     def read(cls, name: str, described: Any) -> Self:
-        """Return the parameter of a description such as `{low: 1e-4, high: 1e-2, log: true}` or `{choices: [a, b]}`.
-
-        Raises:
-            InvalidValueError: if it describes none.
-        """
+        """Return the parameter of a description such as `{low: 1e-4, high: 1e-2, log: true}` or `{choices: [a, b]}`."""
         where = f"study.space.{name}"
         if isinstance(described, Mapping):
             # What the command line takes away.

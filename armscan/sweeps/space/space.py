@@ -15,21 +15,13 @@ from armscan.sweeps.space.parameter import Parameter, Value, as_kept
 
 @dataclass(frozen=True)
 class Space:
-    """A search space.
-
-    Args:
-        parameters: in the order in which they are chosen.
-    """
+    """A search space: its parameters, in the order in which they are chosen."""
 
     parameters: tuple[Parameter, ...]
 
     @classmethod
     def read(cls, described: Any) -> Self:
-        """Return the space of a mapping from keys of the configuration to descriptions; null takes a key out.
-
-        Raises:
-            InvalidValueError: if it describes none.
-        """
+        """Return the space of a mapping from keys of the configuration to descriptions; null takes a key out."""
         if not isinstance(described, Mapping) or not described:
             raise InvalidValueError(f"study.space is {described!r}, but it must have at least one key to search")
         space = cls(tuple(Parameter.read(name, each) for name, each in described.items() if each is not None))

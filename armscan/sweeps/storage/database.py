@@ -66,10 +66,6 @@ class DatabaseStorage(_CachedStorage):
 
     A call may be repeated although it was done and only its answer was lost: a value is set again, and a new trial that
     no worker knows has no lease and is reclaimed. A state is set within a transaction, which looks at it first.
-
-    Args:
-        database: the storage, as Optuna has it.
-        retry_policy: says when and for how long a call is repeated.
     """
 
     def __init__(self, database: RDBStorage, retry_policy: RetryPolicy) -> None:

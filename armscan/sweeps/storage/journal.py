@@ -82,9 +82,6 @@ class JournalFile(BaseJournalBackend):
 
     What earlier versions or Optuna have appended has no sum of its own; the next sum counts it. Only lost last lines
     remain unseen: they may never have been written.
-
-    Args:
-        path: of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -106,11 +103,7 @@ class JournalFile(BaseJournalBackend):
             yield
 
     def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:
-        """See `BaseJournalBackend`.
-
-        Raises:
-            StudyError: if a line was lost or changed.
-        """
+        """See `BaseJournalBackend`."""
         if log_number_from != self._read.n_lines:
             self._read, self._n_studies, self._n_trials = Position(), 0, 0
         for line, position in self._lines():

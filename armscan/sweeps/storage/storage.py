@@ -91,15 +91,7 @@ def open_storage(uri: str, *, where: str = "study.storage", retry: bool = False)
 
 
 def existing_storage(uri: str, *, where: str = "study.storage") -> Storage | None:
-    """Open a storage to read, None if there is none; nothing is created, repaired or locked.
-
-    Args:
-        uri: see `open_storage`.
-        where: likewise.
-
-    Raises:
-        StudyError: if it cannot be reached or used.
-    """
+    """Open a storage to read, named as in `open_storage`; None if there is none. Nothing is created or locked."""
     with _refused_in_one_line(uri, where):
         file = _file_of(uri)
         if file is None:

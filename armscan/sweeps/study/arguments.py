@@ -40,11 +40,7 @@ class StudyCommand:
 
     @classmethod
     def read(cls, words: Sequence[str]) -> Self:
-        """Return what the words of the command line say.
-
-        Raises:
-            InvalidValueError: if they say something that no study can do.
-        """
+        """Return what the words of the command line say."""
         own = [word for word in words if word not in (*MULTIRUN, PLAN)]
         overrides = OverridesParser.create().parse_overrides(own)
         keys = [each.key_or_group for each in overrides]

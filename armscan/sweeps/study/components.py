@@ -29,11 +29,7 @@ TASK_MEMBERS = ("metrics", "final_metric", "check", "run", "evaluate")
 
 
 def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig]:
-    """Return what a command line asks of a study, what a trial does, and its configuration without what it tries.
-
-    Raises:
-        InvalidValueError: if something is not allowed.
-    """
+    """Return what a command line asks of a study, what a trial does, and its configuration without what it tries."""
     config = compose(words, return_hydra_config=True)
     if config.get(SWEEP) is not None:
         raise InvalidValueError(
@@ -52,14 +48,14 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
             raise InvalidValueError("nothing is left to search: each key of study.space is given a value")
     settings = StudySettings.read("study", section)
     # What cannot be made is refused here, and not by the first trial.
-    make_sampler(settings.sampler, settings.seed)
-    make_pruner(settings.pruner)
+    make("sampler", settings.sampler, BaseSampler, seed=settings.seed)
+    make("pruner", settings.pruner, BasePruner)
     for name, folder in (("folder", settings.folder), ("artifacts", settings.artifacts)):
         path = Path(folder).absolute()
         there = next(each for each in (path, *path.parents) if each.exists())
         if not there.is_dir():
             raise StudyError(f"study.{name} is {folder!r}, but {str(there)!r} is no folder")
-    task: Task = _made("task", settings.task, object)
+    task: Any = make("task", settings.task, object)
     if missing := [name for name in TASK_MEMBERS if not hasattr(task, name)]:
         raise InvalidValueError(f"study.task is {settings.task['_target_']}, which has no {missing[0]}, as a task must")
     for name in settings.objectives:
@@ -68,19 +64,8 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
     return settings, task, of_run(config)[0]
 
 
-def make_sampler(described: Mapping[str, Any], seed: int) -> BaseSampler:
-    """Return an Optuna sampler; raises `InvalidValueError` if `study.sampler` describes none."""
-    sampler: BaseSampler = _made("sampler", described, BaseSampler, seed=seed)
-    return sampler
-
-
-def make_pruner(described: Mapping[str, Any]) -> BasePruner:
-    """Return an Optuna pruner; raises `InvalidValueError` if `study.pruner` describes none."""
-    pruner: BasePruner = _made("pruner", described, BasePruner)
-    return pruner
-
-
-def _made(name: str, described: Mapping[str, Any], kind: type[Any], **arguments: Any) -> Any:
+def make(name: str, described: Mapping[str, Any], kind: type[Any], **arguments: Any) -> Any:
+    """Return the object of this class that `study.NAME` describes; raise `InvalidValueError` if it describes none."""
     try:
         made = instantiate(described, **arguments)
     except InstantiationException as error:
@@ -95,12 +80,6 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
     """Build what is run as it is without the space, then with each choice and both ends of each range.
 
     Choices of groups and of keys at the top are tried beside values of all others, too, as a trial has them.
-
-    Args:
-        settings: those of the study.
-        task: what its trials do.
-        words: those of the command line.
-        config: the configuration that they are composed to.
 
     Raises:
         InvalidValueError: if a key is unknown, or a value not allowed.

@@ -118,14 +118,7 @@ class OpenedStudy:
 def open_for_work(
     settings: StudySettings, task: Task, config: DictConfig, words: Sequence[str], *, retry: bool = False
 ) -> OpenedStudy:
-    """Open a study, and make it where there is none.
-
-    Args:
-        settings: as `read_settings` returns them.
-        task: likewise.
-        config: likewise.
-        words: that these were read from, without a password.
-        retry: see `open_storage`.
+    """Open a study, as `read_settings` has read it from these words, and make it where there is none.
 
     Raises:
         StudyError: if the storage cannot be used, or the study that exists is another.
@@ -190,15 +183,7 @@ def _final_phase(search: Phase, settings: StudySettings, task: Task) -> Phase:
 def note_run(
     target: optuna.Study | Trial, client: TrackingStore, experiment_id: str, run_id: str, folder: Path
 ) -> None:
-    """Leave a note with the link to the tracked run of a study or a trial, and its folder.
-
-    Args:
-        target: the study, or the trial.
-        client: the tracking store.
-        experiment_id: the MLflow experiment of the run.
-        run_id: the ID of the run.
-        folder: the folder of the study or the trial.
-    """
+    """Leave a note with the link to the tracked run of a study or a trial, and its folder."""
     # Deferred: it takes a second, and only who works at a study needs it.
     from optuna_dashboard import save_note
 
@@ -208,13 +193,7 @@ def note_run(
 
 
 def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:
-    """Copy a picture to where the dashboard finds those of a trial.
-
-    Args:
-        trial: which still runs.
-        picture: a file.
-        artifacts: folder of the pictures of all studies.
-    """
+    """Copy a picture to where the dashboard finds those of a trial."""
     try:
         artifacts.mkdir(parents=True, exist_ok=True)
         upload_artifact(study_or_trial=trial, file_path=str(picture), artifact_store=FileSystemArtifactStore(artifacts))

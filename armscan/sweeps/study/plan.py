@@ -19,12 +19,7 @@ BYTES_A_MIB = 2**20
 
 
 def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
-    """Print the space, how far the study is and what it has cost, and from that what the rest will take.
-
-    Args:
-        settings: of the study.
-        study: as far as it is; None where it has not been begun.
-    """
+    """Print the space, how far a study is, if it has been begun, what it has cost, and what the rest will take."""
     console = Console()
     state = StudyState.of(study.get_trials(deepcopy=False) if study is not None else ())
     table = Table("key", "values", "where", title=f"study {settings.name}: what is searched", title_justify="left")

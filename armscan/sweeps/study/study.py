@@ -8,6 +8,7 @@ from itertools import product
 from typing import Any
 
 import optuna
+from optuna.pruners import BasePruner
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.config.defaults import NOT_COMPARED
@@ -15,7 +16,7 @@ from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST
 from armscan.sweeps.storage.storage import Storage, existing_storage
-from armscan.sweeps.study.components import make_pruner
+from armscan.sweeps.study.components import make
 from armscan.sweeps.study.settings import FIRST_SEED_ABOVE, StudySettings
 from armscan.sweeps.study.stored import StudyAttributes, check_trials
 from armscan.tracking import flattened
@@ -26,12 +27,7 @@ N_SHOWN = 5
 
 
 def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study:
-    """Make a study, or find the one that exists.
-
-    Args:
-        storage: the one that it is or will be in.
-        settings: those of the study.
-        fixed: the configuration of its trials, without what they try.
+    """Make a study, or find the one that exists; `fixed` is the configuration of trials without what they try.
 
     Raises:
         StudyError: if the study that exists searches another space, has other objectives, or has trials with another
@@ -43,7 +39,7 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
         study = optuna.create_study(
             study_name=settings.name,
             storage=storage.optuna,
-            pruner=make_pruner(settings.pruner),
+            pruner=make("pruner", settings.pruner, BasePruner),
             directions=[*settings.objectives.values()],
             load_if_exists=True,
         )
@@ -59,11 +55,7 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
 
 
 def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study | None:
-    """Return the study that these settings would go on with, to look at; None where they would begin one.
-
-    Raises:
-        StudyError: see `open_storage` and `make_study`.
-    """
+    """Return the study that these settings would go on with, to look at; None where they would begin one."""
     storage = existing_storage(settings.storage)
     if storage is None or settings.name not in optuna.get_all_study_names(storage.optuna):
         return None
@@ -152,13 +144,7 @@ def enqueue_final_trials(storage: Storage, settings: StudySettings, search: optu
 def missing_final_trials(
     settings: StudySettings, search: optuna.Study, final: optuna.Study
 ) -> list[tuple[FrozenTrial, int]]:
-    """Return the best trials with each seed for which there is no final training yet.
-
-    Args:
-        settings: those of the study.
-        search: the study in which configurations are searched.
-        final: the study of the final trainings.
-    """
+    """Return the best trials with each seed for which there is no final training yet."""
     trials = final.get_trials(deepcopy=False)
     there = {(trial.user_attrs[FINALIST], trial.user_attrs[FINAL_SEED]) for trial in trials}
     # None of these seeds was a search trial run with.

@@ -209,15 +209,7 @@ def _volumes(data: str) -> Split:
 
 
 def check_metrics(metrics: Any, objectives: Sequence[str]) -> dict[str, float]:
-    """Return what a task has returned.
-
-    Args:
-        metrics: by name; those that are no objectives may be NaN.
-        objectives: the names of those that must be there, and finite.
-
-    Raises:
-        InvalidValueError: if it is anything else.
-    """
+    """Return what a task has returned, if these are metrics by their names, those that are objectives finite."""
     if not isinstance(metrics, Mapping):
         raise InvalidValueError(f"the task has returned {metrics!r}, but it must be metrics by their names")
     if missing := [name for name in objectives if name not in metrics]:

@@ -86,8 +86,8 @@ class Heartbeat:
         self._is_told_to_leave, self._leave, self._on_death = is_told_to_leave, leave, on_death
         self._is_told_to_leave_soon = is_told_to_leave_soon
         self._trial: Trial | None = None
-        self._cleanup: Callable[[], None] | None = None
-        # Of the current trial.
+        # Closes the open runs of the current trial if the process is told to leave.
+        self.cleanup: Callable[[], None] | None = None
         self.writes = PendingWrites()
         self._limit: str | None = None
         self._next_check_s = 0.0
@@ -110,28 +110,19 @@ class Heartbeat:
                 thread.join()
 
     def claim(self, outcome: TrialOutcome | None = None, cleanup: Callable[[], None] | None = None) -> Trial | None:
-        """Claim a trial as `TrialScheduler.claim` does, and hold it from then on.
-
-        Args:
-            outcome: of the trial before, which is not held any more.
-            cleanup: of the trial before; see `clean_up`.
-        """
+        """Claim a trial as `TrialScheduler.claim` does, and hold it; `cleanup` is that of the trial before."""
         with self._changing:
             # The progress of the trial before is not this one's.
             self._lease = {key: self._lease[key] for key in (*HOLDER, "beat")}
             self._trial = self._scheduler.claim(self._lease, outcome)
-            self._cleanup, self.writes = cleanup, PendingWrites()
+            self.cleanup, self.writes = cleanup, PendingWrites()
         self._leave_if_told_to()
         return self._trial
-
-    def set_cleanup(self, cleanup: Callable[[], None] | None) -> None:
-        """Set what closes the trial's open runs if the process is told to leave."""
-        self._cleanup = cleanup
 
     def clean_up(self) -> None:
         """Run the cleanup, once; another thread that calls this waits until it is done."""
         with self._cleaning:
-            cleanup, self._cleanup = self._cleanup, None
+            cleanup, self.cleanup = self.cleanup, None
             if cleanup is not None:
                 cleanup()
 

@@ -49,12 +49,6 @@ Launch = Callable[[Sequence[str]], object]
 def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch: Launch) -> None:
     """Launch the workers of a study, and wait for their end.
 
-    Args:
-        opened: the study.
-        given: its command line.
-        launcher: the choice of `hydra/launcher`.
-        launch: runs the command with Hydra, with the words it is given.
-
     Raises:
         KeyboardInterrupt: if it is interrupted; the workers have been asked to leave.
         StudyError: if the launcher has failed, and no worker is alive.

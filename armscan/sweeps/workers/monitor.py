@@ -23,11 +23,7 @@ LIFELESS_S = 120.0
 
 
 class StudyMonitor:
-    """Monitors a study.
-
-    Args:
-        opened: the study.
-    """
+    """Monitors a study."""
 
     def __init__(self, opened: OpenedStudy) -> None:
         self._opened = opened

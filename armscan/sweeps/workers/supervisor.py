@@ -48,10 +48,6 @@ def run_worker(words: Sequence[str], number: int, folder: Path) -> None:
         words: the words of the study.
         number: the number of the worker, from 0.
         folder: the folder of the workers of one start; each writes its log there.
-
-    Raises:
-        StudyError: if this machine does not see the folders of the launcher's.
-        SystemExit: see `Notice.follow`.
     """
     launcher = _launcher_of(folder)
     if not launcher.is_current:

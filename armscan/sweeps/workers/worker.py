@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import optuna
 from optuna.exceptions import UpdateFinishedTrialError
+from optuna.samplers import BaseSampler
 from optuna.trial import Trial, TrialState
 
 from armscan.config.command_hints import run_command
@@ -20,7 +21,7 @@ from armscan.config.error_messages import one_line_message
 from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
-from armscan.sweeps.study.components import make_sampler, read_settings
+from armscan.sweeps.study.components import make, read_settings
 from armscan.sweeps.study.open import Phase, note_run, open_for_work, show_picture
 from armscan.sweeps.study.study import enqueue_final_trials
 from armscan.sweeps.tasks.attempt import (
@@ -96,7 +97,7 @@ class Worker:
         except UpdateFinishedTrialError:
             # This worker was taken for dead: the trial is another's.
             self._let_go(trial, self._tracked)
-            self._heartbeat.set_cleanup(None)
+            self._heartbeat.cleanup = None
         except LimitReachedError as limit:
             log(f"trial {trial.number} is requeued: {limit}")
             self._heartbeat.requeue()
@@ -121,7 +122,7 @@ class Worker:
         phase, writes = self._phase, self._heartbeat.writes
         # By the trial's number: parallel workers draw different points, and a single worker is reproducible.
         seed = np.random.SeedSequence((phase.seed, trial.number)).generate_state(1)[0]
-        trial.study.sampler = make_sampler(phase.sampler, int(seed))
+        trial.study.sampler = make("sampler", phase.sampler, BaseSampler, seed=int(seed))
         # Of a new object each time: what the trial believes written may have been lost with the connection.
         chosen = phase.scheduler.storage.transaction(lambda: phase.space.suggest(Trial(trial.study, trial._trial_id)))
         config, choices = composed([*self._words, *overrides_of(chosen)])
@@ -185,8 +186,7 @@ class Worker:
         return tracked
 
     def _opened(self, training: TrackedRun | None) -> None:
-        open_runs = [run for run in (training, self._tracked) if run is not None]
-        self._heartbeat.set_cleanup(partial(_close, open_runs))
+        self._heartbeat.cleanup = partial(_close, training, self._tracked)
 
     def _conclude(self, outcome: TrialOutcome, tracked: TrackedRun | None) -> None:
         """Log and track the outcome of a trial, once the storage has it."""
@@ -211,8 +211,8 @@ class Worker:
             tracked.end("FAILED", reason="taken over by another worker")
 
 
-def _close(runs: Sequence[TrackedRun]) -> None:
-    for run in runs:
+def _close(*runs: TrackedRun | None) -> None:
+    for run in filter(None, runs):
         run.end("KILLED", reason="requeued", wait_s=SHORT_WAIT_S)
 
 
