@@ -120,11 +120,7 @@ CLUSTERINGS: dict[str, Tissues] = {"pixels": PIXEL_TISSUES, "metric": METRIC_TIS
 
 
 def check_tissues(clustering: str | Tissues) -> Tissues:
-    """Return the tissues, given as such or by the name of their clustering.
-
-    Raises:
-        InvalidValueError: if there is no clustering of that name, or what is given is no `Tissues`.
-    """
+    """Return the tissues, given as such or by the name of their clustering."""
     if isinstance(clustering, str) and clustering in CLUSTERINGS:
         return CLUSTERINGS[clustering]
     if not isinstance(clustering, Tissues):

@@ -159,10 +159,10 @@ def _tissue_table(report: VolumeReport) -> Table:
 
 
 def _geometry(report: VolumeReport) -> str:
-    stored = report.stored
-    parts = [f"{_grid(report.shape, report.spacing)}, axes towards {report.orientation}"]
+    stored, volume = report.stored, report.volume
+    parts = [f"{_grid(volume.shape, volume.spacing)}, axes towards {report.orientation}"]
     before = (stored.shape, stored.spacing, stored.orientation)
-    if before != (report.shape, report.spacing, report.orientation):
+    if before != (volume.shape, volume.spacing, report.orientation):
         parts.append(f"read from {_grid(stored.shape, stored.spacing)}, axes towards {stored.orientation}")
     if stored.crop_mm:
         kept = ", ".join(f"{axis} from {low:g} to {high:g} mm" for axis, (low, high) in stored.crop_mm.items())

@@ -122,11 +122,7 @@ def look(rules: Rules, episodes: Sequence[Episode]) -> None:
 
 
 def check_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
-    """Return an action, or a batch of them, as numbers within [-1, 1]; values outside are clipped.
-
-    Raises:
-        InvalidValueError: if the shape is another, or a value is not finite.
-    """
+    """Return an action, or a batch, of this shape as finite numbers within [-1, 1]; values outside are clipped."""
     try:
         # A copy: what the caller does with the array afterwards must not change what was done. Text is no number.
         received = np.asarray(actions).astype(np.float64, casting="same_kind")
@@ -140,11 +136,7 @@ def check_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def wanted_volume(rules: Rules, options: Any) -> str | None:
-    """Return the volume that the options of a reset name, None where they name none.
-
-    Raises:
-        InvalidValueError: if the options are no dict, hold anything else, or name no volume of the rules.
-    """
+    """Return the volume that the options of a reset name, None where they name none; refuse all other options."""
     if options is None:
         return None
     if not isinstance(options, dict):

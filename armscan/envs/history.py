@@ -23,11 +23,7 @@ Mask = NDArray[np.bool_]
 
 
 def boxes_of(space: spaces.Space[Any], who: str) -> dict[str, spaces.Box]:
-    """Return the boxes of a space by name; a single one goes by `FLAT`.
-
-    Raises:
-        InvalidValueError: if the space is neither a vector nor a `Dict` of boxes; `who` cannot wrap it.
-    """
+    """Return the boxes of a vector or `Dict` space by name, a single one by `FLAT`; `who` wraps no other space."""
     if isinstance(space, spaces.Box) and len(space.shape) == 1:
         return {FLAT: space}
     if isinstance(space, spaces.Dict):
@@ -53,11 +49,7 @@ def observation_of(parts: Parts) -> NDArray[Any] | Parts:
 
 
 def check_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozenset[str]:
-    """Return the names of the parts that are not stacked.
-
-    Raises:
-        InvalidValueError: if it is no collection of names, or one is not among those of `boxes`.
-    """
+    """Return the names of the parts that are not stacked, each of which must be among those of `boxes`."""
     named = [name for name in boxes if name != FLAT]
     is_collection = isinstance(excluded, list | tuple | set | frozenset)
     if not is_collection or not all(isinstance(name, str) and name in named for name in excluded):

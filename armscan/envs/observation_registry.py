@@ -78,15 +78,7 @@ NAMED_OBSERVATIONS: dict[str, type[Observation]] = {
 
 
 def with_action_reward(observation: ObservationLike, targets: Sequence[int] = PUBLISHED_TARGETS) -> Observation:
-    """Return an observation with action and reward, which are part of every one.
-
-    Args:
-        observation: as such, by name, or as a list of those that are merged.
-        targets: what `cluster`, given by name, divides its counts by.
-
-    Raises:
-        InvalidValueError: if there is no observation of that name, or it is no observation.
-    """
+    """Return an observation with action and reward, which are part of every one; `targets` are for `cluster`."""
     merged = MergedObservation([observation], targets=targets)
     if any(isinstance(member, ActionRewardObservation) for member in merged.observations):
         return merged

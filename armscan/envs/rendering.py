@@ -124,12 +124,6 @@ def view_of(
 ) -> View:
     """Look at a plane outside of an episode, in a volume as it was read.
 
-    Args:
-        volume: the volume.
-        plane: the plane, anywhere.
-        tissues: how what is seen is clustered.
-        reward: scores it.
-
     Returns:
         What is seen; no action led there, so its `action` is empty.
     """

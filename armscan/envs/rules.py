@@ -190,11 +190,7 @@ class Rules:
 
 
 def named_volumes(volumes: Volumes) -> dict[str, LabelVolume]:
-    """Return volumes given in any of the ways that `ArmscanEnv` takes, by name.
-
-    Raises:
-        InvalidValueError: if there is none, something else is among them, or two have the same name.
-    """
+    """Return volumes given in any of the ways that `ArmscanEnv` takes, by name."""
     if volumes is None:
         return load_phantoms(DEFAULT_PHANTOMS)
     if isinstance(volumes, str | Path):
@@ -216,11 +212,7 @@ def named_volumes(volumes: Volumes) -> dict[str, LabelVolume]:
 
 
 def check_reward(reward: Reward | None, targets: Sequence[int]) -> Reward:
-    """Return a reward given as such, or by the targets of the published one.
-
-    Raises:
-        InvalidValueError: if it is no reward, or comes with targets of its own beside it.
-    """
+    """Return a reward given as such, or by the targets of the published one."""
     targets = check_targets(targets)
     if reward is None:
         return LandmarkReward(targets)

@@ -45,16 +45,7 @@ class MultiBoxSpace(spaces.Dict):
 
 
 def in_order(parts: Parts, boxes: Mapping[str, spaces.Box], leading: tuple[int, ...] = ()) -> Parts:
-    """Return the parts of an observation in the order of their boxes.
-
-    Args:
-        parts: as an observation gave them.
-        boxes: what it said that it gives.
-        leading: shape before that of each box, of a batch.
-
-    Raises:
-        InvalidValueError: if a part is missing, unknown, or of another shape.
-    """
+    """Return the parts of an observation in the order of their boxes, each of shape (*leading, *box.shape)."""
     if parts.keys() != boxes.keys():
         raise InvalidValueError(
             f"the observation gave the parts {', '.join(parts)}, but its spaces are of {', '.join(boxes)}"

@@ -78,9 +78,6 @@ def opened(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tup
         title: of the window.
         picture: shape (height, width, 3).
         height_below: pixels left free below the picture.
-
-    Raises:
-        DisplayError: if the window cannot be opened.
     """
     from matplotlib import pyplot
 

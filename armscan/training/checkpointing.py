@@ -41,12 +41,7 @@ class CheckpointProvenance:
         return {"run_id": self.run_id, "volumes": self.volumes}
 
     def check(self, path: Path, facts: dict[str, Any]) -> None:
-        """Check that a checkpoint comes from this.
-
-        Raises:
-            CheckpointError: if it is another run's.
-            ChangedVolumesError: if it is of other volumes.
-        """
+        """Raise `CheckpointError` if a checkpoint is another run's, `ChangedVolumesError` if it is of other volumes."""
         if facts.get("run_id") != self.run_id:
             raise CheckpointError(
                 f"{path}: is a checkpoint of run {facts.get('run_id')!r}, but this is {self.run_id!r}"

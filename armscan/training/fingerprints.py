@@ -42,16 +42,7 @@ def fingerprints_in(record: bytes | Any, where: str) -> Fingerprints:
 
 
 def check_unchanged(then: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], those_of: str) -> None:
-    """Check that volumes are what they were.
-
-    Args:
-        then: the fingerprints as they were.
-        now: as they are, of the splits that matter.
-        those_of: what was done with them then, for the message: `run 7f was started with`.
-
-    Raises:
-        ChangedVolumesError: if a volume is new, gone, changed, or in another split.
-    """
+    """Raise `ChangedVolumesError` if a volume is new, gone, changed or in another split than `those_of`."""
     for part, prints in now.items():
         before = then.get(part, {})
         changes = {

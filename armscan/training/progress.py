@@ -13,11 +13,7 @@ from armscan.training.callbacks import Callback, EpochReport
 
 
 def progress_reporter(label: str | None = None) -> Callback:
-    """Return a progress bar on a terminal; one line per epoch elsewhere, and for a job of a multirun.
-
-    Args:
-        label: label of the job, printed before each line; None for a single run.
-    """
+    """Return a progress bar on a terminal; elsewhere, or with the label of a job, one line an epoch."""
     return ProgressBar() if label is None and sys.stdout.isatty() else ProgressLines(label)
 
 

@@ -93,7 +93,7 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
     splits = None if manifest.splits is None else _split_of(manifest.splits, subjects, used, f"{found}: splits")
     return Dataset(
         volumes=volumes,
-        reports={name: VolumeReport.of(volume, stored[name]) for name, volume in volumes.items()},
+        reports={name: VolumeReport(volume, stored[name]) for name, volume in volumes.items()},
         subjects={name: subjects[name] for name in used},
         splits=splits,
         excluded={name: str(entry.exclude) for name, entry in entries.items() if entry.exclude},

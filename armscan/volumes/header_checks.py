@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from armscan.errors import VolumeError, listed
@@ -67,11 +68,6 @@ def check_nrrd(path: Path, needed: Sequence[str] = ()) -> None:
     check_stored(path, stored)
 
 
-def check_segmentation(path: Path) -> None:
-    """Raise `VolumeError` as `check_nrrd`, and if a segmentation does not say where it lies."""
-    check_nrrd(path, ("space", "space directions", "space origin", "kinds"))
-
-
 def check_metaimage(path: Path) -> None:
     """Raise `VolumeError` if a MetaImage is damaged, or its header gives no finite and positive spacing."""
     text = _text_header(path)
@@ -120,7 +116,8 @@ def check_metaimage(path: Path) -> None:
 
 # By ending; the first that fits a name is the file's.
 CHECKS: dict[str, Callable[[Path], None]] = {
-    ".seg.nrrd": check_segmentation,
+    # A segmentation must also say where it lies.
+    ".seg.nrrd": partial(check_nrrd, needed=("space", "space directions", "space origin", "kinds")),
     ".nii.gz": check_nifti,
     ".nii": check_nifti,
     ".nrrd": check_nrrd,

@@ -75,11 +75,7 @@ class LabelMap:
 
     @classmethod
     def from_mapping(cls, mapping: Any) -> Self:
-        """Build a label map from what a manifest says, {'bones': [1, 2], ...}.
-
-        Raises:
-            InvalidValueError: if it is no mapping, or a key is unknown, and as the class says.
-        """
+        """Build a label map from what a manifest says, {'bones': [1, 2], ...}."""
         allowed = [field.name for field in fields(cls)]
         if not isinstance(mapping, Mapping):
             raise InvalidValueError(f"labels is {mapping!r}, but it must be a mapping with {', '.join(allowed)}")

@@ -34,11 +34,7 @@ Document = dict[str, Any]
 
 
 def volume_files(folder: Path) -> dict[str, Path]:
-    """Return the volumes of a folder by file name, in the order of their names.
-
-    Raises:
-        VolumeError: if the folder does not exist, cannot be read, or holds no volume.
-    """
+    """Return the volumes of a folder by file name, in the order of their names."""
     try:
         found = [file for file in sorted(folder.iterdir()) if file.name.endswith(tuple(CHECKS)) and file.is_file()]
     except FileNotFoundError as error:
@@ -52,11 +48,7 @@ def volume_files(folder: Path) -> dict[str, Path]:
 
 
 def find_manifest(folder: Path) -> Path | None:
-    """Return the manifest of a folder, None where there is none.
-
-    Raises:
-        ManifestError: if there are several.
-    """
+    """Return the one manifest of a folder, None where there is none."""
     found = [folder / name for name in MANIFEST_NAMES if (folder / name).exists()]
     if len(found) > 1:
         raise ManifestError(f"{folder}: holds {' and '.join(path.name for path in found)}, but one manifest is allowed")
@@ -64,11 +56,7 @@ def find_manifest(folder: Path) -> Path | None:
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Read and check a manifest.
-
-    Raises:
-        ManifestError: naming the file, the entry, the key, the value received and what is allowed.
-    """
+    """Read and check a manifest; an error names the file, the entry, the key, the value and what is allowed."""
     # Deferred: who steps through phantoms reads no manifest.
     from armscan.volumes.manifest_schema import check_manifest
 
@@ -76,11 +64,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def volume_entries(manifest: Manifest, files: Mapping[str, Path], path: Path | None) -> dict[str, VolumeEntry]:
-    """Return the entry of each volume file; empty ones where the manifest has no `volumes`.
-
-    Raises:
-        ManifestError: if an entry has no file, or a file no entry.
-    """
+    """Return the entry of each volume file, which must have one; empty ones where the manifest has no `volumes`."""
     from armscan.volumes.manifest_schema import VolumeEntry
 
     if manifest.volumes is None:

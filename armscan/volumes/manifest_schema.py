@@ -40,7 +40,6 @@ Axes = Annotated[str, BeforeValidator(check_axes)]
 Orientation = Annotated[str | None, BeforeValidator(check_orientation)]
 Labels = Annotated[LabelMap, BeforeValidator(LabelMap.from_mapping)]
 Overlap = Literal["refuse", "first", "last"]
-OVERLAP_MEANING = "refuse, first or last"
 
 
 class _Strict(BaseModel):
@@ -49,19 +48,24 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
 
 
-class VolumeEntry(_Strict):
-    """Entry of a manifest for one volume; the description of each key says what its value must be."""
+class _Settings(_Strict):
+    """What an entry and the whole manifest can say; the description of each key says what its value must be."""
+
+    labels: Labels | None = None
+    orientation: Orientation = None
+    axes: Axes = "xyz"
+    overlap: Overlap = Field(default="refuse", description="refuse, first or last")
+
+
+class VolumeEntry(_Settings):
+    """Entry of a manifest for one volume."""
 
     rotation: Rotation | None = None
     translation: Translation | None = None
     score: Score | None = None
     subject: Text | None = Field(default=None, min_length=1, description="a text that is not empty (quote numbers)")
     exclude: bool | Annotated[Text, Field(min_length=1)] = Field(default=False, description="true, false or the reason")
-    labels: Labels | None = None
-    orientation: Orientation = None
-    axes: Axes = "xyz"
     crop_mm: Annotated[Crop | None, BeforeValidator(check_crop)] = None
-    overlap: Overlap = Field(default="refuse", description=OVERLAP_MEANING)
 
     @model_validator(mode="after")
     def _has_whole_plane(self) -> VolumeEntry:
@@ -96,13 +100,9 @@ class Splits(_Strict):
         return self
 
 
-class Manifest(_Strict):
+class Manifest(_Settings):
     """A whole manifest; what stands at the top holds for every volume whose entry says nothing else."""
 
-    labels: Labels | None = None
-    orientation: Orientation = None
-    axes: Axes = "xyz"
-    overlap: Overlap = Field(default="refuse", description=OVERLAP_MEANING)
     spacing: Literal["own", "finest"] = Field(default="own", description="own or finest")
     splits: Splits | None = Field(default=None, description="lists of subjects under train, validation and test")
     volumes: dict[Text, VolumeEntry] | None = Field(default=None, description="entries by the names of the files")

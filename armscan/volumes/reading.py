@@ -45,11 +45,6 @@ class ReadingOptions:
         check_choice("overlap", self.overlap, OVERLAPS)
 
 
-def volume_suffix(path: Path) -> str | None:
-    """Return the ending that says a file is a volume ('.nii.gz', ...), None for any other file."""
-    return next((suffix for suffix in CHECKS if path.name.endswith(suffix)), None)
-
-
 def read_volume(
     path: str | Path,
     *,
@@ -130,7 +125,7 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
     # Deferred: it takes long to load, and who steps through phantoms never needs it.
     import SimpleITK
 
-    suffix = volume_suffix(path)
+    suffix = next((suffix for suffix in CHECKS if path.name.endswith(suffix)), None)
     if suffix is None:
         raise VolumeError(f"{path}: a volume is read from {listed(CHECKS)}")
     SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)

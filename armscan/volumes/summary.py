@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Self
+from functools import cached_property
 
 from armscan.volumes.labelmap import BACKGROUND, LABEL_NAMES, Found, LabelMap, Source, count_values
 from armscan.volumes.orientation import Crop, orientation_of
@@ -37,43 +37,28 @@ class StoredFile:
         return tuple(each.source for each in self.found if each.label == BACKGROUND and each.source != 0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class VolumeReport:
-    """A volume and its file, after orientation, order of axes, crop and resampling.
+    """A volume, after orientation, order of axes, crop and resampling, and the file that it was read from."""
 
-    Args:
-        name: the volume's.
-        stored: the file.
-        shape: (nx, ny, nz) in voxels.
-        spacing: (sx, sy, sz) in mm.
-        orientation: directions that its axes run towards, such as 'LPS'.
-        n_voxels: by tissue.
-    """
-
-    name: str
+    volume: LabelVolume
     stored: StoredFile
-    shape: tuple[int, int, int]
-    spacing: tuple[float, float, float]
-    orientation: str
-    n_voxels: dict[str, int]
 
-    @classmethod
-    def of(cls, volume: LabelVolume, stored: StoredFile) -> Self:
-        """Describe a volume."""
-        counts = count_values(volume.labels)
-        return cls(
-            name=volume.name,
-            stored=stored,
-            shape=volume.shape,
-            spacing=volume.spacing,
-            orientation=orientation_of(volume.direction),
-            n_voxels={tissue: counts.get(label, 0) for label, tissue in LABEL_NAMES.items() if label != BACKGROUND},
-        )
+    @property
+    def orientation(self) -> str:
+        """Directions that the volume's axes run towards, such as 'LPS'."""
+        return orientation_of(self.volume.direction)
+
+    @cached_property
+    def n_voxels(self) -> dict[str, int]:
+        """Number of voxels of each tissue."""
+        counts = count_values(self.volume.labels)
+        return {tissue: counts.get(label, 0) for label, tissue in LABEL_NAMES.items() if label != BACKGROUND}
 
     @property
     def tissue_mm3(self) -> dict[str, float]:
         """The tissues' volumes in cubic millimetres."""
-        return {tissue: count * math.prod(self.spacing) for tissue, count in self.n_voxels.items()}
+        return {tissue: count * math.prod(self.volume.spacing) for tissue, count in self.n_voxels.items()}
 
 
 def missing_sources(labels: LabelMap | None, found: tuple[Found, ...]) -> tuple[Source, ...]:

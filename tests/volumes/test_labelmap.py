@@ -148,7 +148,7 @@ def test_report_tells_what_the_file_held_and_what_became_of_it(write_labelmap, t
     assert report.n_voxels["bones"] == (tiny_volume.labels == 1).sum()
     assert report.tissue_mm3["bones"] == pytest.approx(0.5 * (tiny_volume.labels == 1).sum())
     assert report.n_voxels["nerve"] == 0
-    assert (report.shape, report.orientation, report.stored.orientation) == (tiny_volume.shape, "LPS", "LPS")
+    assert (report.volume.shape, report.orientation, report.stored.orientation) == (tiny_volume.shape, "LPS", "LPS")
 
 
 @pytest.mark.parametrize("name", ["thin.nrrd", "thin.nii.gz", "thin.mha"])

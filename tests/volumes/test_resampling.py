@@ -66,7 +66,7 @@ def test_manifest_brings_volumes_to_the_finest_spacing(write_labelmap, tmp_path,
     dataset = open_dataset(tmp_path)
     spacings = {volume.spacing for volume in dataset.volumes.values()}
     assert (spacings == {(0.3, 0.4, 0.5)}) == expected
-    assert {report.spacing for report in dataset.reports.values()} == spacings
+    assert {report.volume.spacing for report in dataset.reports.values()} == spacings
     assert dataset.reports["b.nrrd"].stored.spacing == pytest.approx((0.4, 0.4, 0.6))
     if expected:
         assert finest_spacing(dataset.volumes.values()) == (0.3, 0.4, 0.5)
