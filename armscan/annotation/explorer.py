@@ -117,16 +117,14 @@ class Explorer:
             history=History(remembered, range(first, first + N_REMEMBERED), -SUCCESS_THRESHOLD, "reward by plane"),
         )
 
-    def _look(self) -> None:
+    def _look(self, _: float = 0.0) -> None:
+        if self._is_setting:
+            return
         self.plane = ManipulatorAction.from_array(np.array([slider.val for slider in self.sliders.values()]))
         self.view = view_of(self.volume, self.plane, tissues=self._tissues)
         self.rewards.append(self.view.reward)
         self._image.set_data(self.picture())
         self.figure.canvas.draw_idle()
-
-    def _slid(self, _: float) -> None:
-        if not self._is_setting:
-            self._look()
 
     def _slider(self, row: int, component: str) -> Slider:
         left, bottom, width, height = SLIDERS_AT
@@ -147,7 +145,7 @@ class Explorer:
             text.set_color(_rgb(INK))
         # Drawn with the picture, once.
         slider.drawon = False
-        slider.on_changed(self._slid)
+        slider.on_changed(self._look)
         return slider
 
     def _button(self, row: int, action: Callable[[], None], label: str = "") -> Button:

@@ -64,7 +64,7 @@ class Multirun(Callback):
 
     @staticmethod
     def _start(config: DictConfig) -> None:
-        from armscan.tracking import open_store, source_tags
+        from armscan.tracking import open_store, source
 
         if config.get("study") is not None:
             # It has a run of its own, which outlives many starts of workers.
@@ -81,7 +81,7 @@ class Multirun(Callback):
         # Includes the tracking URI, because the environment may differ later.
         hydra_words = [word for word in config.hydra.overrides.hydra if not word.startswith(NOT_REPEATED)]
         again = [*overrides, *hydra_words, f"{TRACKING_URI}='{tracking['uri']}'"]
-        tags = {**source_tags(), "overrides": command, "working_folder": str(Path.cwd()), GRID_TAG: json.dumps(again)}
+        tags = {**source().tags, "overrides": command, "working_folder": str(Path.cwd()), GRID_TAG: json.dumps(again)}
         parent = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
         word = {"run_id": parent.info.run_id, "tracking": tracking, "overrides": overrides}
         word |= {"is_repeated": Multirun.is_repeated, "trust": untrusted_word(again, tracking["uri"]) is not None}

@@ -52,6 +52,7 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
         ExportError: if torch.export or ONNX cannot take the policy.
     """
     program = export_program(policy, batch)
+    example = {name: part[:2] for name, part in batch.items()} if isinstance(batch, dict) else batch[:2]
     with tempfile.TemporaryDirectory() as beside:
         file = Path(beside, PROGRAM_FILE)
         save_program(program, file)
@@ -60,8 +61,9 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
             python_model=str(CODE),
             artifacts={"program": str(file)},
             signature=infer_signature(arrays_of(batch), arrays_of(policy(batch))),
-            input_example=_first(2, arrays_of(batch)),
-            pip_requirements=[f"{name}=={_release(name)}" for name in REQUIREMENTS],
+            input_example=arrays_of(example),
+            # Without the build that is installed here, such as `+cpu`.
+            pip_requirements=[f"{name}=={metadata.version(name).partition('+')[0]}" for name in REQUIREMENTS],
             metadata=dict(facts),
         )
     save_onnx(program, batch, folder / ONNX_FILE)
@@ -93,12 +95,3 @@ def arrays_of(batch: Batch) -> Arrays:
     if isinstance(batch, torch.Tensor):
         return batch.numpy()
     return {name: part.numpy() for name, part in batch.items()}
-
-
-def _release(name: str) -> str:
-    """Return the version of a library without the build that is installed here, such as `+cpu`."""
-    return metadata.version(name).partition("+")[0]
-
-
-def _first(n: int, arrays: Arrays) -> Arrays:
-    return {name: part[:n] for name, part in arrays.items()} if isinstance(arrays, dict) else arrays[:n]

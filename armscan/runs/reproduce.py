@@ -19,7 +19,7 @@ from armscan.experiment.job import Invocation, remove_if_untracked
 from armscan.experiment.provenance import CHOICES_IN_TAGS, start_tracking
 from armscan.experiment.runner import run_tracked
 from armscan.runs.compare import Comparison, compare_runs
-from armscan.tracking import EVALUATED_TAG, FoundRun, environment_tags, load_run, source_tags
+from armscan.tracking import EVALUATED_TAG, FoundRun, environment_tags, load_run, source
 from armscan.tracking.environment import COMMIT, CONSTRAINTS_SUM, DIFF_SUM, DIRTY, TOLD, environment
 from armscan.tracking.sync import ENDED
 from armscan.training import check_unchanged
@@ -88,7 +88,7 @@ def _environment(text: str, run: FoundRun) -> Mapping[str, Any]:
 
 def differences(original: Original) -> list[str]:
     """Return what is not as it was when a run was made, in a line each: code, packages, machine."""
-    tags, now = original.run.tags, {**source_tags(), **environment_tags()}
+    tags, now = original.run.tags, {**source().tags, **environment_tags()}
     lines = [
         f"{what} was {tags.get(tag, 'not kept')}, and is {now.get(tag, 'not kept')}"
         for tag, what in ((COMMIT, "the git commit"), (CONSTRAINTS_SUM, "the sum of constraints.txt"))

@@ -1,7 +1,7 @@
 """MLflow: the store, its runs, and the pictures that go there."""
 
 from armscan.tracking.client import TrackingStore
-from armscan.tracking.environment import environment_file, environment_tags, source, source_tags
+from armscan.tracking.environment import environment_file, environment_tags, source
 from armscan.tracking.lookup import (
     DOMAIN_TAG,
     EVALUATED_TAG,
@@ -42,7 +42,6 @@ __all__ = [
     "open_existing_store",
     "open_store",
     "source",
-    "source_tags",
     "sync",
     "tags_of",
     "take_over",

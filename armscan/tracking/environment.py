@@ -89,11 +89,6 @@ def source() -> Source:
     return source_in(Path(__file__).parent)
 
 
-def source_tags() -> Mapping[str, str]:
-    """Return the git commit of the code and whether its tree was dirty; 'unknown' where the code is under no git."""
-    return source().tags
-
-
 def source_in(folder: Path) -> Source:
     """Return the state of the working tree that a folder with code is in."""
     commit = UNKNOWN

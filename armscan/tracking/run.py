@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 from armscan.config.command_hints import armscan_command
 from armscan.errors import TrackingError, is_interruption
 from armscan.tracking.client import TrackingStore
-from armscan.tracking.environment import DIFF_SUM, environment_tags, source, source_tags
+from armscan.tracking.environment import DIFF_SUM, environment_tags, source
 from armscan.tracking.notes import forget
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
 from armscan.tracking.sanitize import params_of, tags_of
@@ -21,8 +21,6 @@ from armscan.utils.files import RESULTS, RESUMED_DIFF_FILE, atomic_write
 from armscan.utils.log import log
 
 if TYPE_CHECKING:
-    from mlflow.entities import Run
-
     from armscan.training import EpochReport
 
 MODEL_FILE = "MLmodel"
@@ -72,7 +70,7 @@ class TrackedRun:
     ) -> Self:
         """Make a new run; the leaves of its resolved configuration become parameters."""
         parent = {"mlflow.parentRunId": parent_id} if parent_id else {}
-        run = store.create_run(experiment_id, name=name, tags={**source_tags(), **tags, **parent})
+        run = store.create_run(experiment_id, name=name, tags={**source().tags, **tags, **parent})
         tracked = cls.joined(store, run.info.run_id, name=name, folder=folder)
         tracked._log_config(config)
         return tracked
@@ -91,11 +89,16 @@ class TrackedRun:
         if not (resumed := run.data.tags.get("resumed", "0")).isdecimal():
             raise TrackingError(f"run {run_id}: its tag resumed is {resumed[:50]!r}, but it must be a whole number")
         n_resumed = int(resumed[:MAX_DIGITS]) + 1
-        now = {**source_tags(), **environment_tags()}
+        now = {**source().tags, **environment_tags()}
         changed = {f"resumed.{key}": value for key, value in now.items() if run.data.tags.get(key) != value}
         had_outbox = file_of(folder, run_id).exists()
         outbox = Outbox.begin(folder, Address(run_id, store.uri))
-        logged = _logged_in(outbox) if had_outbox else _logged_of(store, run)
+        if had_outbox:
+            logged = {(name, step) for entry in outbox.entries() for name, _, _, step in entry.get("metrics", ())}
+        else:
+            # An earlier version has made the run.
+            histories = {name: store.get_metric_history(run_id, name) for name in run.data.metrics}
+            logged = {(name, point.step) for name, points in histories.items() for point in points}
         tracked = cls(store, outbox, name=run.info.run_name or run_id, logged=logged)
         tracked.go_on()
         tracked.set_tags(dict(tags) | changed | {"resumed": str(n_resumed)})
@@ -227,13 +230,3 @@ class TrackedRun:
     def _add(self, **entry: Any) -> None:
         self._outbox.add(**entry)
         self._uploader.wake()
-
-
-def _logged_in(outbox: Outbox) -> set[tuple[str, int]]:
-    return {(name, step) for entry in outbox.entries() for name, _, _, step in entry.get("metrics", ())}
-
-
-def _logged_of(store: TrackingStore, run: Run) -> set[tuple[str, int]]:
-    """Return what the store has of a run whose folder has no outbox: an older version has made it."""
-    run_id = run.info.run_id
-    return {(name, point.step) for name in run.data.metrics for point in store.get_metric_history(run_id, name)}

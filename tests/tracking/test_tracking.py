@@ -20,7 +20,7 @@ from armscan.tracking import (
     load_run,
     open_existing_store,
     open_store,
-    source_tags,
+    source,
 )
 from armscan.tracking.notes import notes
 from armscan.tracking.outbox import Address, Outbox, file_of
@@ -78,7 +78,7 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
     assert run.info.status == "FINISHED"
     assert run.data.params == {"agent.lr": "0.1", "agent.sizes": "[1, 2]", "seed": "3"}
     assert run.data.tags["overrides"] == "seed=3"
-    assert run.data.tags["git.commit"] == source_tags()["git.commit"]
+    assert run.data.tags["git.commit"] == source().tags["git.commit"]
     assert run.data.metrics["test_volumes/mean_steps"] == 3.0
     assert run.data.metrics["best_env_step"] == 300
     history = client.get_metric_history(tracked.run_id, "validation/mean_steps")

@@ -24,7 +24,7 @@ from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX, StudySettings
 from armscan.sweeps.study.stored import check_trials
 from armscan.sweeps.study.study import STUDY_RUN, make_study
 from armscan.sweeps.tasks.attempt import Attempt, Task, trial_folder
-from armscan.tracking import TrackingStore, abandon, open_store, source_tags
+from armscan.tracking import TrackingStore, abandon, open_store, source
 from armscan.tracking.run import FAILURE_TAG
 from armscan.utils.log import log
 from armscan.utils.retry import RETRY_S
@@ -133,7 +133,7 @@ def open_for_work(
 
     @functools.cache
     def create_run() -> str:
-        tags = {**source_tags(), "study": settings.name, "study.storage": storage.uri, "overrides": " ".join(words)}
+        tags = {**source().tags, "study": settings.name, "study.storage": storage.uri, "overrides": " ".join(words)}
         return str(client.create_run(experiment_id, name=f"study {settings.name}", tags=tags).info.run_id)
 
     def tracked_run() -> str:
