@@ -98,13 +98,7 @@ class PlaneGrid:
 
 
 class PlaneScorer:
-    """Scores planes of one volume.
-
-    Args:
-        volume: the volume.
-        reward: scores what is seen.
-        tissues: clustering rule of each tissue.
-    """
+    """Scores planes of one volume."""
 
     def __init__(self, volume: LabelVolume, reward: Reward, tissues: Tissues) -> None:
         self.volume = volume

@@ -1,20 +1,95 @@
-"""Compose the configuration, for the command line and outside of it."""
+"""Compose the configuration; `./conf` and `./sweeps` of the working folder come before armscan's own."""
 
 from __future__ import annotations
 
+import functools
+import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import hydra
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig
 
 # They register the resolvers that the configuration uses.
 from armscan.config import choices as choices
 from armscan.config import services as services
-from armscan.config.search_path import register
-from armscan.config.sources import CONFIG_NAME, config_folder
+from armscan.config.sources import (
+    CONF,
+    CONFIG_NAME,
+    SWEEP,
+    SWEEPS,
+    config_folder,
+    own_folders,
+    replaced_files,
+    sweeps_folder,
+)
 
 VERSION_BASE = "1.3"
+MAX_NAMED = 3
+
+
+class SweepsSource(FileConfigSource):
+    """A folder of studies as the configuration group `sweep`."""
+
+    @staticmethod
+    def scheme() -> str:
+        """Return what its addresses begin with."""
+        return SWEEPS
+
+    def is_group(self, config_path: str) -> bool:
+        """Return whether this is the group, or the folder that it is in."""
+        return config_path in ("", SWEEP)
+
+    def is_config(self, config_path: str) -> bool:
+        """Return whether this is a study of the folder."""
+        group, _, name = config_path.partition("/")
+        return group == SWEEP and bool(name) and super().is_config(name)
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Read a study."""
+        return super().load_config(config_path.removeprefix(f"{SWEEP}/"))
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        """Return the studies of the folder; of what the folder is in, the group."""
+        if not config_path:
+            return [] if results_filter == ObjectType.CONFIG else [SWEEP]
+        names = sorted(path.stem for path in Path(self.path).glob("*.yaml"))
+        return [] if results_filter == ObjectType.GROUP else names
+
+
+class OwnFolders(SearchPathPlugin):
+    """Add armscan's studies, and put the folders of the working folder before armscan's own."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Add the folders, where it is armscan that is configured."""
+        if any(each.path == str(config_folder()) for each in search_path.get_path()):
+            search_path.append(SWEEPS, f"{SWEEPS}://{sweeps_folder()}")
+            for name, folder in own_folders().items():
+                scheme = "file" if name == CONF else SWEEPS
+                search_path.prepend(f"./{name}", f"{scheme}://{folder}", anchor="main")
+            _print_replaced(tuple(f"./{path}" for path in replaced_files()))
+
+
+@functools.cache
+def _print_replaced(names: tuple[str, ...]) -> None:
+    """Say once which of armscan's own files are not used."""
+    if names:
+        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+        print(f"using {', '.join(names[:MAX_NAMED])}{more} instead of armscan's own", file=sys.stderr)
+
+
+@functools.cache
+def register() -> None:
+    """Make both known to Hydra in this process."""
+    for plugin in (SweepsSource, OwnFolders):
+        Plugins.instance().register(plugin)
 
 
 def application(run: Callable[[DictConfig], None]) -> Callable[[], None]:

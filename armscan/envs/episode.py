@@ -20,11 +20,6 @@ class Episode:
 
     Each plane comes in two steps, so that many environments can be looked at together between them: `aim` at it, then
     `see` what is there. The first plane is the start, every further one a step.
-
-    Args:
-        rules: the rules.
-        scene: the episode's volume.
-        start: the first action.
     """
 
     view: View

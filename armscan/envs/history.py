@@ -84,9 +84,6 @@ class FrameHistory:
         size: number of observations, from 1 to 1000.
         excluded: parts that are not stacked.
         n_envs: environments of the batch.
-
-    Raises:
-        InvalidValueError: if the size is out of bounds, or a part to leave out does not exist.
     """
 
     def __init__(self, boxes: Mapping[str, spaces.Box], size: int, excluded: Collection[str], n_envs: int) -> None:
@@ -137,9 +134,6 @@ class BestPairs:
         size: number of pairs of action and reward, from 1 to 1000.
         action_space: the free components of an action.
         n_envs: environments of the batch.
-
-    Raises:
-        InvalidValueError: if the size is out of bounds, or there is a part called `memory` already.
     """
 
     def __init__(self, boxes: dict[str, spaces.Box], size: int, action_space: spaces.Space[Any], n_envs: int) -> None:

@@ -127,13 +127,7 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSampler:
-    """Draws the scenes of an environment.
-
-    Args:
-        rotation_bounds_deg: bounds of rz and rx.
-        translation_bounds_mm: bounds of tx and ty, None for each volume's own size.
-        transform: the motions to draw from, None for none.
-    """
+    """Draws the scenes of an environment."""
 
     rotation_bounds_deg: tuple[float, float]
     translation_bounds_mm: tuple[float, float] | None

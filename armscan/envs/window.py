@@ -24,10 +24,6 @@ class Window:
 
     A window that a person closes stays closed, until `close` has been called and another picture comes.
 
-    Args:
-        title: of the window.
-        frames_per_s: how fast pictures follow each other at most.
-
     Raises:
         DisplayError: if no window can be shown here.
     """

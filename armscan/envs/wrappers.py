@@ -125,13 +125,7 @@ class _VectorRemembering(VectorWrapper):
 
 
 class VectorFrameStack(_VectorRemembering):
-    """`FrameStack` for many environments.
-
-    Args:
-        env: the environments.
-        stack: as in `FrameStack`.
-        exclude: as in `FrameStack`.
-    """
+    """`FrameStack` for many environments, with the same arguments."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], stack: int, *, exclude: Collection[str] = ()) -> None:
         boxes = boxes_of(_checked(env, VectorEnv).single_observation_space, "VectorFrameStack")
@@ -139,12 +133,7 @@ class VectorFrameStack(_VectorRemembering):
 
 
 class VectorBestActionMemory(_VectorRemembering):
-    """`BestActionMemory` for many environments.
-
-    Args:
-        env: the environments.
-        memory: as in `BestActionMemory`.
-    """
+    """`BestActionMemory` for many environments, with the same arguments."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], memory: int) -> None:
         boxes = boxes_of(_checked(env, VectorEnv).single_observation_space, "VectorBestActionMemory")

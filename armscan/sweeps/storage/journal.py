@@ -64,13 +64,7 @@ def _why_full(error: BaseException) -> str | None:
 
 @dataclass(frozen=True)
 class Position:
-    """A position between two lines of a journal.
-
-    Args:
-        n_lines: number of lines before it.
-        end: number of bytes before it.
-        sum: sum of the lines before it.
-    """
+    """A position between two lines of a journal: the number, the bytes and the sum of the lines before it."""
 
     n_lines: int = 0
     end: int = 0
