@@ -44,9 +44,7 @@ def inspect(folder: str) -> None:
     _print_dataset(open_dataset(folder, require_manifest=False))
 
 
-@data.command(
-    epilog=examples("data label wrists", "data label wrists --volume a.nii.gz --markup moved.mrk.json"),
-)
+@data.command(epilog=examples("data label wrists", "data label wrists --volume a.nii.gz --markup moved.mrk.json"))
 @click.argument("folder")
 @click.option("--volumes", type=CommaSeparated("NAME"), help="Only these volumes, by their file names.")
 @click.option("--overwrite", is_flag=True, help="Also label volumes that have a plane.")

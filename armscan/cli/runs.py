@@ -160,9 +160,7 @@ def sync(folder: Path, tracking: str | None, trust: bool) -> int:
     return 1 if any(delivery.left for delivery in deliveries) else 0
 
 
-@runs.command(
-    epilog=examples("runs reproduce 3bf2 --dry-run", "runs reproduce 3bf2 --out again"),
-)
+@runs.command(epilog=examples("runs reproduce 3bf2 --dry-run", "runs reproduce 3bf2 --out again"))
 @click.argument("run")
 @click.option("--dry-run", is_flag=True, help="Only list what differs from the run.")
 @click.option(

@@ -12,9 +12,7 @@ from armscan.config.services import DASHBOARD_PORT, MLFLOW_PORT
 PORT = click.IntRange(1, 65_535)
 
 
-@click.command(
-    epilog=examples("ui --storage postgresql://USER@HOST/DATABASE --tracking http://SERVER:5000"),
-)
+@click.command(epilog=examples("ui --storage postgresql://USER@HOST/DATABASE --tracking http://SERVER:5000"))
 @storage_option(help="Optuna storage of the studies; the password of a database is read from ARMSCAN_STORAGE_PASSWORD.")
 @tracking_option(help="MLflow tracking store of the runs; the password of a database: ARMSCAN_TRACKING_PASSWORD.")
 @click.option(

@@ -13,13 +13,7 @@ from armscan.envs.env import ArmscanEnv
 from armscan.envs.history import MOST_KEPT, boxes_of, check_exclusions
 from armscan.envs.rules import Rules, Volumes, check_reward
 from armscan.envs.vector_env import ArmscanVectorEnv
-from armscan.envs.wrappers import (
-    BestActionMemory,
-    Env,
-    FrameStack,
-    VectorBestActionMemory,
-    VectorFrameStack,
-)
+from armscan.envs.wrappers import BestActionMemory, Env, FrameStack, VectorBestActionMemory, VectorFrameStack
 from armscan.errors import InvalidValueError, listed
 from armscan.utils.validation import check_bool, check_int
 from armscan.volumes import LabelVolume

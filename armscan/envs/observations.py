@@ -11,14 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from armscan.anatomy import (
-    PUBLISHED_TARGETS,
-    USUAL_PIXEL_MM,
-    Landmarks,
-    TissueClusters,
-    Tissues,
-    check_targets,
-)
+from armscan.anatomy import PUBLISHED_TARGETS, USUAL_PIXEL_MM, Landmarks, TissueClusters, Tissues, check_targets
 from armscan.envs.spaces import Parts
 from armscan.utils.validation import check_bool
 from armscan.volumes.plane import FloatArray

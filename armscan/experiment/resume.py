@@ -23,15 +23,7 @@ from armscan.experiment.build import set_up
 from armscan.experiment.job import GRID_TAG
 from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
-from armscan.tracking import (
-    TrackedRun,
-    TrackingStore,
-    check_run_id,
-    check_version,
-    find_run,
-    open_existing_store,
-    sync,
-)
+from armscan.tracking import TrackedRun, TrackingStore, check_run_id, check_version, find_run, open_existing_store, sync
 from armscan.training import Fingerprints, check_unchanged, fingerprints_in, resume_from_checkpoint
 from armscan.utils.files import (
     CONFIG_FILE,

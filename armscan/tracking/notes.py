@@ -22,12 +22,9 @@ def forget(run_id: str) -> None:
 
 @dataclass(frozen=True)
 class Note:
-    """A note of this machine: a run that may have something to upload, or that nobody has ended.
+    """A note of this machine: a run, by its outbox, that may have something to upload, or that nobody has ended.
 
-    Args:
-        outbox: its outbox.
-        uri: address of its tracking store.
-        process: the process that tracks it.
+    It names the address of the run's tracking store, and the process that tracks the run.
     """
 
     outbox: Path

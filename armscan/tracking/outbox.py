@@ -45,11 +45,7 @@ LOCK_TIMEOUT_S = 20.0
 
 @dataclass(frozen=True)
 class Address:
-    """Where the entries of an outbox belong.
-
-    Args:
-        run_id: the run's ID.
-        uri: address of its tracking store.
+    """Where the entries of an outbox belong: the ID of a run, and the address of its tracking store.
 
     Raises:
         TrackingError: if the ID is none; files are named after it.

@@ -16,13 +16,7 @@ from urllib.request import url2pathname
 
 from filelock import FileLock
 
-from armscan.config.credentials import (
-    SERVER_PASSWORD,
-    TRACKING_PASSWORD,
-    check_address,
-    database_url,
-    read_password,
-)
+from armscan.config.credentials import SERVER_PASSWORD, TRACKING_PASSWORD, check_address, database_url, read_password
 from armscan.errors import TrackingError
 from armscan.tracking.client import TrackingStore, reason_in
 from armscan.utils.files import SQLITE_PREFIX, check_writable, sqlite_file

@@ -25,13 +25,7 @@ from armscan.sweeps.study.arguments import STORAGE, USUAL_LAUNCHER, WORKER_KEY, 
 from armscan.sweeps.study.open import OpenedStudy
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.sweeps.workers.monitor import StudyMonitor
-from armscan.sweeps.workers.supervisor import (
-    LAUNCHER_FILE,
-    STOP_FILE,
-    WORKER_FILES,
-    keep_gpus,
-    local_workers,
-)
+from armscan.sweeps.workers.supervisor import LAUNCHER_FILE, STOP_FILE, WORKER_FILES, keep_gpus, local_workers
 from armscan.tracking import TrackedRun, sync
 from armscan.tracking.run import SHORT_WAIT_S
 from armscan.utils.processes import ProcessInfo
