@@ -160,7 +160,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         """Start an episode; `options={"volume": name}` chooses its volume."""
         volume_name = wanted_volume(self.rules, options)
         super().reset(seed=None if seed is None else check_int("seed", seed, at_least=0))
-        (self._episode,) = begin(self.rules, [self.np_random], volume_name)
+        (self._episode,) = begin(self.rules, [self.np_random], [volume_name])
         return self._seen()
 
     def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:

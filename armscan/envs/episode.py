@@ -92,12 +92,19 @@ def info_of(episode: Episode) -> dict[str, Any]:
     }
 
 
-def begin(rules: Rules, rngs: Sequence[np.random.Generator], volume_name: str | None = None) -> list[Episode]:
-    """Begin an episode for each generator, which everything of it is drawn from; on the named volume, if there is one.
+def begin(rules: Rules, rngs: Sequence[np.random.Generator], volume_names: Sequence[str | None]) -> list[Episode]:
+    """Begin an episode for each generator, which everything of it is drawn from.
 
     The episodes have been started but not seen: their first planes are still to be looked at.
+
+    Args:
+        rules: the rules.
+        rngs: the generators.
+        volume_names: name of each episode's volume, None for one that is drawn.
     """
-    drawn = [volume_name or rules.names[int(rng.integers(len(rules.names)))] for rng in rngs]
+    drawn = [
+        name or rules.names[int(rng.integers(len(rules.names)))] for name, rng in zip(volume_names, rngs, strict=True)
+    ]
     scenes = rules.draw_scenes(drawn, rngs)
     return [Episode(rules, scene, _start(rules, rng)) for scene, rng in zip(scenes, rngs, strict=True)]
 

@@ -20,6 +20,7 @@ MEMORY = "memory"
 # Observations of a stack, and pairs of a memory.
 MOST_KEPT = 1000
 Mask = NDArray[np.bool_]
+EnvIds = NDArray[np.int64]
 
 
 def boxes_of(space: spaces.Space[Any], who: str) -> dict[str, spaces.Box]:
@@ -60,19 +61,27 @@ def check_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozense
     return frozenset(excluded)
 
 
+def rows_of(observations: NDArray[Any] | Parts, rows: NDArray[Any]) -> NDArray[Any] | Parts:
+    """Return the chosen rows, by their numbers or as a mask, of a batch of observations."""
+    return observation_of({name: part[rows] for name, part in parts_of(observations).items()})
+
+
 class Remembered(Protocol):
-    """History of the episodes of a batch of environments, kept by a wrapper."""
+    """History of the episodes of a batch of environments, kept by a wrapper.
+
+    What it is given and returns has a row for each of the environments in `env_ids`, an array of their numbers.
+    """
 
     boxes: dict[str, spaces.Box]
     """Space of each part of what one environment observes with it."""
 
-    def refill(self, parts: Parts, infos: Mapping[str, Any], is_first: Mask) -> None:
-        """Begin anew with the first observations, shape (n_envs, ...), of the environments that `is_first` marks."""
+    def refill(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
+        """Begin anew with the first observations of environments."""
 
-    def push(self, parts: Parts, infos: Mapping[str, Any]) -> None:
-        """Add the latest observation and `info` of every environment, shape (n_envs, ...)."""
+    def push(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
+        """Add the latest observation and `info` of environments."""
 
-    def added_to(self, parts: Parts) -> Parts:
+    def added_to(self, parts: Parts, env_ids: EnvIds) -> Parts:
         """Return the latest observations with what is remembered, in arrays that are not filled again."""
 
 
@@ -90,30 +99,32 @@ class FrameHistory:
         self._size = size = check_int("stack", size, at_least=1, at_most=MOST_KEPT)
         excluded = check_exclusions(excluded, boxes)
         stacked = {name: box for name, box in boxes.items() if name not in excluded}
-        # Every frame is written twice, `size` apart, so that the last ones always lie in one piece.
-        self._frames = {name: np.empty((2 * size, n_envs, *box.shape), box.dtype) for name, box in stacked.items()}
-        self._latest = size - 1
+        # A ring for each environment, because not all of them take every step.
+        self._frames = {name: np.empty((n_envs, size, *box.shape), box.dtype) for name, box in stacked.items()}
+        self._latest = np.full(n_envs, size - 1)
         self.boxes = {**boxes, **{name: self._stacked_box(name, box) for name, box in stacked.items()}}
 
-    def refill(self, parts: Parts, infos: Mapping[str, Any], is_first: Mask) -> None:
+    def refill(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
         """See `Remembered.refill`."""
         for name, frames in self._frames.items():
-            frames[:, is_first] = parts[name][is_first]
+            frames[env_ids] = parts[name][:, None]
 
-    def push(self, parts: Parts, infos: Mapping[str, Any]) -> None:
+    def push(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
         """See `Remembered.push`."""
-        self._latest = (self._latest + 1) % self._size
+        self._latest[env_ids] = latest = (self._latest[env_ids] + 1) % self._size
         for name, frames in self._frames.items():
-            frames[self._latest] = frames[self._latest + self._size] = parts[name]
+            frames[env_ids, latest] = parts[name]
 
-    def added_to(self, parts: Parts) -> Parts:
+    def added_to(self, parts: Parts, env_ids: EnvIds) -> Parts:
         """Return the latest observations, what is stacked of them as (n_envs, size, ...)."""
-        return {name: self._stack(name) if name in self._frames else part for name, part in parts.items()}
+        # From the oldest on, which the latest one's next place holds.
+        order = (self._latest[env_ids, None] + np.arange(1, self._size + 1)) % self._size
+        return {
+            name: self._stack(name, env_ids, order) if name in self._frames else part for name, part in parts.items()
+        }
 
-    def _stack(self, name: str) -> NDArray[Any]:
-        frames = self._frames[name][self._latest + 1 : self._latest + 1 + self._size]
-        # A copy in any case: what is given away must not change any more.
-        stack = frames.swapaxes(0, 1).copy()
+    def _stack(self, name: str, env_ids: EnvIds, order: NDArray[np.int64]) -> NDArray[Any]:
+        stack = self._frames[name][env_ids[:, None], order]
         return stack.reshape(len(stack), -1) if name == FLAT else stack
 
     def _stacked_box(self, name: str, box: spaces.Box) -> spaces.Box:
@@ -146,21 +157,22 @@ class BestPairs:
         box = spaces.Box(np.tile(low, size).astype(np.float32), np.tile(high, size).astype(np.float32))
         self.boxes = {FLAT: flat_space({**boxes, MEMORY: box})} if FLAT in boxes else {**boxes, MEMORY: box}
 
-    def refill(self, parts: Parts, infos: Mapping[str, Any], is_first: Mask) -> None:
+    def refill(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
         """Make all pairs of environments whose episode begins those of its first plane."""
-        self.pairs[is_first] = _paired(infos)[is_first, None]
+        self.pairs[env_ids] = _paired(infos)[:, None]
 
-    def push(self, parts: Parts, infos: Mapping[str, Any]) -> None:
-        """Add the latest pair of every environment where it is good enough."""
-        enters = infos["reward"].astype(np.float32) > self.pairs[:, -1, -1]
+    def push(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
+        """Add the latest pair of environments where it is good enough."""
+        enters = infos["reward"].astype(np.float32) > self.pairs[env_ids, -1, -1]
         if enters.any():
-            self.pairs[enters, -1] = _paired(infos)[enters]
-            order = np.argsort(-self.pairs[enters, :, -1], axis=1, kind="stable")
-            self.pairs[enters] = np.take_along_axis(self.pairs[enters], order[:, :, None], axis=1)
+            where = env_ids[enters]
+            self.pairs[where, -1] = _paired(infos)[enters]
+            order = np.argsort(-self.pairs[where, :, -1], axis=1, kind="stable")
+            self.pairs[where] = np.take_along_axis(self.pairs[where], order[:, :, None], axis=1)
 
-    def added_to(self, parts: Parts) -> Parts:
+    def added_to(self, parts: Parts, env_ids: EnvIds) -> Parts:
         """Return the latest observations with each environment's pairs in a row, (action, reward) of the best first."""
-        pairs = self.pairs.reshape(len(self.pairs), -1).copy()
+        pairs = self.pairs[env_ids].reshape(len(env_ids), -1)
         return {FLAT: np.concatenate([parts[FLAT], pairs], axis=-1)} if FLAT in parts else {**parts, MEMORY: pairs}
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Self, cast
 
 import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
 
 from armscan.envs.episode import INFO, Episode, begin, check_actions, look, wanted_volume
-from armscan.envs.history import Mask
+from armscan.envs.history import EnvIds, Mask
 from armscan.envs.rules import Observed, Rules, Volumes
 from armscan.errors import InvalidValueError, ResetNeededError
 from armscan.utils.validation import check_int
@@ -51,12 +50,22 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         render_mode: None = None,
         **rules: Any,
     ) -> None:
-        self.num_envs = check_int("num_envs", num_envs, at_least=1, at_most=MOST_ENVS)
         if render_mode is not None:
             raise InvalidValueError(f"render_mode is {render_mode!r}, but many environments are not drawn: use one")
-        self._autoreset_mode = _checked_mode(autoreset_mode)
-        self.metadata = {"autoreset_mode": self._autoreset_mode}
-        self.rules = Rules(volumes, **rules)
+        self._set_up(num_envs, _checked_mode(autoreset_mode), lambda: Rules(volumes, **rules))
+
+    @classmethod
+    def sharing(cls, rules: Rules, num_envs: int) -> Self:
+        """Return environments that play by the rules of others, without autoreset; their volumes are held once."""
+        envs = cls.__new__(cls)
+        envs._set_up(num_envs, AutoresetMode.DISABLED, lambda: rules)
+        return envs
+
+    def _set_up(self, num_envs: int, autoreset_mode: AutoresetMode, make_rules: Callable[[], Rules]) -> None:
+        self.num_envs = check_int("num_envs", num_envs, at_least=1, at_most=MOST_ENVS)
+        self._autoreset_mode = autoreset_mode
+        self.metadata = {"autoreset_mode": autoreset_mode}
+        self.rules = make_rules()
         self.single_observation_space = self.rules.observation_space
         self.single_action_space = self.rules.action_space
         self.observation_space = batch_space(self.rules.observation_space, self.num_envs)
@@ -71,40 +80,54 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             seed: of the first environment, the next has the next seed; or one for each, None to leave it as it is.
-            options: `volume`, the name of a volume for all of them; `reset_mask`, truth values, shape (num_envs,).
+            options: `volume`, the name of a volume for all of them, or a list of one for each; `reset_mask`, truth
+                values, shape (num_envs,).
 
         Returns:
             The observations and `info` of all environments; only those that were reset are marked in `info`.
         """
         options = dict(options) if isinstance(options, dict) else options
         chosen = np.flatnonzero(self._popped_mask(options))
-        volume_name, seeds = wanted_volume(self.rules, options), self._seeds(seed)
+        names, seeds = self._volume_names(options), self._seeds(seed)
         for i, one_seed in enumerate(seeds):
             if one_seed is not None and i in chosen:
                 self._rngs[i] = seeding.np_random(one_seed)[0]
-        self._begin(chosen, volume_name)
+        self._begin(chosen, names)
         look(self.rules, [self._episode(int(i)) for i in chosen])
-        return self._observed(), self._infos(chosen)
-
-    def step(self, actions: Any) -> VectorStep:
-        """Take a step in every environment."""
         episodes = [self._episode(i) for i in range(self.num_envs)]
+        return self._observed(episodes), _infos_of(episodes, np.isin(np.arange(self.num_envs), chosen))
+
+    def step(self, actions: Any, env_ids: Sequence[int] | EnvIds | None = None) -> VectorStep:
+        """Take a step in every environment, or in some of them.
+
+        Args:
+            actions: a row for each environment that takes a step.
+            env_ids: numbers of these environments, each at most once; what is returned has a row for each of them, in
+                this order, and the others stay as they are. Default: None, all of them.
+        """
+        chosen = np.arange(self.num_envs) if env_ids is None else self._checked_ids(env_ids)
+        episodes = [self._episode(int(i)) for i in chosen]
         is_over = np.array([not episode.is_running for episode in episodes])
         if self._autoreset_mode is AutoresetMode.DISABLED and is_over.any():
             raise ResetNeededError(
-                f"the episodes of environments {np.flatnonzero(is_over).tolist()} have ended: reset them by "
+                f"the episodes of environments {chosen[is_over].tolist()} have ended: reset them by "
                 "reset(options={'reset_mask': mask}) before step()"
             )
-        for episode, action in zip(episodes, check_actions(actions, self._action_shape), strict=True):
+        for episode, action in zip(episodes, check_actions(actions, self._action_shape(len(chosen))), strict=True):
             if episode.is_running:
                 episode.aim(action)
-        self._begin(np.flatnonzero(is_over))
-        episodes = [self._episode(i) for i in range(self.num_envs)]
+        self._begin(chosen[is_over], [None] * self.num_envs)
+        episodes = [self._episode(int(i)) for i in chosen]
         look(self.rules, episodes)
         rewards = np.array([0.0 if over else e.view.reward for e, over in zip(episodes, is_over, strict=True)])
         terminated = np.array([episode.is_terminated for episode in episodes]) & ~is_over
         truncated = np.array([episode.is_truncated for episode in episodes]) & ~is_over
-        return self._observed(), rewards, terminated, truncated, self._infos(np.arange(self.num_envs))
+        infos = _infos_of(episodes, np.ones(len(episodes), dtype=np.bool_))
+        return self._observed(episodes), rewards, terminated, truncated, infos
+
+    def episodes(self, env_ids: Sequence[int] | EnvIds) -> list[Episode]:
+        """Return the current episodes of some environments; like `optimal_actions`, they know what no agent may."""
+        return [self._episode(int(i)) for i in env_ids]
 
     @property
     def optimal_actions(self) -> FloatArray:
@@ -118,9 +141,8 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         optima[:, : len(free)] = [self._episode(i).scene.optimum_normalised[free] for i in range(self.num_envs)]
         return optima
 
-    @property
-    def _action_shape(self) -> tuple[int, ...]:
-        return (self.num_envs, *self.rules.action_space.shape)
+    def _action_shape(self, n_chosen: int) -> tuple[int, ...]:
+        return (n_chosen, *self.rules.action_space.shape)
 
     def _episode(self, i: int) -> Episode:
         episode = self._episodes[i]
@@ -128,28 +150,37 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             raise ResetNeededError(f"environment {i} has no episode yet: call reset() first")
         return episode
 
-    def _begin(self, chosen: NDArray[np.int64], volume_name: str | None = None) -> None:
+    def _begin(self, chosen: EnvIds, volume_names: Sequence[str | None]) -> None:
         if len(chosen):
-            begun = begin(self.rules, [self._rngs[i] for i in chosen], volume_name)
+            begun = begin(self.rules, [self._rngs[i] for i in chosen], [volume_names[i] for i in chosen])
             for i, episode in zip(chosen, begun, strict=True):
                 self._episodes[i] = episode
 
-    def _observed(self) -> Observed:
-        return self.rules.observe_all([self._episode(i).view for i in range(self.num_envs)])
+    def _observed(self, episodes: Sequence[Episode]) -> Observed:
+        return self.rules.observe_all([episode.view for episode in episodes])
 
-    def _infos(self, chosen: NDArray[np.int64]) -> dict[str, Any]:
-        """Return `info` as arrays, and under `_key` which environments it is given for, as Gymnasium has it."""
-        episodes = [self._episode(i) for i in chosen]
-        is_given = np.isin(np.arange(self.num_envs), chosen)
-        infos: dict[str, Any] = {}
-        for key, (of, dtype) in INFO.items():
-            values = np.array([of(episode) for episode in episodes], dtype=dtype)
-            # Of texts Gymnasium makes arrays of objects.
-            values = values.astype(object) if values.dtype.kind == "U" else values
-            infos[key] = np.zeros((self.num_envs, *values.shape[1:]), dtype=values.dtype)
-            infos[key][is_given] = values
-            infos[f"_{key}"] = is_given.copy()
-        return infos
+    def _volume_names(self, options: Any) -> list[str | None]:
+        """Return the name of the volume that options choose for each environment, None for one that is drawn."""
+        listed_names = options.get("volume") if isinstance(options, dict) else None
+        if not isinstance(listed_names, list | tuple):
+            return [wanted_volume(self.rules, options)] * self.num_envs
+        if len(listed_names) != self.num_envs:
+            raise InvalidValueError(
+                f"reset option 'volume' is {listed_names!r}, but it must be one name, or one for each of "
+                f"{self.num_envs} environments"
+            )
+        return [wanted_volume(self.rules, {**options, "volume": name}) for name in listed_names]
+
+    def _checked_ids(self, env_ids: Any) -> EnvIds:
+        ids = np.asarray(env_ids)
+        if ids.ndim == 1 and ids.dtype.kind in "iu" and len(ids):
+            in_order = np.sort(ids)
+            if in_order[0] >= 0 and in_order[-1] < self.num_envs and (in_order[1:] > in_order[:-1]).all():
+                return ids.astype(np.int64, copy=False)
+        raise InvalidValueError(
+            f"env_ids is {env_ids!r}, but it must hold at least one, and each once, of the numbers of the "
+            f"{self.num_envs} environments, from 0"
+        )
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
         if seed is None:
@@ -176,6 +207,20 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         return mask
 
 
+def _infos_of(episodes: Sequence[Episode], is_given: Mask) -> dict[str, Any]:
+    """Return `info` as arrays, and under `_key` which environments it is given for, as Gymnasium has it."""
+    given = [episode for episode, is_its in zip(episodes, is_given, strict=True) if is_its]
+    infos: dict[str, Any] = {}
+    for key, (of, dtype) in INFO.items():
+        values = np.array([of(episode) for episode in given], dtype=dtype)
+        # Of texts Gymnasium makes arrays of objects.
+        values = values.astype(object) if values.dtype.kind == "U" else values
+        infos[key] = np.zeros((len(episodes), *values.shape[1:]), dtype=values.dtype)
+        infos[key][is_given] = values
+        infos[f"_{key}"] = is_given.copy()
+    return infos
+
+
 def reset_each(
     envs: VectorEnv[Any, Any, Any],
     seeds: int | Sequence[int | None] | None = None,
@@ -184,6 +229,14 @@ def reset_each(
     """Reset vector environments, with a seed for each where there is a list of them."""
     # Gymnasium's types leave out such lists, which its own vector environments take.
     return envs.reset(seed=seeds, options=options)  # type: ignore[arg-type]
+
+
+def step_each(
+    envs: VectorEnv[Any, Any, Any], actions: Any, env_ids: Sequence[int] | EnvIds | None = None
+) -> VectorStep:
+    """Take a step in vector environments, or in those of `env_ids`, which only ours know; see `ArmscanVectorEnv`."""
+    stepped: VectorStep = envs.step(actions) if env_ids is None else cast(Any, envs).step(actions, env_ids)
+    return stepped
 
 
 def _checked_mode(mode: str | AutoresetMode) -> AutoresetMode:

@@ -6,7 +6,7 @@ full size it takes 107 microseconds where this one takes 43. Where both can be u
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -15,15 +15,25 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from armscan.envs.history import BestPairs, FrameHistory, Remembered, boxes_of, observation_of, parts_of, space_of
+from armscan.envs.history import (
+    BestPairs,
+    EnvIds,
+    FrameHistory,
+    Remembered,
+    boxes_of,
+    observation_of,
+    parts_of,
+    space_of,
+)
 from armscan.envs.rules import Observed
-from armscan.envs.vector_env import VectorStep, reset_each
+from armscan.envs.spaces import Parts
+from armscan.envs.vector_env import VectorStep, reset_each, step_each
 from armscan.errors import InvalidValueError
 from armscan.volumes.plane import FloatArray
 
 Env = gym.Env[Any, FloatArray]
 # Of the one environment that is wrapped.
-ALL = np.array([True])
+ONLY = np.array([0])
 
 
 class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs):
@@ -32,6 +42,7 @@ class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstruc
     def __init__(self, env: Env, remembered: Remembered, **arguments: Any) -> None:
         RecordConstructorArgs.__init__(self, **arguments)
         gym.Wrapper.__init__(self, env)
+        self.arguments = arguments
         self.remembered = remembered
         self.observation_space = space_of(remembered.boxes)
 
@@ -41,18 +52,18 @@ class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstruc
         """Start an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         parts, infos = _batch_of_one(observation, info)
-        self.remembered.refill(parts, infos, ALL)
+        self.remembered.refill(parts, infos, ONLY)
         return self._with_memory(parts), info
 
     def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Take a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         parts, infos = _batch_of_one(observation, info)
-        self.remembered.push(parts, infos)
+        self.remembered.push(parts, infos, ONLY)
         return self._with_memory(parts), float(reward), terminated, truncated, info
 
     def _with_memory(self, parts: dict[str, Any]) -> Observed:
-        return observation_of({name: part[0] for name, part in self.remembered.added_to(parts).items()})
+        return observation_of({name: part[0] for name, part in self.remembered.added_to(parts, ONLY).items()})
 
 
 class FrameStack(_Remembering):
@@ -108,20 +119,25 @@ class _VectorRemembering(VectorWrapper):
     ) -> tuple[Observed, dict[str, Any]]:
         """Start episodes."""
         observations, infos = reset_each(self.env, seed, options)
-        parts, is_first = parts_of(observations), infos["_reward"]
-        self._has_ended &= ~is_first
-        self.remembered.refill(parts, infos, is_first)
-        return observation_of(self.remembered.added_to(parts)), infos
+        parts, first = parts_of(observations), np.flatnonzero(infos["_reward"])
+        self._has_ended[first] = False
+        self._refill(parts, infos, first, first)
+        return observation_of(self.remembered.added_to(parts, np.arange(self.num_envs))), infos
 
-    def step(self, actions: Any) -> VectorStep:
-        """Take a step in every environment."""
-        observations, rewards, terminated, truncated, infos = self.env.step(actions)
-        parts = parts_of(observations)
-        self.remembered.push(parts, infos)
-        if self._has_ended.any():
-            self.remembered.refill(parts, infos, self._has_ended)
-        self._has_ended = terminated | truncated
-        return observation_of(self.remembered.added_to(parts)), rewards, terminated, truncated, infos
+    def step(self, actions: Any, env_ids: Sequence[int] | EnvIds | None = None) -> VectorStep:
+        """Take a step in every environment, or in those of `env_ids`; see `ArmscanVectorEnv.step`."""
+        observations, rewards, terminated, truncated, infos = step_each(self.env, actions, env_ids)
+        ids = np.arange(self.num_envs) if env_ids is None else np.asarray(env_ids)
+        parts, begun = parts_of(observations), np.flatnonzero(self._has_ended[ids])
+        self.remembered.push(parts, infos, ids)
+        if len(begun):
+            self._refill(parts, infos, begun, ids[begun])
+        self._has_ended[ids] = terminated | truncated
+        return observation_of(self.remembered.added_to(parts, ids)), rewards, terminated, truncated, infos
+
+    def _refill(self, parts: Parts, infos: Mapping[str, Any], rows: EnvIds, env_ids: EnvIds) -> None:
+        firsts = {name: part[rows] for name, part in parts.items()}
+        self.remembered.refill(firsts, {key: infos[key][rows] for key in ("action", "reward") if key in infos}, env_ids)
 
 
 class VectorFrameStack(_VectorRemembering):
