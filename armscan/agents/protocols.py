@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
 
 from armscan.agents.compute import Compute
 from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
-from armscan.volumes.plane import FloatArray
 
 if TYPE_CHECKING:
     from armscan.agents.policy import Policy
@@ -21,17 +21,20 @@ VectorEnvFactory = Callable[[int], VectorEnv[Any, Any, Any]]
 
 
 class Agent(Protocol):
-    """Chooses planes, one episode after another."""
+    """Chooses planes, one episode after another.
+
+    Episodes that are played side by side are each played by a shallow copy, unless it is a `BatchAgent` too.
+    """
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Begin an episode.
+        """Begin an episode; all that belongs to it is assigned anew, so that copies do not share it.
 
         Args:
             seed: seed of the agent's random numbers in this episode.
             bounds: ranges of the action's components on the episode's volume, in degrees and mm.
         """
 
-    def act(self, observation: Observed, reward: float) -> FloatArray:
+    def act(self, observation: Observed, reward: float) -> NDArray[Any]:
         """Return the next action, shape (n_free,), within [-1, 1], as it is judged: without exploration.
 
         Args:

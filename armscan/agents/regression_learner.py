@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from armscan.agents.hyperparameters import Parameters
+from armscan.agents.inference import Inference
 from armscan.agents.networks import Network
-from armscan.agents.policy import Batch, Policy, batch_of, clip_action
+from armscan.agents.policy import Batch, Policy, clip_action
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.supervised_buffer import SupervisedBuffer
 from armscan.agents.tianshou_learner import diverged, is_finite, load_into, prepare_torch
@@ -61,6 +64,7 @@ class RegressionLearner:
         self._optimiser = torch.optim.Adam(self._network.parameters(), lr=parameters.lr)
         self._n_env_steps = self._n_epochs = 0
         setup.compute.apply_to(self._network)
+        self._inference = Inference(self._network, clip_action, setup.compute)
 
     @property
     def n_env_steps(self) -> int:
@@ -148,12 +152,18 @@ class RegressionLearner:
         return torch.as_tensor(mean)
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Learn that an episode begins, in which nothing is drawn."""
+        """Begin an episode, in which nothing is drawn."""
 
-    def act(self, observation: Observed, reward: float) -> FloatArray:
+    def act(self, observation: Observed, reward: float) -> NDArray[np.float32]:
         """Return the optimal action as predicted from this observation alone, shape (n_free,)."""
-        with torch.no_grad():
-            return self._predicted(batch_of([observation]))[0].clamp(-1.0, 1.0).cpu().numpy()
+        return self._inference.action(observation)
+
+    def begin_all(self, *, seeds: Sequence[int], bounds: Sequence[ActionBounds]) -> None:
+        """Begin episodes, in which nothing is drawn."""
+
+    def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the optimal action as predicted from each observation alone, shape (n, n_free)."""
+        return self._inference.actions(observations, episodes)
 
     def policy(self) -> Policy:
         """Return a copy of the network that `act` asks."""

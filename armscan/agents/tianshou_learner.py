@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import tianshou.trainer
 import torch
+from numpy.typing import NDArray
 from tianshou.algorithm import algorithm_base
 from tianshou.algorithm.algorithm_base import Policy as TianshouPolicy
-from tianshou.data import Batch, Collector, collector
+from tianshou.data import Collector, collector
 from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.hyperparameters import Parameters
-from armscan.agents.policy import Policy, batch_of
+from armscan.agents.inference import Inference
+from armscan.agents.policy import Policy
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
 from armscan.agents.tianshou_envs import TianshouVectorEnv
@@ -69,6 +71,8 @@ class TianshouLearner:
         self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
         self._parameters = parameters
         self._bounded, self._compute = bounded, setup.compute
+        policy = self._algorithm.policy
+        self._inference = Inference(policy.actor, bounded, setup.compute, is_sampling=not policy.deterministic_eval)
         self._n_epochs = 0
         critics = [module for name, module in self._algorithm.named_children() if name.startswith("critic")]
         # Lagging copies of the critics included.
@@ -140,15 +144,20 @@ class TianshouLearner:
             raise diverged(self.n_env_steps, f"agent.lr{or_entropy}") from cause
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Learn that an episode begins; only a policy whose evaluation samples actions draws anything in it."""
-        torch.manual_seed(seed)
+        """Begin an episode; only a policy whose evaluation samples actions draws anything in it."""
+        self._inference.begin([seed])
 
-    def act(self, observation: Observed, reward: float) -> FloatArray:
+    def act(self, observation: Observed, reward: float) -> NDArray[np.float32]:
         """Return the policy's action, shape (n_free,)."""
-        policy = self._algorithm.policy
-        with torch.no_grad():
-            result = policy(Batch(obs=batch_of([observation]), info=Batch()))
-        return np.asarray(policy.map_action(result.act.cpu().numpy())[0])
+        return self._inference.action(observation)
+
+    def begin_all(self, *, seeds: Sequence[int], bounds: Sequence[ActionBounds]) -> None:
+        """Begin an episode for each seed."""
+        self._inference.begin(seeds)
+
+    def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the policy's action in each episode, shape (n, n_free)."""
+        return self._inference.actions(observations, episodes)
 
     def policy(self) -> Policy:
         """Return a copy of the actor that `act` asks, with the mode of its actions as its answer."""

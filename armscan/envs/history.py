@@ -61,8 +61,8 @@ def check_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozense
     return frozenset(excluded)
 
 
-def rows_of(observations: NDArray[Any] | Parts, rows: NDArray[Any]) -> NDArray[Any] | Parts:
-    """Return the chosen rows, by their numbers or as a mask, of a batch of observations."""
+def rows_of(observations: NDArray[Any] | Parts, rows: int | NDArray[Any]) -> NDArray[Any] | Parts:
+    """Return rows of a batch of observations, by their numbers or as a mask; of a single number the observation."""
     return observation_of({name: part[rows] for name, part in parts_of(observations).items()})
 
 

@@ -32,8 +32,8 @@ POLICY_TAG = "policy"
 KEPT = "kept"
 # The run's tag with the sum of the model, by which another one in its place is known.
 SUM_TAG = "policy.sha256"
-# How far the model may be from the learner, and ONNX from the model.
-TOLERANCE, ONNX_TOLERANCE = 1e-6, 1e-5
+# How far the model may be from its network, and from the learner and ONNX, which add up in orders of their own.
+TOLERANCE, ROUNDING_TOLERANCE = 1e-6, 1e-5
 # First seed of the episode that the observations are from, above those of all episodes that count; and how many.
 FIRST_SEED, N_OBSERVED = 6 * 10**6, 8
 
@@ -150,8 +150,8 @@ def _check(folder: Path, policy: Policy, played: list[tuple[Observed, FloatArray
     if policy.differs is None:
         # One by one, as the agent was asked: in another batch torch may add up in another order.
         alone = np.concatenate([model.predict(arrays_of(batch_of([observation]))) for observation, _ in played])
-        _check_same("the model", alone, "the agent", np.stack([action for _, action in played]), TOLERANCE)
-    _check_same("ONNX", onnx_answers(folder / ONNX_FILE, arrays_of(batch)), "the model", answers, ONNX_TOLERANCE)
+        _check_same("the model", alone, "the agent", np.stack([action for _, action in played]), ROUNDING_TOLERANCE)
+    _check_same("ONNX", onnx_answers(folder / ONNX_FILE, arrays_of(batch)), "the model", answers, ROUNDING_TOLERANCE)
 
 
 def onnx_answers(file: Path, arrays: Arrays) -> NDArray[np.float32]:

@@ -4,9 +4,10 @@ from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from armscan.training.checkpointing import CheckpointProvenance, resume_from_checkpoint
 from armscan.training.domain import TrainingDomain
+from armscan.training.episodes import evaluate
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint, fingerprints_in
 from armscan.training.metrics import MetricEstimates
-from armscan.training.rollout import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation, evaluate
+from armscan.training.rollout import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation
 from armscan.training.splits import PARTS, Split, mixed_data, nifti_data, phantom_data
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
 from armscan.training.video import VideoRecorder, outcome, record_episode

@@ -1,21 +1,16 @@
-"""How good an agent is: whole episodes on given volumes, played without exploration."""
+"""How good an agent is: how whole episodes went, and what they add up to."""
 
 from __future__ import annotations
 
 import statistics
-import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 from typing import Any, Self, get_type_hints
 
 import gymnasium as gym
 
-from armscan.agents.protocols import Agent
-from armscan.anatomy import tissue_dice
 from armscan.envs.rules import Observed
 from armscan.errors import InvalidValueError
-from armscan.utils.validation import check_int
 from armscan.volumes.plane import FloatArray
 
 # What evaluations are called by, after the volumes that they are on.
@@ -57,8 +52,8 @@ class EpisodeResult:
         dice_bones: how far the last slice shows the bones where the optimal plane's slice does, as `tissue_dice` says.
         dice_tendons: likewise.
         dice_artery: likewise.
-        seconds_per_plane: mean wall time of choosing a plane and looking at it; two episodes that differ in nothing
-            else are equal.
+        seconds_per_plane: mean wall time of choosing a plane and looking at it, of planes in episodes side by side an
+            equal share each; two episodes that differ in nothing else are equal.
     """
 
     volume: str
@@ -149,65 +144,3 @@ def _episode_of(plain: object) -> EpisodeResult:
         if not is_of_kind or (kind in (int, float) and not -LARGEST < value < LARGEST):
             raise InvalidValueError(f"an episode's {name} is {value!r}, but it must be a finite {kind.__name__}")
     return EpisodeResult(**plain)
-
-
-def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluation:
-    """Play episodes on each of the environment's volumes in turn.
-
-    Args:
-        agent: agent that plays them.
-        env: an `ArmscanEnv`, with or without wrappers.
-        n_episodes: number of episodes; a multiple of the number of volumes treats them alike.
-        seed: seed of the first episode, the next has the next: the same seed gives the same episodes to every agent.
-    """
-    names = list(env.get_wrapper_attr("volumes"))
-    count = check_int("episodes", n_episodes, at_least=1)
-    return Evaluation(tuple(play(agent, env, names[i % len(names)], seed + i) for i in range(count)))
-
-
-def play(
-    agent: Agent, env: Env, volume_name: str, seed: int, look: Callable[[], object] = lambda: None
-) -> EpisodeResult:
-    """Play an episode.
-
-    Args:
-        agent: agent that plays it.
-        env: an `ArmscanEnv`, with or without wrappers.
-        volume_name: name of one of the environment's volumes.
-        seed: seed of the episode.
-        look: called when it begins, and after every step.
-    """
-    observation, info = env.reset(seed=seed, options={"volume": volume_name})
-    look()
-    agent.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
-    reward, rewards, ended = float(info["reward"]), [], False
-    start_s = time.perf_counter()
-    while not ended:
-        observation, received, terminated, truncated, info = env.step(agent.act(observation, reward))
-        reward = float(received)
-        rewards.append(reward)
-        ended = terminated or truncated
-        look()
-    seconds = time.perf_counter() - start_s
-    return EpisodeResult(
-        volume=volume_name,
-        seed=seed,
-        n_steps=len(rewards),
-        is_success=bool(info["is_success"]),
-        starts_solved=bool(info["starts_solved"]),
-        episode_return=sum(rewards),
-        final_reward=reward,
-        best_reward=max(rewards),
-        distance_mm=float(info["distance_mm"]),
-        distance_deg=float(info["distance_deg"]),
-        seconds_per_plane=seconds / len(rewards),
-        **_final_dice(env),
-    )
-
-
-def _final_dice(env: Env) -> dict[str, float]:
-    """Compare the current slice with that of the optimal plane; another look, which an episode's steps outweigh."""
-    scene = env.get_wrapper_attr("scene")
-    (optimal,) = env.get_wrapper_attr("rules").look([scene], [scene.optimum])
-    dice = tissue_dice(env.get_wrapper_attr("slice_xz"), optimal.slice_xz)
-    return {f"dice_{tissue}": value for tissue, value in dice.items()}

@@ -8,6 +8,7 @@ from torch.utils.data import DataLoader, Dataset
 
 import armscan
 from armscan.envs import ArmscanVectorEnv, RandomTransform
+from armscan.envs.history import rows_of
 from armscan.errors import InvalidValueError, ResetNeededError
 from armscan.volumes import LabelVolume
 
@@ -92,6 +93,48 @@ def test_vector_env_takes_a_volume_for_all(dataset):
     assert envs.reset(seed=0, options={"volume": name})[1]["volume"].tolist() == [name, name]
 
 
+@pytest.mark.parametrize("variant", VARIANTS, ids=str)
+def test_vector_env_takes_steps_in_some_environments_only(volumes, variant):
+    """Each environment goes its own way, and gives what it gives alone."""
+    arguments = {"volumes": volumes, "max_steps": 4} | variant
+    together = gym.make_vec(armscan.ENV_ID, num_envs=4, autoreset_mode="Disabled", **arguments)
+    alone = [gym.make(armscan.ENV_ID, **arguments) for _ in range(4)]
+    observed, _ = together.reset(seed=[5, 6, 7, 8])
+    for i, env in enumerate(alone):
+        assert_same(rows_of(observed, i), env.reset(seed=5 + i)[0])
+    running, rng = [True] * 4, np.random.default_rng(0)
+    while any(running):
+        chosen = rng.permutation([i for i in range(4) if running[i] and rng.random() < 0.7])
+        if not len(chosen):
+            continue
+        actions = rng.uniform(-1, 1, (len(chosen), *alone[0].action_space.shape)).astype(np.float32)
+        observed, rewards, terminated, truncated, infos = together.step(actions, env_ids=chosen)
+        for row, i in enumerate(chosen):
+            theirs = alone[i].step(actions[row])
+            assert_same(rows_of(observed, row), theirs[0])
+            assert (rewards[row], terminated[row], truncated[row]) == theirs[1:4]
+            assert infos["distance_mm"][row] == theirs[4]["distance_mm"]
+            running[i] = not (terminated[row] or truncated[row])
+
+
+def test_vector_env_takes_a_volume_for_each(dataset):
+    envs, names = ArmscanVectorEnv(3, dataset), list(dataset)
+    chosen = [names[2], names[0], names[2]]
+    assert envs.reset(seed=0, options={"volume": chosen})[1]["volume"].tolist() == chosen
+    for wrong in (names[:2], [*names[:2], "nope"], [*names[:2], 3]):
+        with pytest.raises(InvalidValueError, match="reset option 'volume' is"):
+            envs.reset(options={"volume": wrong})
+
+
+def test_vector_env_shares_the_rules_of_others(dataset):
+    rules = ArmscanVectorEnv(1, dataset, projection="zy").rules
+    envs, twins = ArmscanVectorEnv.sharing(rules, 3), ArmscanVectorEnv(3, dataset, projection="zy")
+    assert envs.rules is rules
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.DISABLED
+    assert envs.observation_space == twins.observation_space
+    assert_same(envs.reset(seed=4), twins.reset(seed=4))
+
+
 def test_vector_env_refuses_what_is_impossible(phantom):
     with pytest.raises(InvalidValueError, match="num_envs is 0"):
         ArmscanVectorEnv(0, [phantom])
@@ -112,6 +155,11 @@ def test_vector_env_refuses_what_is_impossible(phantom):
     for actions in (np.zeros(2), np.full((2, 1), np.nan), "up", None):
         with pytest.raises(InvalidValueError, match=r"(?s)action is .*\(2, 1\)"):
             envs.step(actions)
+    for env_ids in ([], [0, 0], [2], [-1], [0.0], [[0]], "0", [True, False]):
+        with pytest.raises(InvalidValueError, match=r"env_ids is .* of the 2 environments"):
+            envs.step(np.zeros((len(env_ids), 1)), env_ids=env_ids)
+    with pytest.raises(InvalidValueError, match=r"(?s)action is .*\(1, 1\)"):
+        envs.step(np.zeros((2, 1)), env_ids=[1])
     envs.step(np.full((2, 1), -1.0))
     with pytest.raises(ResetNeededError, match=r"environments \[0, 1\] have ended"):
         envs.step(np.zeros((2, 1)))

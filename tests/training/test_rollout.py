@@ -22,21 +22,23 @@ class Still:
 
 
 class Oracle:
-    """Knows the optimal plane."""
+    """Knows the optimal plane: begins the episode of a seed, of an evaluation from `first_seed` on, beforehand."""
 
-    def __init__(self, env):
-        self._env = env.unwrapped
+    def __init__(self, env, first_seed):
+        self._env, self._first_seed = env.unwrapped, first_seed
 
     def begin(self, *, seed, bounds):
-        pass
+        names = list(self._env.volumes)
+        self._env.reset(seed=seed, options={"volume": names[(seed - self._first_seed) % len(names)]})
+        self._scene = self._env.scene
 
     def act(self, observation, reward):
-        return self._env.scene.optimum_normalised[3:]
+        return self._scene.optimum_normalised[3:]
 
 
 def test_evaluate_visits_the_volumes_in_turn(dataset):
     env = make_armscan_env(dataset, max_steps=2)
-    evaluation = evaluate(Oracle(env), env, n_episodes=6, seed=5)
+    evaluation = evaluate(Oracle(env, 5), env, n_episodes=6, seed=5)
     names = list(dataset)
     assert [episode.volume for episode in evaluation.episodes] == [*names, *names[:2]]
     assert [episode.seed for episode in evaluation.episodes] == [5, 6, 7, 8, 9, 10]
@@ -49,7 +51,7 @@ def test_evaluate_gives_every_agent_the_same_episodes(dataset):
     env = make_armscan_env(dataset, max_steps=3)
     starts = [
         [episode.starts_solved for episode in evaluate(agent, env, n_episodes=12, seed=1).episodes]
-        for agent in (Still(), Oracle(env))
+        for agent in (Still(), Oracle(env, 1))
     ]
     assert starts[0] == starts[1]
 
@@ -67,7 +69,7 @@ def test_evaluate_counts_episodes_that_start_solved_apart(dataset):
 
 def test_episode_of_the_optimal_plane_shows_its_slice(dataset):
     env = make_armscan_env(dataset, max_steps=2)
-    for episode in evaluate(Oracle(env), env, n_episodes=4, seed=5).episodes:
+    for episode in evaluate(Oracle(env, 5), env, n_episodes=4, seed=5).episodes:
         assert episode.mean_dice == pytest.approx(1.0, abs=0.01)
         assert episode.seconds_per_plane > 0
 

@@ -1,0 +1,115 @@
+"""Actions of a Gaussian actor: many observations at once, each answered to the last bit as if it were alone.
+
+torch adds up a batch of one in another order than a larger batch. Here a network of linear layers and ReLU goes row by
+row through the same compiled loop, whatever the size of the batch; every other network is asked row by row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tianshou.utils.net.common import Net
+from tianshou.utils.net.continuous import ContinuousActorProbabilistic
+from torch import nn
+
+from armscan.agents.compute import Compute
+from armscan.agents.policy import batch_of
+from armscan.envs.history import observation_of, parts_of, rows_of
+from armscan.envs.rules import Observed
+
+Rows = NDArray[np.float32]
+Bounded = Callable[[torch.Tensor], torch.Tensor]
+
+
+@numba.njit(cache=True, nogil=True)
+def linear_rows(rows: Rows, weights: Rows, bias: Rows) -> Rows:
+    """Return `rows @ weights.T + bias`; each number is summed alone, in the order of the inputs, from its bias on.
+
+    Args:
+        rows: shape (n, n_inputs).
+        weights: shape (n_outputs, n_inputs), as torch keeps them.
+        bias: shape (n_outputs,).
+    """
+    by_input = np.ascontiguousarray(weights.T)
+    answers = np.empty((rows.shape[0], bias.size), dtype=np.float32)
+    for row in range(rows.shape[0]):
+        sums = answers[row]
+        sums[:] = bias
+        for k in range(by_input.shape[0]):
+            value, of_input = rows[row, k], by_input[k]
+            # Many outputs at a time, which no sum is shared between.
+            for j in range(sums.size):
+                sums[j] += value * of_input[j]
+    return answers
+
+
+class Inference:
+    """Chooses an actor's actions without exploration, for the episodes that `begin` has begun.
+
+    Args:
+        actor: gives mean and spread of the actions; asked with the weights that it has at the time.
+        bounded: takes an action to [-1, 1].
+        compute: device and precision of the actor.
+        is_sampling: whether actions are drawn from mean and spread; an episode's draws all come from its own seed.
+    """
+
+    def __init__(self, actor: nn.Module, bounded: Bounded, compute: Compute, *, is_sampling: bool = False) -> None:
+        self._actor, self._bounded, self._is_sampling = actor, bounded, is_sampling
+        self._layers = _layers_of(actor) if compute.is_plain and not is_sampling else None
+        self._generators: list[torch.Generator] = []
+
+    def begin(self, seeds: Sequence[int]) -> None:
+        """Begin an episode for each seed."""
+        if self._is_sampling:
+            self._generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+
+    def action(self, observation: Observed) -> Rows:
+        """Return the action for one observation of the first episode, shape (n_free,)."""
+        batch = observation_of({name: part[None] for name, part in parts_of(observation).items()})
+        first: Rows = self.actions(batch, [0])[0]
+        return first
+
+    def actions(self, observations: Observed, episodes: Sequence[int] | NDArray[np.int64]) -> Rows:
+        """Return an action for each observation of a batch, shape (n, n_free), within [-1, 1].
+
+        Args:
+            observations: shape (n, ...).
+            episodes: the episode of each, by its place among the seeds.
+        """
+        with torch.no_grad():
+            if self._layers is not None:
+                means = torch.from_numpy(_answered(self._layers, np.asarray(observations)))
+                chosen = [self._bounded(mean) for mean in means]
+            else:
+                chosen = [self._asked(rows_of(observations, row), int(episode)) for row, episode in enumerate(episodes)]
+            actions: Rows = torch.stack(chosen).cpu().numpy()
+            return actions
+
+    def _asked(self, observation: Observed, episode: int) -> torch.Tensor:
+        """Return the action for one observation, shape (n_free,)."""
+        (means, spreads), _ = self._actor(batch_of([observation]))
+        mean, spread = means[0], spreads[0]
+        if self._is_sampling:
+            mean = mean + spread * torch.randn(mean.shape, generator=self._generators[episode]).to(mean.device)
+        return self._bounded(mean)
+
+
+def _layers_of(actor: nn.Module) -> list[nn.Module] | None:
+    """Return the layers of an actor's mean, None where they are not all linear or ReLU."""
+    if type(actor) is not ContinuousActorProbabilistic or type(actor.preprocess) is not Net:
+        return None
+    layers = [*actor.preprocess.model.model, *actor.mu.model]
+    return layers if all(isinstance(layer, nn.Linear | nn.ReLU) for layer in layers) else None
+
+
+def _answered(layers: Sequence[nn.Module], rows: Rows) -> Rows:
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            rows = linear_rows(rows, layer.weight.detach().numpy(), layer.bias.detach().numpy())
+        else:
+            np.maximum(rows, 0.0, out=rows)
+    return rows

@@ -1,0 +1,124 @@
+"""Whole episodes, played without exploration: one by one, or many side by side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+
+from armscan.agents.batch_agent import BatchAgent, batch_agent
+from armscan.agents.protocols import Agent
+from armscan.anatomy import tissue_dice
+from armscan.envs import ArmscanVectorEnv
+from armscan.envs.episode import Episode
+from armscan.envs.factory import side_by_side
+from armscan.envs.history import rows_of
+from armscan.envs.vector_env import reset_each, step_each
+from armscan.training.rollout import Env, EpisodeResult, Evaluation
+from armscan.utils.validation import check_int
+
+# Episodes that are played side by side; more would hardly be faster, and each holds what it observes.
+MOST_SIDE_BY_SIDE = 64
+
+
+def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluation:
+    """Play episodes on each of the environment's volumes in turn, many of them side by side.
+
+    Each is, bit for bit, the episode that `play` plays.
+
+    Args:
+        agent: agent that plays them; each by a copy of it, unless it is a `BatchAgent`.
+        env: an `ArmscanEnv`, with or without its wrappers; its rules are played by, it is left as it is.
+        n_episodes: number of episodes; a multiple of the number of volumes treats them alike.
+        seed: seed of the first episode, the next has the next: the same seed gives the same episodes to every agent.
+    """
+    names = list(env.get_wrapper_attr("volumes"))
+    count = check_int("episodes", n_episodes, at_least=1)
+    planned = [(names[i % len(names)], seed + i) for i in range(count)]
+    envs, player = side_by_side(env, min(count, MOST_SIDE_BY_SIDE)), batch_agent(agent)
+    batches = (planned[i : i + envs.num_envs] for i in range(0, count, envs.num_envs))
+    return Evaluation(tuple(chain.from_iterable(_play_all(player, envs, batch) for batch in batches)))
+
+
+def _play_all(
+    agent: BatchAgent, envs: VectorEnv[Any, Any, Any], planned: Sequence[tuple[str, int]]
+) -> list[EpisodeResult]:
+    """Play episodes on the named volumes with the seeds beside them, at most one in each environment."""
+    bare = envs.unwrapped
+    assert isinstance(bare, ArmscanVectorEnv)
+    names, seeds = [name for name, _ in planned], [seed for _, seed in planned]
+    n_idle = envs.num_envs - len(planned)
+    is_played = np.arange(envs.num_envs) < len(planned)
+    observations, _ = reset_each(
+        envs, [*seeds, *[None] * n_idle], {"volume": names + names[:1] * n_idle, "reset_mask": is_played}
+    )
+    running = np.flatnonzero(is_played)
+    episodes, seconds = bare.episodes(running), np.zeros(len(planned))
+    agent.begin_all(seeds=seeds, bounds=[episode.scene.bounds for episode in episodes])
+    observations, rewards = rows_of(observations, running), np.array([episode.view.reward for episode in episodes])
+    while running.size:
+        start_s = time.perf_counter()
+        actions = agent.act_all(observations, rewards, running)
+        observations, rewards, terminated, truncated, _ = step_each(envs, actions, running)
+        seconds[running] += (time.perf_counter() - start_s) / running.size
+        goes_on = ~(terminated | truncated)
+        observations, rewards, running = rows_of(observations, goes_on), rewards[goes_on], running[goes_on]
+    optima = bare.rules.look([episode.scene for episode in episodes], [episode.scene.optimum for episode in episodes])
+    return [
+        _result(episode, seed, its_seconds, optimal.slice_xz)
+        for episode, seed, its_seconds, optimal in zip(episodes, seeds, seconds.tolist(), optima, strict=True)
+    ]
+
+
+def play(
+    agent: Agent, env: Env, volume_name: str, seed: int, look: Callable[[], object] = lambda: None
+) -> EpisodeResult:
+    """Play an episode.
+
+    Args:
+        agent: agent that plays it.
+        env: an `ArmscanEnv`, with or without wrappers.
+        volume_name: name of one of the environment's volumes.
+        seed: seed of the episode.
+        look: called when it begins, and after every step.
+    """
+    observation, info = env.reset(seed=seed, options={"volume": volume_name})
+    look()
+    episode: Episode = env.get_wrapper_attr("episode")
+    agent.begin(seed=seed, bounds=episode.scene.bounds)
+    reward, ended = float(info["reward"]), False
+    start_s = time.perf_counter()
+    while not ended:
+        observation, received, terminated, truncated, _ = env.step(agent.act(observation, reward))
+        reward, ended = float(received), terminated or truncated
+        look()
+    seconds = time.perf_counter() - start_s
+    (optimal,) = env.get_wrapper_attr("rules").look([episode.scene], [episode.scene.optimum])
+    return _result(episode, seed, seconds, optimal.slice_xz)
+
+
+def _result(episode: Episode, seed: int, seconds: float, optimal_xz: NDArray[np.uint8]) -> EpisodeResult:
+    """Return how an episode went that has ended; `optimal_xz` is the slice of its optimal plane."""
+    # The first is the start's.
+    _, *rewards = episode.rewards
+    distance_mm, distance_deg = episode.distance
+    dice = tissue_dice(episode.view.slice_xz, optimal_xz)
+    return EpisodeResult(
+        volume=episode.scene.volume.name,
+        seed=seed,
+        n_steps=episode.n_steps,
+        is_success=episode.is_solved,
+        starts_solved=episode.starts_solved,
+        episode_return=sum(rewards),
+        final_reward=rewards[-1],
+        best_reward=max(rewards),
+        distance_mm=distance_mm,
+        distance_deg=distance_deg,
+        seconds_per_plane=seconds / episode.n_steps,
+        **{f"dice_{tissue}": value for tissue, value in dice.items()},
+    )
