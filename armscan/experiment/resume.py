@@ -50,11 +50,7 @@ def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -
     Raises:
         InvalidValueError: if the words say anything else.
         UntrustedError: if it would execute code of others, and the words have no `--trust`.
-        TrackingError: if the run is not found.
-        ResumeError: if it cannot go on.
-        FolderInUseError: if it is still going on.
-        CheckpointError: if its checkpoint is damaged or another run's.
-        ChangedVolumesError: if its volumes are not those any more that it was started with.
+        ArmscanError: if there is no such run, it is still going on, or its checkpoint or volumes are not its own.
     """
     trust = TRUST in words
     wanted, uri = _read([word for word in words if word != TRUST])

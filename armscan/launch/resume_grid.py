@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from armscan.config.defaults import to_plain
-from armscan.experiment.build import Experiment, check_keys, set_up
+from armscan.experiment.build import check_keys, set_up
 from armscan.experiment.job import JOB_TAG, Invocation, Job
 from armscan.experiment.provenance import provenance_files, sha256_tags
 from armscan.experiment.resume import resume_run
@@ -31,7 +31,10 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     check_keys(config)
     setup, tracking = set_up(config), to_plain(config.tracking)
     client, experiment_id = open_store(**tracking)
-    earlier = _earlier_runs(client, experiment_id, setup, config)
+    # Of this configuration on these volumes, the latest first.
+    sums = sha256_tags(provenance_files(to_plain(config), setup))
+    wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
+    earlier = client.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"])
     for run in earlier:
         if run.info.status == "FINISHED":
             print(f"[{job.label}] has finished before: run {run.info.run_id}", flush=True)
@@ -43,13 +46,6 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
             # Its configuration is this job's.
             return resume_run(client, run.info.run_id, job_label=job.label, trust=True)
     return run_experiment(config, invocation)
-
-
-def _earlier_runs(client: TrackingStore, experiment_id: str, setup: Experiment, config: DictConfig) -> list[Run]:
-    """Return the runs of this configuration on these volumes, the latest first."""
-    sums = sha256_tags(provenance_files(to_plain(config), setup))
-    wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
-    return list(client.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"]))
 
 
 def _adopt(client: TrackingStore, run: Run, job: Job) -> None:

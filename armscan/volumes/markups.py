@@ -16,7 +16,7 @@ from armscan.errors import InvalidValueError, MarkupError
 from armscan.utils.files import atomic_write
 from armscan.utils.validation import check_path
 from armscan.volumes.plane import FloatArray, ManipulatorAction, shift_into
-from armscan.volumes.slicer_plane import SlicerPlane, read_slicer_plane
+from armscan.volumes.slicer_plane import read_slicer_plane
 from armscan.volumes.volume import LabelVolume
 
 MARKUP_SUFFIX = ".mrk.json"
@@ -96,7 +96,9 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     if in_depth[2] < LEAST_SLOPE:
         raise MarkupError(f"{where} along the palm of {volume.name}, but it must cross the arm")
     slice_origin_mm = point_mm - turned.matrix @ _slice_centre(volume)
-    if not _is_slice(plane, volume):
+    # Whether the rectangle is as large as the volume's slices are.
+    size_mm = (volume.size_mm[0], volume.size_mm[2])
+    if plane.size_mm is None or not np.allclose(plane.size_mm, size_mm, rtol=0.0, atol=SAME_SIZE_MM):
         slice_origin_mm += across @ (np.array(volume.centre_mm) - point_mm) * across
     slice_origin_mm -= slice_origin_mm[2] / in_depth[2] * in_depth
     # What the file's rounding has moved out of the volume is moved back.
@@ -110,12 +112,6 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
             f"{volume.size_mm[:2]} mm"
         )
     return slid
-
-
-def _is_slice(plane: SlicerPlane, volume: LabelVolume) -> bool:
-    """Whether Slicer's rectangle is as large as the volume's slices are."""
-    size_mm = (volume.size_mm[0], volume.size_mm[2])
-    return plane.size_mm is not None and np.allclose(plane.size_mm, size_mm, rtol=0.0, atol=SAME_SIZE_MM)
 
 
 def _markup(volume: LabelVolume, action: ManipulatorAction, name: str) -> dict[str, Any]:
