@@ -16,6 +16,7 @@ from tianshou.algorithm.algorithm_base import Policy as TianshouPolicy
 from tianshou.data import Collector, collector
 from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
+from armscan.agents.compile_cache import cache_compiled
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.hyperparameters import Parameters
 from armscan.agents.inference import Inference
@@ -203,6 +204,7 @@ class TianshouLearner:
 
 def training_envs(setup: AgentSetup, num_envs: int) -> TianshouVectorEnv:
     """Return the training environments, and seed the weights of the networks that are made next."""
+    cache_compiled()
     envs = TianshouVectorEnv(setup.make_envs(num_envs))
     prepare_torch(setup.seed)
     return envs
