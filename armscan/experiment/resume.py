@@ -100,14 +100,7 @@ def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
 def resume_run(
     client: TrackingStore, run_id: str, *, job_label: str | None = None, trust: bool = False
 ) -> dict[str, dict[str, float]]:
-    """Go on with a run; see `resume`.
-
-    Args:
-        client: the run's store.
-        run_id: MLflow run ID.
-        job_label: prefix of the printed lines of a multirun's job. Default: None, a single run.
-        trust: whether its configuration may name classes that are not armscan's; default: false.
-    """
+    """Go on with a run; see `resume`. The lines that a job of a multirun prints begin with its label."""
     folder = _folder_of(client.get_run(run_id))
     with folder_lock(folder):
         # What it has left because the store was away; it may have ended just before the folder was free.

@@ -42,13 +42,6 @@ def save_policy(agent: Learner, env: Env, tracked: TrackedRun, folder: Path, tel
     """Keep the policy of a trained agent as a model of its run, where its configuration does not say otherwise.
 
     What cannot be kept stops no run: it is told, and noted in a tag.
-
-    Args:
-        agent: agent of the run.
-        env: environment that the agent can act in.
-        tracked: the run.
-        folder: folder of the run, with its configuration.
-        tell: called with the reason, where the policy is not kept.
     """
     config = yaml.safe_load((folder / CONFIG_FILE).read_bytes())
     # Runs of earlier versions say nothing of it.
@@ -74,12 +67,6 @@ def tags_of_kept(folder: Path) -> dict[str, str]:
 
 def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any]) -> None:
     """Write an agent's policy as a model, in the place of what is there; one that fails a check is not written.
-
-    Args:
-        agent: trained agent.
-        env: environment that it can act in.
-        folder: folder of the model.
-        facts: metadata of the model, as `facts_of` returns it.
 
     Raises:
         ExportError: if the policy cannot be written down, or the model does not answer as the agent does.

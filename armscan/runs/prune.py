@@ -56,11 +56,6 @@ def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneIte
 def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
     """Remove what a plan says of a run.
 
-    Args:
-        client: the run's store.
-        item: the run's part of the plan.
-        what: `CHECKPOINTS` or `FOLDERS`.
-
     Returns:
         Why the folder stays; None if it is gone, or was to stay.
 

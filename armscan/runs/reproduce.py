@@ -51,11 +51,6 @@ class Original:
 def load_original(tracking: str, run_id: str, *, trust: bool = False) -> Original:
     """Return a tracked run, ready to be made again.
 
-    Args:
-        tracking: MLflow tracking URI.
-        run_id: MLflow run ID, or its first characters.
-        trust: whether its configuration may name classes that are not armscan's; default: false.
-
     Raises:
         ArmscanError: if there is no such run, it is none of `armscan run`, it has not ended, what it has kept is gone
             or was changed, or its volumes are not those any more that it was started with.

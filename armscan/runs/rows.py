@@ -137,13 +137,7 @@ def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
 
 
 def sort_rows(rows: Sequence[RunRow], sort: str, limit: int | None = None) -> list[RunRow]:
-    """Return rows in an order; those without a value come last in both directions.
-
-    Args:
-        rows: the rows.
-        sort: one of `SORTS`, with - before it for the greatest first.
-        limit: number of rows at most. Default: None, all.
-    """
+    """Return rows by one of `SORTS`, the greatest first with - before it; those without a value always come last."""
     # A server is asked for each run's size: once.
     values = [(getattr(row, SORTS[sort.removeprefix("-")]), row) for row in rows]
     known = [each for each in values if each[0] is not None]

@@ -23,10 +23,6 @@ from armscan.utils.log import silence_library_warnings
 def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:
     """Run a study, or show what it would run.
 
-    Args:
-        words: of the command line.
-        launch: runs the command with Hydra, with the words it is given.
-
     Returns:
         The exit code: 0 where there is a result, 1 where too many trials failed.
     """

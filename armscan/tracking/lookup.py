@@ -80,11 +80,7 @@ class FoundRun:
         return self._fetched(BEST_CHECKPOINT, folder) if BEST_CHECKPOINT in self.files else None
 
     def volumes(self, folder: Path) -> Fingerprints | None:
-        """Return the fingerprints of its volumes; None where the run was made before these were kept.
-
-        Raises:
-            TrackingError: if they are gone, or not those that the run was started with.
-        """
+        """Return the fingerprints of its volumes; None where the run was made before these were kept."""
         if SHA256_TAGS[VOLUMES_FILE] not in self.tags:
             return None
         # Deferred: a mistake on the command line is answered before it is loaded.
@@ -115,11 +111,7 @@ class FoundRun:
 
 
 def load_run(uri: str, run_id: str) -> FoundRun:
-    """Return a run with what it has kept.
-
-    Args:
-        uri: MLflow tracking URI.
-        run_id: MLflow run ID, or its first characters.
+    """Return the run of an MLflow run ID, or of its first characters, with what it has kept.
 
     Raises:
         TrackingError: if no run is meant, or several are, or the store does not exist or cannot be used.

@@ -34,14 +34,7 @@ from armscan.sweeps.storage.storage import Storage
 
 
 class TrialScheduler:
-    """Scheduler of the trials of a study.
-
-    Args:
-        study: as it is in its storage.
-        storage: the storage.
-        limits: when the study ends.
-        is_open: whether new trials are made; otherwise only enqueued ones are run. Default: True.
-    """
+    """Scheduler of the trials of a study; unless it is open, it makes none, and only enqueued ones are run."""
 
     def __init__(self, study: optuna.Study, storage: Storage, limits: Limits, *, is_open: bool = True) -> None:
         self.study, self.storage = study, storage

@@ -19,11 +19,7 @@ class Section(BaseModel):
 
     @classmethod
     def read(cls, where: str, values: Mapping[str, Any]) -> Self:
-        """Return the section with these values; `where` is its place in the configuration, for messages.
-
-        Raises:
-            InvalidValueError: if a key is unknown, missing or has a value that is not allowed.
-        """
+        """Return the section with these values; `where` is its place in the configuration, for messages."""
         try:
             return cls.model_validate(values)
         except ValidationError as error:

@@ -138,12 +138,7 @@ for _name in BaseStorage.__abstractmethods__ - {"set_trial_param"}:
 
 
 def open_database(uri: str, *, retry: bool = False) -> DatabaseStorage:
-    """Open a database, and create its tables if there are none.
-
-    Args:
-        uri: address of a SQLite or PostgreSQL database, without a password.
-        retry: whether to wait for a database that is away while opening it. Default: False.
-    """
+    """Open a database, for which `retry` waits while it is away, and create its tables if there are none."""
     logging.getLogger("alembic").setLevel(logging.WARNING)
     retry_policy = RetryPolicy("the storage", f"study.storage is {uri!r}", why_away, StorageAwayError)
     opened = partial(_opened, database_url(uri, STORAGE_PASSWORD))

@@ -30,11 +30,7 @@ SUM = re.compile(rb',"sum":"([0-9a-f]{8})"\}\n$')
 
 
 def open_journal(path: Path, *, is_written: bool) -> JournalStorage:
-    """Open a journal.
-
-    Args:
-        path: of the file.
-        is_written: whether to create it if there is none, and to truncate a torn last line.
+    """Open a journal; one that is written is created if there is none, and loses a torn last line.
 
     Raises:
         OSError: if no file can be used there.

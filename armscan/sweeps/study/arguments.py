@@ -28,12 +28,7 @@ NO_RANGE = ",low:null,high:null,log:null,step:null"
 
 @dataclass(frozen=True)
 class StudyCommand:
-    """The words that a person has given for a study, checked.
-
-    Args:
-        words: but for the options, as Hydra takes them.
-        is_plan: whether only to show what would be run.
-    """
+    """The words of a study's command line, checked, without options; whether only to show what would be run."""
 
     words: tuple[str, ...]
     is_plan: bool

@@ -42,13 +42,7 @@ def local_workers(folder: Path) -> list[ProcessInfo]:
 
 
 def run_worker(words: Sequence[str], number: int, folder: Path) -> None:
-    """Run one job of a launcher: a worker, restarted when it is killed, until it ends by itself.
-
-    Args:
-        words: the words of the study.
-        number: the number of the worker, from 0.
-        folder: the folder of the workers of one start; each writes its log there.
-    """
+    """Run one job of a launcher: a worker, restarted when it is killed, until it ends by itself."""
     launcher = _launcher_of(folder)
     if not launcher.is_current:
         # A Ctrl-C reaches all processes of a terminal, but it is the launcher that asks the workers to leave.

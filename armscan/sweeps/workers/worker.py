@@ -45,13 +45,7 @@ MAX_REASON_CHARS = 2000
 
 
 class Worker:
-    """Runs trials of one phase of a study, one after another.
-
-    Args:
-        phase: the phase of the study.
-        words: the overrides of the command line, which each trial adds its values to.
-        heartbeat: the heartbeat of this worker, which holds the current trial.
-    """
+    """Runs trials of one phase of a study, one after another, each with its values beside the command's words."""
 
     def __init__(self, phase: Phase, words: Sequence[str], heartbeat: Heartbeat) -> None:
         self._phase, self._words, self._heartbeat = phase, words, heartbeat
