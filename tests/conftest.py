@@ -47,6 +47,12 @@ def phantom_cache(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="session", autouse=True)
+def activated():
+    """Puts the environment's programs on the path, so that suggested commands begin with their names alone."""
+    os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
+
+
 @pytest.fixture(scope="session")
 def data_folder():
     """Four full-size labelmaps with their manifest."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -112,6 +111,7 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
     """
     from rich.filesize import decimal
 
+    from armscan.config.command_hints import armscan_command
     from armscan.runs.prune import plan
     from armscan.runs.query import find
     from armscan.runs.rows import RunRow, sort_rows
@@ -127,7 +127,7 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
     freed = decimal(sum(case.n_bytes for case in taken))
     print(f"{what} of {len(taken)} of {len(cases)} runs would be removed, {freed}; nothing is touched")
     if taken:
-        print(f"remove it {shlex.join(['armscan', *click.get_current_context().obj, '--apply'])}")
+        print(f"remove it {armscan_command(*click.get_current_context().obj, '--apply')}")
     return 0
 
 

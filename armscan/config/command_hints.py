@@ -1,19 +1,42 @@
-"""The commands that messages suggest."""
+"""The commands that messages suggest, as they can be typed here: with `uv run` or a path where nothing is activated."""
 
 from __future__ import annotations
 
+import os
 import shlex
+import shutil
+import sys
 from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
 
 from armscan.config.defaults import RESUME, TRACKING_URI, default_storage, default_tracking
 from armscan.config.trust import TRUST
 
 RUN = ("python", "-m", "armscan.run")
+# `uv run` says so to the programs that it starts.
+UV_RUN = "UV_RUN_RECURSION_DEPTH"
+
+
+@cache
+def typed(program: str) -> tuple[str, ...]:
+    """Return the words with which a program of this Python's environment is started from the working folder."""
+    if UV_RUN in os.environ:
+        return "uv", "run", program
+    file, found = Path(sys.executable).with_name(program), shutil.which(program)
+    if not file.exists() or (found is not None and Path(found).parent.samefile(file.parent)):
+        return (program,)
+    return (str(file.relative_to(here) if file.is_relative_to(here := Path.cwd()) else file),)
+
+
+def kept_command(words: Iterable[str]) -> str:
+    """Return the command that runs what these Hydra overrides describe, as a run keeps it for every machine."""
+    return shlex.join([*RUN, *words])
 
 
 def run_command(words: Iterable[str]) -> str:
     """Return the command that runs what these Hydra overrides describe."""
-    return shlex.join([*RUN, *words])
+    return shlex.join([*typed(RUN[0]), *RUN[1:], *words])
 
 
 def resume_command(run_id: str, tracking_uri: str, *, trust: bool = False) -> str:
@@ -32,4 +55,4 @@ def armscan_command(*words: str, tracking: str | None = None, storage: str | Non
     """Return a command of the program `armscan`, with the stores that are not the default ones."""
     stores = ["--storage", storage] if storage is not None and storage != default_storage() else []
     stores += ["--tracking", tracking] if tracking is not None and tracking != default_tracking()["uri"] else []
-    return shlex.join(["armscan", *words, *stores])
+    return shlex.join([*typed("armscan"), *words, *stores])

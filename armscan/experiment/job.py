@@ -16,7 +16,7 @@ from typing import Self
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
-from armscan.config.command_hints import run_command
+from armscan.config.command_hints import kept_command
 from armscan.errors import FolderInUseError, FolderTakenError
 from armscan.utils.files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID, atomic_write
 
@@ -118,7 +118,7 @@ class Invocation:
         return cls(
             folder=Path(hydra_config.runtime.output_dir),
             overrides=list(hydra_config.overrides.task),
-            command=run_command(hydra_config.overrides.task),
+            command=kept_command(hydra_config.overrides.task),
             choices={str(group): str(choice) for group, choice in hydra_config.runtime.choices.items()},
             job=Job.current(),
         )

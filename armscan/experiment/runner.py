@@ -114,7 +114,7 @@ def run_tracked(
             save_policy(setup.agent, setup.test_env, tracked, folder, tell)
     if job_label is None:
         print_where_to_look(folder, tracking_uri, files=(LEARNING_CURVE_FILE, VIDEO_FILE) if result else (VIDEO_FILE,))
-        print(f"evaluate  {armscan_command('evaluate', tracked.run_id, tracking=tracking_uri)}")
+        print(f"evaluate  {armscan_command('evaluate', tracked.run_id, '--data', 'FOLDER', tracking=tracking_uri)}")
     return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
 
 

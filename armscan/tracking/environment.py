@@ -7,6 +7,7 @@ import functools
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import tempfile
@@ -24,6 +25,7 @@ from armscan.utils.files import sha256
 TOLD = ("torch", "tianshou", "gymnasium", "numpy", "numba", "scipy", "simpleitk", "optuna", "mlflow", "hydra-core")
 PYTHON, CONSTRAINTS_SUM = "version.python", "constraints.sha256"
 UNKNOWN = "unknown"
+HEADER = re.compile(r"^(Name|Version): *(\S+)", re.MULTILINE)
 # Files that nobody has added to git are kept up to this size each: code, and not a volume beside it.
 MAX_UNTRACKED_BYTES = 2**20
 COMMIT, DIRTY, DIFF_SUM = "git.commit", "git.dirty", "git.diff.sha256"
@@ -35,7 +37,7 @@ TIMEOUT_S = 30.0
 @functools.cache
 def environment() -> Mapping[str, Any]:
     """Return Python, the machine and the packages of this process, once, as plain values."""
-    found = [(each.metadata["Name"], each.version) for each in metadata.distributions()]
+    found = map(_name_and_version, metadata.distributions())
     packages = {canonicalize_name(name): version for name, version in found if name}
     return {
         "python": platform.python_version(),
@@ -43,6 +45,13 @@ def environment() -> Mapping[str, Any]:
         "machine": platform.machine(),
         "packages": dict(sorted(packages.items())),
     }
+
+
+def _name_and_version(package: metadata.Distribution) -> tuple[str, str]:
+    """Return the two lines that are needed of a package's metadata, which a parser of e-mails reads for a second."""
+    text = package.read_text("METADATA") or package.read_text("PKG-INFO") or ""
+    fields = dict(HEADER.findall(text.partition("\n\n")[0]))
+    return fields.get("Name", ""), fields.get("Version", UNKNOWN)
 
 
 def environment_file() -> bytes:

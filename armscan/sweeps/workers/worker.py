@@ -15,7 +15,7 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.samplers import BaseSampler
 from optuna.trial import Trial, TrialState
 
-from armscan.config.command_hints import run_command
+from armscan.config.command_hints import kept_command
 from armscan.config.defaults import MULTIRUN, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.errors import StorageAwayError, TrackingAwayError
@@ -132,7 +132,7 @@ class Worker:
             trial=trial,
             overrides=overrides_of(chosen),
             composed=(config, choices),
-            command=run_command([MULTIRUN[0], *self._words]),
+            command=kept_command([MULTIRUN[0], *self._words]),
             seeds=phase.seeds_of(trial),
             study_folder=phase.folder,
             run_id=self._tracked.run_id,
