@@ -24,20 +24,25 @@ from tests.support.postgres import PASSWORD
 from tests.support.waiting import HANG_S, wait_until
 
 REPOSITORY = Path(__file__).parents[2]
+# Files of one's own, in the folder where the command is typed: a worker that does not find them fails every trial.
+OWN_FILES = {
+    "sweeps/own.yaml": "# @package _global_\ndefaults: [sac_y, _self_]\nstudy: {max_retries: 3}\n",
+    "conf/network/own.yaml": "defaults: [auto, _self_]\nvector: {hidden_sizes: [16]}\n",
+}
+OWN = ["sweep=own", "network=own"]
 FEW_VOLUMES = ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
 # Trials that only wait, each one to five seconds.
 WAITING = [
     *(
-        "sweep=sac_y",
+        *OWN,
         "study.task._target_=benchmarks.sweeps.sleeping.Sleeping",
         "study/pruner=none",
-        "study.max_retries=3",
     ),
     *("+study.space={training.env_steps:{low:100,high:200},agent.lr:{low:1.0e-4,high:1.0e-2}}", *FEW_VOLUMES),
 ]
 # Trials that train, in epochs of a second or less.
 TRAINING = [
-    *("sweep=sac_y", "study/pruner=none", "study.max_retries=3", "training.eval_every_env_steps=200", *FEW_VOLUMES),
+    *(*OWN, "study/pruner=none", "training.eval_every_env_steps=200", *FEW_VOLUMES),
     *(
         "training.validation_episodes=2",
         "evaluation.episodes=3",
@@ -45,7 +50,7 @@ TRAINING = [
         "agent.learning_starts=100",
         "tracking.policy=false",
     ),
-    *("agent.batch_size=32", "network.vector.hidden_sizes=[16]"),
+    "agent.batch_size=32",
 ]
 
 
@@ -67,6 +72,9 @@ class StartedStudy:
         self._client, self._experiment = MlflowClient(tracking), folder.name
         own = {"PYTHONPATH": str(REPOSITORY), "MLFLOW_TRACKING_URI": tracking, STORAGE_PASSWORD: PASSWORD}
         kept = [f"study.storage={storage}", f"tracking.experiment={self._experiment}"]
+        for name, text in OWN_FILES.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text)
         self.printed = folder / "printed"
         with self.printed.open("ab") as printed:
             self.process = subprocess.Popen(
