@@ -62,8 +62,8 @@ def test_verdict_leaves_the_draws_of_others_alone(monkeypatch):
 
 
 def test_verdict_on_one_volume_has_the_interval_of_rliable():
-    scores = np.random.default_rng(0).gamma(2.0, 2.0, (5, 1))
+    scores = np.random.default_rng(0).gamma(2.0, 2.0, (20, 1))
     (result,) = final_results([judged(7, figures_of(list(of_seed))) for of_seed in scores])
     _, ends = get_interval_estimates({"it": scores}, lambda each: np.array([aggregate_iqm(each)]), reps=10_000)
-    # But for what is left to chance.
+    # But for what is left to chance, as rliable takes no seed: of few scores, an interval may end on one or on another.
     assert result.means["test/mean_steps"][1:] == pytest.approx(ends["it"][:, 0], rel=0.05)
