@@ -15,7 +15,8 @@ from armscan.volumes import LabelVolume, open_dataset, read_volume
 from tests.conftest import make_tiny_volume
 
 HUGE = 1600
-MOST_SECONDS, MOST_BYTES = 2.0, 16 << 20
+# Of processor time, generously: what is refused late takes half a minute and more, or all memory.
+MOST_SECONDS, MOST_BYTES = 15.0, 16 << 20
 MHA = (
     "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = {compressed}\n"
     "{size}ElementSpacing = 1 1 1\nDimSize = {n} {n} {n}\nElementType = MET_UCHAR\nElementDataFile = {file}\n"
@@ -61,10 +62,10 @@ def refusal(tmp_path, capfd):
         import SimpleITK  # noqa: F401
 
         tracemalloc.start()
-        began = time.monotonic()
+        began = time.process_time()
         with pytest.raises(VolumeError) as caught:
             read_volume(tmp_path / name)
-        took, (_, most) = time.monotonic() - began, tracemalloc.get_traced_memory()
+        took, (_, most) = time.process_time() - began, tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert took < MOST_SECONDS
         assert most < MOST_BYTES
@@ -151,11 +152,11 @@ def test_voxels_that_cannot_be_checked_are_refused(refusal, name, contents, mess
 def damaged_manifest(folder, name, text):
     """Returns the line in which a manifest is refused, and how long that takes."""
     (folder / name).write_text(text)
-    began = time.monotonic()
+    began = time.process_time()
     with pytest.raises(ManifestError) as caught:
         open_dataset(folder)
     assert len(str(caught.value).splitlines()) == 1
-    return str(caught.value), time.monotonic() - began
+    return str(caught.value), time.process_time() - began
 
 
 @pytest.mark.parametrize("name", ["manifest.yaml", "manifest.json"])
@@ -168,7 +169,7 @@ def test_a_manifest_of_many_missing_files_names_four_of_them(write_labelmap, tmp
         entry["translation"] = [0, 1]
     message, took = damaged_manifest(tmp_path, name, json.dumps({"volumes": entries}, indent=1))
     assert "missing_00003.nii.gz and 9996 more" in message
-    assert took < 10.0
+    assert took < MOST_SECONDS
 
 
 @pytest.mark.parametrize("depth", [900, 3000, 100_000])
