@@ -5,6 +5,7 @@ from armscan.agents.compute import Compute
 from armscan.agents.multimodal import Multimodal
 from armscan.agents.networks import MLP, Network, NetworkByObservation, NetworkChoice
 from armscan.agents.optuna_search import OptunaSearch
+from armscan.agents.plane_finder import PlaneFinder
 from armscan.agents.ppo import PPO
 from armscan.agents.protocols import Agent, AgentSetup, Algorithm, Learner, VectorEnvFactory
 from armscan.agents.regression import Regression
@@ -25,6 +26,7 @@ __all__ = [
     "NetworkByObservation",
     "NetworkChoice",
     "OptunaSearch",
+    "PlaneFinder",
     "Random",
     "Regression",
     "VectorEnvFactory",

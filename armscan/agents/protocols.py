@@ -91,6 +91,8 @@ class AgentSetup:
         total_env_steps: budget of the training in environment steps.
         seed: seed of the environments, networks and replay buffer.
         compute: device and precision of the tensors.
+        make_validation_envs: likewise on the validation volumes, for what a learner sets by them; None, the default,
+            where it does not learn.
     """
 
     make_envs: VectorEnvFactory
@@ -99,6 +101,7 @@ class AgentSetup:
     total_env_steps: int
     seed: int
     compute: Compute
+    make_validation_envs: VectorEnvFactory | None = None
 
 
 class Algorithm(Protocol):

@@ -12,6 +12,7 @@ from armscan.anatomy import PUBLISHED_TARGETS, check_tissues
 from armscan.envs.env import ArmscanEnv
 from armscan.envs.history import MOST_KEPT, boxes_of, check_exclusions
 from armscan.envs.rules import Rules, Volumes, check_reward
+from armscan.envs.scene import RandomTransform
 from armscan.envs.vector_env import ArmscanVectorEnv
 from armscan.envs.wrappers import BestActionMemory, Env, FrameStack, VectorBestActionMemory, VectorFrameStack
 from armscan.errors import InvalidValueError, listed
@@ -44,6 +45,13 @@ class EnvFactory:
         return EnvFactory(
             **self.rules | {"reward": reward.fitted_to(volumes.values(), tissues), "targets": PUBLISHED_TARGETS}
         )
+
+    def undeformed(self) -> EnvFactory:
+        """Return a factory of environments that move volumes but leave their shape: those that agents are judged in."""
+        transform = self.rules.get("transform")
+        if not isinstance(transform, RandomTransform):
+            return self
+        return EnvFactory(**self.rules | {"transform": transform.rigid})
 
     def make_env(self, volumes: Volumes, *, render_mode: str | None = None) -> Env:
         """Make one environment."""

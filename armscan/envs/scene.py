@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -63,6 +63,11 @@ class RandomTransform:
         for name in ("scale", "stretch", "shear"):
             check_float(f"transform {name}", getattr(self, name), at_least=0.0, at_most=MAX_DEFORMATION)
         check_bool("transform mirror", self.mirror)
+
+    @property
+    def rigid(self) -> RandomTransform:
+        """The motions alone."""
+        return replace(self, scale=0.0, stretch=0.0, shear=0.0, mirror=False)
 
     def draw(self, volume: LabelVolume, rng: np.random.Generator) -> RigidTransform:
         """Draw one motion of a volume, and its deformation if there is one."""

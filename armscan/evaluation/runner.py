@@ -131,7 +131,7 @@ def prepare(
 
 def _env(env_factory: EnvFactory, volumes: Volumes, clustering: object, render_mode: str | None) -> Env:
     try:
-        return env_factory.make_env(volumes, render_mode=render_mode)
+        return env_factory.undeformed().make_env(volumes, render_mode=render_mode)
     except OptimalPlaneError as error:
         sizes = {volume.pixel_mm for volume in volumes.values()}
         is_usual = all(

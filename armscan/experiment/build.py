@@ -55,22 +55,22 @@ class Experiment:
     @cached_property
     def training_env(self) -> Env:
         """Of the training volumes, for the final evaluation."""
-        return self.env_factory.make_env(self.split.training)
+        return self.env_factory.undeformed().make_env(self.split.training)
 
     @cached_property
     def validation_env(self) -> Env:
         """Of the validation volumes, for the validation after each epoch."""
-        return self.env_factory.make_env(self.split.validation)
+        return self.env_factory.undeformed().make_env(self.split.validation)
 
     @cached_property
     def test_env(self) -> Env:
         """Of the test volumes, for the final evaluation."""
-        return self.env_factory.make_env(self.split.test)
+        return self.env_factory.undeformed().make_env(self.split.test)
 
     @cached_property
     def video_env(self) -> Env:
         """Of the test volumes, for the video of an episode."""
-        return self.env_factory.make_env(self.split.test, render_mode="rgb_array")
+        return self.env_factory.undeformed().make_env(self.split.test, render_mode="rgb_array")
 
     @cached_property
     def fingerprints(self) -> Fingerprints:
@@ -110,7 +110,14 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
     split = split or _made(config, "data", Split)
     smallest = smallest_slice([*split.training.values(), *split.validation.values(), *split.test.values()])
     env_factory = make_env_factory(apply_crop(config, smallest, smallest), split.training)
-    agent = make_agent(config, env_factory, split.training, total_env_steps=budget.env_steps, seed=seed)
+    agent = make_agent(
+        config,
+        env_factory,
+        split.training,
+        total_env_steps=budget.env_steps,
+        seed=seed,
+        validation=split.validation,
+    )
     return Experiment(
         split=split,
         env_factory=env_factory,
@@ -163,18 +170,39 @@ def make_env_factory(config: DictConfig, training: Mapping[str, LabelVolume]) ->
 
 
 def make_agent(
-    config: DictConfig, env_factory: EnvFactory, volumes: Mapping[str, LabelVolume], *, total_env_steps: int, seed: int
+    config: DictConfig,
+    env_factory: EnvFactory,
+    volumes: Mapping[str, LabelVolume],
+    *,
+    total_env_steps: int,
+    seed: int,
+    validation: Mapping[str, LabelVolume] | None = None,
 ) -> Agent:
-    """Return the agent, which has learned nothing yet, for environments on these volumes."""
+    """Return the agent, which has learned nothing yet, for environments on these volumes.
+
+    Args:
+        config: the composed configuration.
+        env_factory: makes its environments.
+        volumes: the volumes that it learns on.
+        total_env_steps: budget of its training in environment steps.
+        seed: seed of everything that it draws.
+        validation: validation volumes of its training; None, the default, where it learns nothing.
+    """
     algorithm = make_algorithm(config)
     env = env_factory.make_env(dict(volumes))
+    make_envs = partial(env_factory.make_vector_env, volumes=dict(volumes), autoreset_mode="Disabled")
+    make_validation_envs = None
+    if validation is not None:
+        factory = env_factory.undeformed()
+        make_validation_envs = partial(factory.make_vector_env, volumes=dict(validation), autoreset_mode="Disabled")
     setup = AgentSetup(
-        make_envs=partial(env_factory.make_vector_env, volumes=dict(volumes), autoreset_mode="Disabled"),
+        make_envs=make_envs,
         observation_space=env.observation_space,
         action_names=env.get_wrapper_attr("action_names"),
         total_env_steps=total_env_steps,
         seed=seed,
         compute=_made(config, "compute", Compute),
+        make_validation_envs=make_validation_envs,
     )
     agent = algorithm.agent(setup)
     if hasattr(agent, "learn") and not isinstance(agent, Learner):

@@ -16,6 +16,8 @@ from armscan.volumes.plane import FloatArray
 # What evaluations are called by, after the volumes that they are on.
 TRAINING, VALIDATION, TEST = "training volumes", "validation volumes", "test volumes"
 
+SUCCESS, DISTANCE = BEST_BY = ("success", "distance")
+
 # Above any number of an episode; sums of such are finite.
 LARGEST = 1e100
 
@@ -104,9 +106,15 @@ class Evaluation:
         """Mean number of steps, episodes without success included."""
         return self._mean("mean_steps")
 
-    @property
-    def score(self) -> tuple[float, float]:
-        """Key that evaluations are compared by: first the success rate, then the fewest steps."""
+    def score(self, best_by: str = SUCCESS) -> tuple[float, float]:
+        """Return the key that evaluations are compared by, the higher the better.
+
+        Args:
+            best_by: `success`, the rate of it, then the fewest steps; or `distance`, the sum of the mean distance in mm
+                and the mean angle in degrees, then the success rate.
+        """
+        if best_by == DISTANCE:
+            return -self._mean("mean_distance_mm") - self._mean("mean_distance_deg"), self.success_rate
         return self.success_rate, -self.mean_steps
 
     def metrics(self) -> dict[str, float]:

@@ -12,9 +12,9 @@ from armscan.errors import InvalidValueError
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint
 from armscan.training.checkpointing import CheckpointProvenance, save_checkpoints
-from armscan.training.rollout import Evaluation
+from armscan.training.rollout import BEST_BY, SUCCESS, Evaluation
 from armscan.utils.files import BEST_CHECKPOINT
-from armscan.utils.validation import check_float, check_int
+from armscan.utils.validation import check_choice, check_float, check_int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,16 +54,19 @@ class Budget:
         eval_every_env_steps: environment steps between two validations, rounded up likewise.
         validation_episodes: number of episodes of a validation.
         solved: stop as soon as this holds; None to spend the whole budget.
+        best_by: what the best epoch is chosen by, `success` or `distance`; see `Evaluation.score`.
     """
 
     env_steps: int
     eval_every_env_steps: int
     validation_episodes: int
     solved: SolvedCriterion | None = None
+    best_by: str = SUCCESS
 
     def __post_init__(self) -> None:
         for name in ("env_steps", "eval_every_env_steps", "validation_episodes"):
             check_int(f"training.{name}", getattr(self, name), at_least=1)
+        check_choice("training.best_by", self.best_by, BEST_BY)
         if self.solved is not None and not isinstance(self.solved, SolvedCriterion):
             raise InvalidValueError(f"training.solved is {self.solved!r}, but it must be a SolvedCriterion or null")
 
@@ -123,13 +126,14 @@ def train(
         while learner.n_env_steps < budget.env_steps and not is_solved:
             metrics = learner.learn(min(budget.eval_every_env_steps, budget.env_steps - learner.n_env_steps))
             evaluation = validate()
+            by = budget.best_by
             report = EpochReport(
                 epoch=len(reports) + 1,
                 n_env_steps=learner.n_env_steps,
                 wall_s=time.perf_counter() - start_s,
                 metrics=metrics,
                 evaluation=evaluation,
-                is_best=all(evaluation.score > before.evaluation.score for before in reports),
+                is_best=all(evaluation.score(by) > before.evaluation.score(by) for before in reports),
             )
             reports.append(report)
             save_checkpoints(learner, reports, folder, provenance)

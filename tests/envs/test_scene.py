@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armscan.anatomy import TissueClusters, landmark_reward
-from armscan.envs import ManipulatorAction, RandomTransform
+from armscan.envs import EnvFactory, ManipulatorAction, RandomTransform
 from armscan.envs.rules import Rules
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.volumes import LabelVolume
@@ -113,6 +113,14 @@ def test_each_deformation_does_one_thing(phantom, name, shape):
     spread = np.abs(np.abs(drawn) - np.eye(3)).max()
     assert spread == 0.0 if name == "mirror" else 0.8 * DEFORMED[name] < spread <= DEFORMED[name]
     assert {np.sign(deformation[0, 0]) for deformation in drawn} == ({-1.0, 1.0} if name == "mirror" else {1.0})
+
+
+def test_agents_are_judged_on_volumes_as_they_are(phantom):
+    factory = EnvFactory(transform=RandomTransform(rz_deg=3.0, **DEFORMED))
+    assert factory.undeformed().rules["transform"] == RandomTransform(rz_deg=3.0)
+    assert factory.rules["transform"].scale == 0.08
+    bare = EnvFactory(transform=None)
+    assert bare.undeformed().rules == bare.rules
 
 
 def test_a_mirrored_volume_shows_the_labelled_slice_mirrored(phantom):

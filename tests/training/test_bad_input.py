@@ -8,13 +8,13 @@ from armscan.training import splits as data
 from tests.support.junk import SETTINGS, junk, refuses
 
 
-@pytest.mark.parametrize("changed", ["env_steps", "eval_every_env_steps", "validation_episodes", "solved"])
+@pytest.mark.parametrize("changed", ["env_steps", "eval_every_env_steps", "validation_episodes", "solved", "best_by"])
 @SETTINGS
 @given(value=junk)
 def test_budget_with_junk(changed, value):
     figures = {"env_steps": 9, "eval_every_env_steps": 3, "validation_episodes": 2}
     budget = refuses(lambda: Budget(**figures | {changed: value}))
-    assert budget is None or changed != "solved" or value is None
+    assert budget is None or changed not in ("solved", "best_by") or value in (None, "success", "distance")
 
 
 @pytest.mark.parametrize("changed", ["success_rate", "mean_steps", "n_epochs"])

@@ -21,7 +21,7 @@ from armscan.training import (
 )
 
 
-def evaluation_of(*lengths, success=True):
+def evaluation_of(*lengths, success=True, distance_mm=1.0):
     return Evaluation(
         tuple(
             EpisodeResult(
@@ -33,7 +33,7 @@ def evaluation_of(*lengths, success=True):
                 episode_return=-0.5 * length,
                 final_reward=0.0,
                 best_reward=0.0,
-                distance_mm=1.0,
+                distance_mm=distance_mm,
                 distance_deg=2.0,
                 dice_bones=0.9,
                 dice_tendons=0.8,
@@ -125,6 +125,13 @@ def test_train_keeps_the_best_and_the_last_and_ends_with_the_best(tmp_path):
 def test_train_prefers_success_to_few_steps(tmp_path):
     learner, *_ = run(tmp_path, [evaluation_of(50), evaluation_of(1, success=False), evaluation_of(60)])
     assert learner.n_epochs == 1
+
+
+@pytest.mark.parametrize(("best_by", "best"), [("success", 1), ("distance", 2)])
+def test_train_keeps_the_best_by_what_is_asked_for(tmp_path, best_by, best):
+    evaluations = [evaluation_of(3), evaluation_of(3, success=False, distance_mm=0.5), evaluation_of(4)]
+    learner, *_ = run(tmp_path, evaluations, best_by=best_by)
+    assert learner.n_epochs == best
 
 
 def test_train_stops_when_solved_often_enough_in_a_row(tmp_path):

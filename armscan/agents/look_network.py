@@ -1,0 +1,146 @@
+"""The network of the plane finder: several looks in, the wanted plane and how far off it may be out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain, pairwise
+
+import torch
+from torch import Tensor, nn
+
+from armscan.agents.plane_geometry import PlaneGeometry
+
+# Names of the parts of an observation that it takes.
+IMAGE, ACTION = "shares", "action"
+# What the outputs are measured in: components of the normal, mm along it, mm across.
+UNITS = (0.1, 0.05, 3.0, 8.0)
+# What the places of earlier looks are divided by, and how large they may become.
+PLACES, MOST_PLACE = (0.2, 0.2, 10.0, 20.0), 6.0
+# Kernel of each convolution; all have stride 2.
+KERNELS = (5, 3, 3)
+
+
+class LookNetwork(nn.Module):
+    """Convolutions over the images of the latest looks, then linear layers with how these lie to each other.
+
+    One head says where the wanted plane lies in the frame of the latest look, as `PlaneGeometry.seen_from` does; the
+    other, which changes nothing of the features that it is given, how far off that is to be, in mm and degrees.
+
+    Args:
+        image_shape: tissues, across and depth of a look's image.
+        n_seen: number of the latest looks that are seen.
+        n_looks: number of looks of an episode.
+        filters: filters of each convolution.
+        hidden_sizes: units of each linear layer.
+    """
+
+    units: Tensor
+    places: Tensor
+
+    def __init__(
+        self,
+        image_shape: Sequence[int],
+        *,
+        n_seen: int,
+        n_looks: int,
+        filters: Sequence[int],
+        hidden_sizes: Sequence[int],
+    ) -> None:
+        super().__init__()
+        n_tissues, *sides = image_shape
+        self._n_seen, self._n_looks = n_seen, n_looks
+        channels = pairwise([n_seen * n_tissues, *filters])
+        layers = [
+            (nn.Conv2d(n_in, n_out, kernel, stride=2, padding=kernel // 2), nn.ReLU())
+            for (n_in, n_out), kernel in zip(channels, KERNELS, strict=True)
+        ]
+        self.convolutions = nn.Sequential(*chain.from_iterable(layers), nn.Flatten())
+        for _ in KERNELS:
+            sides = [(side + 1) // 2 for side in sides]
+        n_features = filters[-1] * sides[0] * sides[1] + 4 * n_seen + n_looks
+        sizes = pairwise([n_features, *hidden_sizes])
+        self.linear = nn.Sequential(*chain.from_iterable((nn.Linear(*each), nn.ReLU()) for each in sizes))
+        self.place = nn.Linear(hidden_sizes[-1], 4)
+        self.doubt = nn.Sequential(nn.Linear(hidden_sizes[-1], 32), nn.ReLU(), nn.Linear(32, 2))
+        self.register_buffer("units", torch.tensor(UNITS))
+        self.register_buffer("places", torch.tensor(PLACES))
+
+    def forward(self, images: Tensor, actions: Tensor, step: Tensor, geometry: PlaneGeometry) -> tuple[Tensor, Tensor]:
+        """Return the place of the wanted plane, shape (n, 4), and the expected errors, shape (n, 2), both above 0.
+
+        Args:
+            images: the looks of an episode from the oldest on, shape (n, n_looks, tissues, across, depth), bytes.
+            actions: their planes, normalised, shape (n, n_looks, 4).
+            step: which of the looks the latest is, one-hot, shape (n, n_looks).
+            geometry: what the planes are.
+        """
+        looks = images[:, -self._n_seen :].flatten(1, 2).float() / 255.0
+        planes = geometry.planes(actions)
+        features = [self.convolutions(looks.contiguous(memory_format=torch.channels_last)), actions[:, -1], step]
+        for i in range(2, self._n_seen + 1):
+            place = geometry.seen_from(planes[:, -1], planes[:, -i]) / self.places
+            features.append(place.clamp(-MOST_PLACE, MOST_PLACE))
+        hidden = self.linear(torch.cat(features, dim=1))
+        return self.place(hidden) * self.units, self.doubt(hidden.detach()).clamp(-6.0, 5.0).exp()
+
+
+class FinderModule(nn.Module):
+    """What a plane finder computes: observations of several looks in, the next plane out.
+
+    Which look of the episode the latest is follows from the stack of observations: it is filled with the first one.
+
+    Args:
+        network: network for the looks.
+        geometry: what the planes are.
+        offsets_mm: how far beside the plane that is found so far the next look is, after each look; the last is 0.
+        sure: expected errors, in mm and degrees, below which it looks no further; None: it always takes all looks.
+        has_stop: whether an action has the component `stop`.
+    """
+
+    offsets: Tensor
+    sure: Tensor
+    calibration: Tensor
+
+    def __init__(
+        self,
+        network: LookNetwork,
+        geometry: PlaneGeometry,
+        offsets_mm: Sequence[float],
+        sure: tuple[float, float] | None,
+        *,
+        has_stop: bool,
+    ) -> None:
+        super().__init__()
+        self.network, self.geometry = network, geometry
+        self._is_ever_sure, self._has_stop = sure is not None, has_stop
+        self.register_buffer("offsets", torch.tensor(offsets_mm))
+        self.register_buffer("sure", torch.tensor(sure or (0.0, 0.0)))
+        self.register_buffer("calibration", torch.ones(2))
+
+    def estimate(self, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the latest plane, the wanted one's place in its frame, the expected errors, and the one-hot step."""
+        actions = observations[ACTION][:, :, :4]
+        n_looks = actions.shape[1]
+        is_first = (actions == actions[:, :1]).all(2).float()
+        n_first = running = is_first[:, 0]
+        for i in range(1, n_looks):
+            running = running * is_first[:, i]
+            n_first = n_first + running
+        latest = torch.arange(n_looks, device=actions.device)
+        step = ((n_looks - n_first)[:, None] == latest).float()
+        place, expected = self.network(observations[IMAGE], actions, step, self.geometry)
+        return self.geometry.planes(actions[:, -1]), place, expected * self.calibration, step
+
+    def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
+        """Return the next actions, shape (n, n_action), and the expected errors of what is found so far, (n, 2)."""
+        plane, place, expected, step = self.estimate(observations)
+        beside_mm = step @ self.offsets
+        is_last = step[:, -1] > 0.0
+        if self._is_ever_sure:
+            is_last = is_last | (expected <= self.sure).all(1)
+        beside_mm = torch.where(is_last, torch.zeros_like(beside_mm), beside_mm)
+        actions = self.geometry.actions(self.geometry.from_frame(plane, place, beside_mm))
+        if self._has_stop:
+            stop = torch.where(is_last, torch.ones_like(beside_mm), -torch.ones_like(beside_mm))
+            actions = torch.cat([actions, stop[:, None]], dim=1)
+        return (actions, expected), None

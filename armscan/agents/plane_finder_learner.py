@@ -1,0 +1,278 @@
+"""The learner of the plane finder: teaches a network on the looks that it comes to by itself."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork
+from armscan.agents.plane_geometry import PlaneGeometry
+from armscan.agents.policy import Policy, batch_of, clip_action
+from armscan.agents.protocols import AgentSetup
+from armscan.agents.tianshou_learner import diverged, is_finite, load_into
+from armscan.envs.actions import ActionBounds
+from armscan.envs.rules import ON_REWARD, Observed
+from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
+from armscan.errors import InvalidValueError, listed
+from armscan.volumes.plane import FloatArray
+
+if TYPE_CHECKING:
+    from armscan.agents.plane_finder import PlaneFinder
+
+# Looks led astray: spreads in mm and degrees between which each is drawn, in orders of magnitude.
+ASTRAY_MM, ASTRAY_DEG = (0.5, 6.0), (1.0, 8.0)
+# How much larger the scales of the loss are for the first look: normal, normal, along it, across.
+FIRST_LOOK = (2.0, 2.0, 5.0, 1.0)
+# Of the second head, beside the first's.
+DOUBT_WEIGHT = 0.1
+# Episodes that the expected errors are calibrated on.
+N_CALIBRATION = 96
+
+
+class PlaneFinderLearner:
+    """Plays episodes in all environments at once, and takes a gradient step on all their looks.
+
+    Every epoch draws everything from `seed` and its own number, so that it goes on from its state bit for bit.
+
+    Args:
+        finder: parameters.
+        setup: environments, spaces, budget and seed of the agent.
+    """
+
+    def __init__(self, finder: PlaneFinder, setup: AgentSetup) -> None:
+        self._finder, self._seed, self._total_env_steps = finder, setup.seed, setup.total_env_steps
+        self._envs = setup.make_envs(finder.num_envs)
+        self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
+        self._has_stop = len(setup.action_names) > 4
+        self._compute, self._device = setup.compute, setup.compute.torch_device
+        torch.manual_seed(setup.seed)
+        space: Any = setup.observation_space
+        network = LookNetwork(
+            space[IMAGE].shape[1:],
+            n_seen=finder.n_seen,
+            n_looks=finder.n_looks,
+            filters=finder.filters,
+            hidden_sizes=finder.hidden_sizes,
+        )
+        sure = None if finder.sure_mm is None or finder.sure_deg is None else (finder.sure_mm, finder.sure_deg)
+        self._module = FinderModule(
+            network, _geometry(_teacher(self._envs), finder), finder.offsets_mm, sure, has_stop=self._has_stop
+        ).to(self._device)
+        self._optimiser = torch.optim.Adam(network.parameters(), lr=finder.lr)
+        self._n_env_steps = self._n_epochs = 0
+        self.expected_error: tuple[float, float] | None = None
+        """How far off the plane that `act` chose last is expected to be, in mm and degrees."""
+        setup.compute.apply_to(self._module)
+
+    @property
+    def n_env_steps(self) -> int:
+        """Looks taken so far, the starts of episodes included, calibration left out."""
+        return self._n_env_steps
+
+    @property
+    def env_steps_at_once(self) -> int:
+        """All looks of an episode in each environment."""
+        return self._envs.num_envs * self._finder.n_looks
+
+    def warm_up(self) -> None:
+        """Do nothing: the first looks can be learned from."""
+
+    def learn(self, n_env_steps: int) -> dict[str, float]:
+        """Learn for one epoch of at least `n_env_steps`; returns its training metrics by name.
+
+        Raises:
+            DivergedError: if the weights are not finite afterwards.
+        """
+        self._n_epochs += 1
+        for_torch, for_draws, for_envs, for_calibration = np.random.SeedSequence([self._seed, self._n_epochs]).spawn(4)
+        torch.manual_seed(int(for_torch.generate_state(1)[0]))
+        rng = np.random.default_rng(for_draws)
+        seeds = [int(word) for word in for_envs.generate_state(self._envs.num_envs)]
+        observations, _ = reset_each(self._envs, seeds)
+        losses: list[Tensor] = []
+        n_before, start_s = self._n_env_steps, time.perf_counter()
+        while self._n_env_steps - n_before < n_env_steps:
+            if losses:
+                observations, _ = self._envs.reset(options={"reset_mask": np.ones(self._envs.num_envs, np.bool_)})
+            losses.append(self._teach(observations, rng))
+            self._n_env_steps += self.env_steps_at_once
+        if not is_finite(self._module):
+            raise diverged(self._n_env_steps)
+        seconds = time.perf_counter() - start_s
+        return {
+            "update/loss": float(torch.stack(losses).mean()),
+            "speed/env_steps_per_s": (self._n_env_steps - n_before) / seconds,
+            "speed/updates_per_s": len(losses) / seconds,
+            **self._calibrate(int(for_calibration.generate_state(1)[0])),
+        }
+
+    def _teach(self, observations: Observed, rng: np.random.Generator) -> Tensor:
+        """Play an episode in every environment, and take a gradient step on its looks."""
+        optima = self._optima(self._envs)
+        seen = [self._tensors(observations)]
+        for offset_mm in self._finder.offsets_mm[:-1]:
+            observations = self._envs.step(self._next_looks(seen[-1], offset_mm, rng))[0]
+            seen.append(self._tensors(observations))
+        looks = {name: torch.cat([each[name] for each in seen]) for name in (IMAGE, ACTION)}
+        planes, place, expected, step = self._module.estimate(looks)
+        wanted = self._module.geometry.seen_from(planes, optima.repeat(len(seen), 1))
+        finder = self._finder
+        tilt = math.radians(finder.loss_deg)
+        scale = wanted.new_tensor([tilt, tilt, finder.loss_mm, finder.loss_across_mm])
+        scale = torch.where(step[:, :1] > 0.0, scale * wanted.new_tensor(FIRST_LOOK), scale)
+        loss = len(seen) * nn.functional.smooth_l1_loss(place / scale, wanted / scale, reduction="none").mean(0).sum()
+        off = (place - wanted).detach()
+        errors = torch.stack([off[:, 2].abs(), torch.rad2deg(off[:, :2].norm(dim=1))], dim=1)
+        # The likelihood of errors that are distributed exponentially about their mean.
+        doubt = (expected.log() + errors / expected).mean()
+        for group in self._optimiser.param_groups:
+            share = min(1.0, self._n_env_steps / self._total_env_steps)
+            fall = 0.5 * (1.0 + math.cos(math.pi * share))
+            group["lr"] = finder.lr * (finder.lr_end_factor + (1.0 - finder.lr_end_factor) * fall)
+        self._optimiser.zero_grad()
+        torch.autograd.backward(loss + DOUBT_WEIGHT * doubt)
+        self._optimiser.step()
+        return loss.detach()
+
+    def _next_looks(self, seen: dict[str, Tensor], offset_mm: float, rng: np.random.Generator) -> FloatArray:
+        """Return the next looks beside what is found, some of them led astray, as actions that never stop."""
+        n = self._envs.num_envs
+        draws = torch.as_tensor(rng.normal(size=(n, 4)), dtype=torch.float32, device=self._device)
+        spreads = np.exp([rng.uniform(math.log(low), math.log(high), n) for low, high in (ASTRAY_DEG, ASTRAY_MM)])
+        is_astray = rng.random(n) < self._finder.astray_share
+        astray_deg, astray_mm = torch.as_tensor(spreads * is_astray, dtype=torch.float32, device=self._device)
+        with torch.no_grad():
+            plane, place, _, _ = self._module.estimate(seen)
+            tilt = torch.deg2rad(astray_deg)[:, None] * draws[:, :2]
+            place = torch.cat([place[:, :2] + tilt, place[:, 2:]], dim=1)
+            beside_mm = offset_mm + astray_mm * draws[:, 2]
+            geometry = self._module.geometry
+            actions = geometry.actions(geometry.from_frame(plane, place, beside_mm)).cpu().numpy()
+        if not np.isfinite(actions).all():
+            raise diverged(self._n_env_steps)
+        return np.column_stack([actions, np.full(n, -1.0)]) if self._has_stop else actions
+
+    def _calibrate(self, seed: int) -> dict[str, float]:
+        """Scale the expected errors to be right on average where they are judged; returns what was seen there."""
+        envs = self._calibration_envs
+        if envs is None:
+            return {}
+        with torch.no_grad():
+            observations, _ = reset_each(envs, seed)
+            optima = self._optima(envs)
+            for is_last in [False] * (self._finder.n_looks - 1) + [True]:
+                (actions, expected), _ = self._module(self._tensors(observations))
+                if is_last:
+                    break
+                if self._has_stop:
+                    actions[:, 4] = -1.0
+                observations = envs.step(actions.cpu().numpy())[0]
+            errors = self._module.geometry.errors(self._module.geometry.planes(actions[:, :4]), optima)
+            self._module.calibration *= errors.mean(0) / expected.mean(0).clamp(min=1e-6)
+        metrics = {}
+        for i, unit in enumerate(("mm", "deg")):
+            order = expected[:, i].argsort()
+            surest, least = order[: len(order) // 4], order[-(len(order) // 4) :]
+            metrics[f"calibration/error_{unit}"] = float(errors[:, i].mean())
+            metrics[f"calibration/error_{unit}_surest_quarter"] = float(errors[surest, i].mean())
+            metrics[f"calibration/error_{unit}_least_sure_quarter"] = float(errors[least, i].mean())
+            metrics[f"calibration/factor_{unit}"] = float(self._module.calibration[i])
+        return metrics
+
+    def _optima(self, envs: Any) -> Tensor:
+        """Return the labelled planes of the current episodes, shape (num_envs, 4)."""
+        optima = torch.as_tensor(_teacher(envs).optimal_actions[:, :4], dtype=torch.float32, device=self._device)
+        return self._module.geometry.planes(optima)
+
+    def _tensors(self, observations: Any) -> dict[str, Tensor]:
+        return {name: torch.as_tensor(observations[name], device=self._device) for name in (IMAGE, ACTION)}
+
+    def begin(self, *, seed: int, bounds: ActionBounds) -> None:
+        """Learn that an episode begins, in which nothing is drawn.
+
+        Raises:
+            InvalidValueError: if actions mean other planes than in training.
+        """
+        given, known = (*bounds.rotation_deg, *bounds.translation_mm), self._module.geometry.bounds.tolist()
+        if not np.allclose(given, known, atol=1e-3):
+            raise InvalidValueError(
+                f"the bounds of the actions are {given}, but agent=plane_finder has learned with {tuple(known)}: give "
+                "them with env.rotation_bounds_deg and env.translation_bounds_mm"
+            )
+
+    def act(self, observation: Observed, reward: float) -> FloatArray:
+        """Return the next plane, shape (n_action,)."""
+        batch = batch_of([observation])
+        with torch.no_grad():
+            (actions, expected), _ = self._module(self._tensors(batch))
+        self.expected_error = (float(expected[0, 0]), float(expected[0, 1]))
+        return np.asarray(actions[0].clamp(-1.0, 1.0).cpu().numpy())
+
+    def policy(self) -> Policy:
+        """Return a copy of what `act` asks."""
+        return Policy(self._module, clip_action, self._compute)
+
+    def weights(self) -> dict[str, Any]:
+        """Return the network's weights, the geometry and the calibration."""
+        return dict(self._module.state_dict())
+
+    def load_weights(self, weights: dict[str, Any]) -> None:
+        """Take over what `weights` returned.
+
+        Raises:
+            CheckpointError: if it is that of another network.
+        """
+        load_into(self._module, weights)
+
+    def state(self) -> dict[str, Any]:
+        """Return network, optimiser and counters."""
+        return {
+            "network": self.weights(),
+            "optimiser": self._optimiser.state_dict(),
+            "n_env_steps": self._n_env_steps,
+            "n_epochs": self._n_epochs,
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what `state` returned.
+
+        Raises:
+            CheckpointError: if it is that of another agent.
+        """
+        load_into(self._module, state["network"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._n_env_steps, self._n_epochs = state["n_env_steps"], state["n_epochs"]
+
+
+def _teacher(envs: Any) -> ArmscanVectorEnv:
+    assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
+    return envs.unwrapped
+
+
+def _geometry(teacher: ArmscanVectorEnv, finder: PlaneFinder) -> PlaneGeometry:
+    """Return what planes are in these environments.
+
+    Raises:
+        InvalidValueError: if that differs between volumes, or an episode may end before all looks are taken.
+    """
+    rules = teacher.rules
+    if rules.ends == ON_REWARD or rules.max_steps < finder.n_looks:
+        raise InvalidValueError(
+            f"env.ends is {rules.ends!r} and env.max_steps is {rules.max_steps}, but agent=plane_finder looks beside "
+            f"the plane, {finder.n_looks} times: take env.ends=on_budget or on_stop, and at least "
+            f"env.max_steps={finder.n_looks}"
+        )
+    bounds = set(rules.bounds.values())
+    if len(bounds) > 1:
+        sizes = listed(" x ".join(f"{mm:g}" for mm in each.translation_mm) for each in bounds)
+        raise InvalidValueError(
+            f"the bounds of translations are {sizes} mm, but agent=plane_finder needs the same on all volumes: give "
+            "env.translation_bounds_mm"
+        )
+    middles = np.array([[volume.centre_mm[0], volume.centre_mm[2]] for volume in rules.volumes.values()])
+    return PlaneGeometry(bounds.pop(), middles.mean(axis=0).tolist())

@@ -1,0 +1,197 @@
+"""The agent that looks beside the plane."""
+
+from copy import deepcopy
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from armscan.agents import Compute, Learner, PlaneFinder
+from armscan.agents.look_network import FinderModule
+from armscan.agents.policy import batch_of
+from armscan.agents.torch_export import export_program
+from armscan.envs import EnvFactory, MetricSliceObservation, RandomTransform
+from armscan.envs.actions import ActionBounds
+from armscan.errors import CheckpointError, InvalidValueError
+from tests.agents.conftest import setup_for
+
+SMALL = {"num_envs": 4, "filters": (2, 2, 2), "hidden_sizes": (16,)}
+NAMES = ("rz", "rx", "tx", "ty")
+RULES = {
+    "projection": "full",
+    "observation": MetricSliceObservation(pixel_mm=(4.05, 2.2)),
+    "ends": "on_budget",
+    "max_steps": 3,
+    "stack": 3,
+    "rotation_bounds_deg": (90.0, 45.0),
+    "success_threshold": 0.5,
+    "transform": RandomTransform(scale=0.05, shear=0.05),
+}
+
+
+def made(phantom, rules=None, **changes):
+    env_factory = EnvFactory(**RULES | (rules or {}))
+    names = (*NAMES, "stop") if (rules or {}).get("ends") == "on_stop" else NAMES
+    validation = partial(env_factory.undeformed().make_vector_env, volumes=[phantom], autoreset_mode="Disabled")
+    setup = setup_for(env_factory, phantom, action_names=names, total_env_steps=480, make_validation_envs=validation)
+    return PlaneFinder(**SMALL | changes).agent(setup), env_factory.make_env([phantom])
+
+
+def played(learner, env, seed=0):
+    """The planes of an episode, normalised, and whether its last step terminated it."""
+    observation, info = env.reset(seed=seed)
+    learner.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
+    actions, terminated, truncated = [info["action"]], False, False
+    while not (terminated or truncated):
+        actions.append(learner.act(observation, 0.0))
+        observation, _, terminated, truncated, _ = env.step(actions[-1])
+    return np.array(actions), terminated
+
+
+def test_learner_takes_its_steps_and_its_loss_falls(phantom):
+    learner, _ = made(phantom, lr=2e-2, lr_end_factor=1.0)
+    assert isinstance(learner, Learner)
+    learner.warm_up()
+    losses = [learner.learn(240)["update/loss"] for _ in range(3)]
+    assert learner.n_env_steps == 3 * 240
+    assert learner.env_steps_at_once == 12
+    assert losses[-1] < 0.7 * losses[0]
+
+
+def test_learner_goes_on_from_its_state_to_the_bit(phantom):
+    one, other = made(phantom)[0], made(phantom)[0]
+    one.learn(24)
+    other.load_state(deepcopy(one.state()))
+    for learner in (one, other):
+        learner.learn(24)
+    assert one.n_env_steps == other.n_env_steps == 48
+    for name, weights in one.weights().items():
+        assert torch.equal(weights, other.weights()[name])
+
+
+def test_looks_lie_beside_what_is_found_and_the_last_on_it(phantom):
+    """Of a network that always says that the plane is 2 mm on and not tilted, every next look is known."""
+    learner, env = made(phantom)
+    learner.load_weights(
+        {name: torch.zeros_like(w) if "place." in name else w for name, w in learner.weights().items()}
+    )
+    learner.load_weights(learner.weights() | {"network.place.bias": torch.tensor([0.0, 0.0, 2.0 / 3.0, 0.0])})
+    actions, _ = played(learner, env)
+    geometry = learner.policy().actor.geometry
+    planes = geometry.planes(torch.as_tensor(actions, dtype=torch.float32))
+    way = [(geometry.middles(planes)[i + 1] - geometry.middles(planes)[i])[1].item() for i in range(3)]
+    assert way == pytest.approx([2.0 + 9.0, 2.0 - 9.0, 2.0], abs=1e-3)
+    np.testing.assert_allclose(planes[:, :2], 0.0, atol=1e-3)
+
+
+def test_policy_answers_as_the_learner_does_also_exported(phantom):
+    learner, env = made(phantom)
+    learner.learn(24)
+    observations = []
+    for seed in range(3):
+        observation, _ = env.reset(seed=seed)
+        for _ in range(3):
+            observations.append(observation)
+            observation = env.step(learner.act(observation, 0.0))[0]
+    batch = batch_of(observations)
+    actions = np.array([learner.act(observation, 0.0) for observation in observations])
+    policy = learner.policy()
+    np.testing.assert_allclose(policy(batch), actions, atol=1e-6)
+    np.testing.assert_allclose(export_program(policy, batch).module()(batch), actions, atol=1e-6)
+    assert policy.differs is None
+
+
+def test_each_look_knows_its_place_in_the_episode(phantom):
+    learner, env = made(phantom)
+    observation, _ = env.reset(seed=0)
+    module = learner._module
+    assert isinstance(module, FinderModule)
+    for place in (0, 1, 2):
+        step = module.estimate(learner._tensors(batch_of([observation])))[3]
+        assert step[0].tolist() == [float(i == place) for i in range(3)]
+        observation = env.step(learner.act(observation, 0.0))[0]
+
+
+@pytest.mark.parametrize(("sure", "n_steps"), [(None, 3), ((1e9, 1e9), 1), ((1e-9, 1e-9), 3)])
+def test_learner_stops_when_it_is_sure_and_after_its_last_look(phantom, sure, n_steps):
+    sure_mm, sure_deg = sure or (None, None)
+    learner, env = made(phantom, {"ends": "on_stop", "max_steps": 10}, sure_mm=sure_mm, sure_deg=sure_deg)
+    learner.learn(12)
+    actions, terminated = played(learner, env)
+    assert terminated
+    assert len(actions) - 1 == n_steps
+    assert (actions[1:, 4] > 0).tolist() == [False] * (n_steps - 1) + [True]
+
+
+def test_expected_errors_are_right_on_average_where_they_were_calibrated(phantom):
+    learner, _ = made(phantom)
+    metrics = learner.learn(24)
+    again = learner._calibrate(seed=5)
+    factors = [learner._calibrate(seed=5)[f"calibration/factor_{unit}"] for unit in ("mm", "deg")]
+    # On the same episodes there is nothing left to scale.
+    assert factors == pytest.approx([again[f"calibration/factor_{unit}"] for unit in ("mm", "deg")], rel=1e-4)
+    assert metrics["calibration/error_mm"] > 0.0
+    assert learner.expected_error is None
+    learner.act(made(phantom)[1].reset(seed=0)[0], 0.0)
+    assert min(learner.expected_error) > 0.0
+
+
+def test_learner_learns_two_looks_and_five(phantom):
+    for offsets in ((9.0, 0.0), (9.0, -9.0, 9.0, -9.0, 0.0)):
+        n = len(offsets)
+        learner, env = made(phantom, {"stack": n, "max_steps": n}, offsets_mm=offsets, n_seen=min(n, 3))
+        learner.learn(n * 4)
+        actions, _ = played(learner, env)
+        assert len(actions) == n + 1
+
+
+@pytest.mark.parametrize(
+    ("rules", "message"),
+    [
+        ({"ends": "on_reward"}, "env.ends is 'on_reward'"),
+        ({"max_steps": 2}, "env.max_steps is 2"),
+        ({"stack": 2}, "2 are stacked .* take stack=3"),
+        ({"observation": "slice_channels"}, "no part 'shares': take obs=slice_metric"),
+        ({"stack_exclude": ["action"]}, "part 'action'"),
+    ],
+)
+def test_environments_that_do_not_fit_are_refused(phantom, rules, message):
+    with pytest.raises(InvalidValueError, match=message):
+        made(phantom, rules)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"offsets_mm": (9.0, -9.0)}, r"agent.offsets_mm is \[9.0, -9.0\], but it must be .* the last of them 0"),
+        ({"offsets_mm": (0.0,)}, "agent.offsets_mm is"),
+        ({"offsets_mm": "wide"}, "agent.offsets_mm is"),
+        ({"n_seen": 4}, "agent.n_seen is 4, but it must be at most 3"),
+        ({"sure_mm": 1.0}, "both or none"),
+        ({"filters": (2, 2)}, "agent.filters"),
+        ({"lr": 0.0}, "agent.lr"),
+        ({"num_envs": 1000}, "agent.num_envs is 1000"),
+    ],
+)
+def test_impossible_parameters_are_refused(phantom, changes, message):
+    with pytest.raises(InvalidValueError, match=message):
+        made(phantom, **changes)
+
+
+def test_other_components_weights_and_bounds_are_refused(phantom):
+    env_factory = EnvFactory(**RULES | {"projection": "zy"})
+    with pytest.raises(InvalidValueError, match="take projection=full"):
+        PlaneFinder(**SMALL).agent(setup_for(env_factory, phantom))
+    learner, _ = made(phantom)
+    with pytest.raises(CheckpointError):
+        learner.load_weights({})
+    with pytest.raises(InvalidValueError, match="give them with"):
+        learner.begin(seed=0, bounds=ActionBounds((90.0, 45.0), (50.0, 300.0)))
+
+
+def test_learner_computes_in_mixed_precision(phantom):
+    env_factory = EnvFactory(**RULES)
+    setup = setup_for(env_factory, phantom, action_names=NAMES, total_env_steps=480, compute=Compute("cpu", "bfloat16"))
+    learner = PlaneFinder(**SMALL).agent(setup)
+    assert np.isfinite(learner.learn(24)["update/loss"])
