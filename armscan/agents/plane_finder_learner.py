@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from armscan.agents.finder_parameters import FinderParameters
 from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork
 from armscan.agents.plane_geometry import PlaneGeometry
 from armscan.agents.policy import Policy, batch_of, clip_action
@@ -20,9 +21,6 @@ from armscan.envs.rules import ON_REWARD, Observed
 from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
 from armscan.errors import InvalidValueError, listed
 from armscan.volumes.plane import FloatArray
-
-if TYPE_CHECKING:
-    from armscan.agents.plane_finder import PlaneFinder
 
 # Looks led astray: spreads in mm and degrees between which each is drawn, in orders of magnitude.
 ASTRAY_MM, ASTRAY_DEG = (0.5, 6.0), (1.0, 8.0)
@@ -44,7 +42,7 @@ class PlaneFinderLearner:
         setup: environments, spaces, budget and seed of the agent.
     """
 
-    def __init__(self, finder: PlaneFinder, setup: AgentSetup) -> None:
+    def __init__(self, finder: FinderParameters, setup: AgentSetup) -> None:
         self._finder, self._seed, self._total_env_steps = finder, setup.seed, setup.total_env_steps
         self._envs = setup.make_envs(finder.num_envs)
         self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
@@ -254,7 +252,7 @@ def _teacher(envs: Any) -> ArmscanVectorEnv:
     return envs.unwrapped
 
 
-def _geometry(teacher: ArmscanVectorEnv, finder: PlaneFinder) -> PlaneGeometry:
+def _geometry(teacher: ArmscanVectorEnv, finder: FinderParameters) -> PlaneGeometry:
     """Return what planes are in these environments.
 
     Raises:

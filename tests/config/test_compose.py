@@ -30,12 +30,16 @@ def test_conf_composes_every_observation_and_reward(phantom, obs, reward):
 WHOLE = [f"agent={agent}" for agent in choices("agent")] + [f"experiment={name}" for name in choices("experiment")]
 
 
+# What an agent needs of the environment, and says so without it.
+BESIDE = {"agent=plane_finder": ["experiment=plane_finder"]}
+
+
 @pytest.mark.parametrize("override", WHOLE)
 def test_conf_composes_every_agent_and_experiment(override):
     # The phantoms are few, so that this is quick; what an experiment says of them is said before.
     # A reward that is fitted to one wrist alone would not take the labelled plane of another.
     few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1", "env.success_threshold=0.5"]
-    experiment = build_experiment(compose([override, *few]))
+    experiment = build_experiment(compose([override, *BESIDE.get(override, []), *few]))
     env = experiment.env_factory.make_env(experiment.split.test)
     observation, info = env.reset(seed=0)
     experiment.agent.begin(seed=0, bounds=env.get_wrapper_attr("scene").bounds)
