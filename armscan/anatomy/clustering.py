@@ -18,6 +18,8 @@ RunArray = NDArray[np.int32]
 # First and last column of each run, and the number of the first run of each row.
 Runs = tuple[RunArray, RunArray, IntArray]
 Pixels = NDArray[np.uint8]
+# Pixels that are looked at together where most are background: the bytes of a 64-bit integer.
+WORD = 8
 
 
 def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -> IntArray:
@@ -42,15 +44,15 @@ def count_disc_pixels(half_widths: IntArray) -> int:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _find_core(mask: Pixels, stride: int, half_widths: IntArray, min_samples: int, zero: Any) -> Pixels:
+def _find_core(mask: Pixels, stride: int, margin: int, half_widths: IntArray, min_samples: int, zero: Any) -> Pixels:
     """Return 0 or 1 for each pixel but the margins of a flat mask: whether it is a core pixel.
 
-    The mask's rows of `stride` have as many columns of margin as the disc is wide, and as many rows above and below as
-    it is high, so that no disc leaves it. `zero` is of the smallest type that holds the disc's number of pixels: small
-    types are summed many at a time.
+    The mask's rows of `stride` have at least as many columns of margin as the disc is wide, and as many rows above and
+    below as it is high, so that no disc leaves it. `zero` is of the smallest type that holds the disc's number of
+    pixels: small types are summed many at a time.
     """
     pad, reach = half_widths[0], half_widths.size - 1
-    first = reach * stride + pad
+    first = reach * stride + margin
     n_pixels = mask.size - 2 * first
     inside = mask[first : first + n_pixels]
     window = np.full(n_pixels, zero)
@@ -80,14 +82,18 @@ def _find_runs(core: Pixels, n_cols: int, are_joined: bool) -> Runs:
     starts, stops = np.empty(capacity, dtype=np.int32), np.empty(capacity, dtype=np.int32)
     first_run = np.zeros(n_rows + 1, dtype=np.int64)
     n_runs = 0
+    words = core.view(np.uint64)
     for row in range(n_rows):
         line = core[row]
-        for col in range(n_cols):
-            if line[col]:
-                if not are_joined or col == 0 or not line[col - 1]:
-                    starts[n_runs] = col
-                    n_runs += 1
-                stops[n_runs - 1] = col
+        for word in range(words.shape[1]):
+            if words[row, word] == 0:
+                continue
+            for col in range(WORD * word, WORD * word + WORD):
+                if line[col]:
+                    if not are_joined or col == 0 or not line[col - 1]:
+                        starts[n_runs] = col
+                        n_runs += 1
+                    stops[n_runs - 1] = col
         first_run[row + 1] = n_runs
     return starts[:n_runs], stops[:n_runs], first_run
 
@@ -145,62 +151,74 @@ def _reached(shape: tuple[int, int], runs: Runs, numbers: RunArray, half_widths:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _bounding_box(slice_xz: Pixels, label: int) -> tuple[int, int, int, int]:
-    """Return first row, row after the last, first column and column after the last of a label; all 0 without it."""
-    n_rows, n_cols = slice_xz.shape
-    row_first, row_stop = n_rows, 0
-    in_column = np.zeros(n_cols, dtype=np.uint8)
-    for row in range(n_rows):
-        line = slice_xz[row]
-        n_in_row = 0
-        for col in range(n_cols):
-            is_label = np.uint8(line[col] == label)
-            in_column[col] |= is_label
-            n_in_row += int(is_label)
-        if n_in_row > 0:
-            row_first = min(row_first, row)
-            row_stop = row + 1
-    if row_stop == 0:
-        return 0, 0, 0, 0
-    columns = np.flatnonzero(in_column)
-    return row_first, row_stop, columns[0], columns[-1] + 1
+def bounding_boxes(slice_xz: Pixels) -> IntArray:
+    """Return for each label its first row, row after the last, first column and column after the last, shape (256, 4).
+
+    Labels that the slice does not have are all 0. Background, label 0, is left out.
+    """
+    n_cols = slice_xz.shape[1]
+    boxes = np.zeros((256, 4), dtype=np.int64)
+    pixels = slice_xz.ravel()
+    n_words = pixels.size // WORD
+    words = pixels[: WORD * n_words].view(np.uint64)
+    # Most of a slice is background, which is passed over eight pixels at a time.
+    for word in range(n_words + 1):
+        if word < n_words and words[word] == 0:
+            continue
+        row, col = WORD * word // n_cols, WORD * word % n_cols
+        for pixel in range(WORD * word, min(pixels.size, WORD * word + WORD)):
+            if pixels[pixel]:
+                box = boxes[pixels[pixel]]
+                if box[1] == 0:
+                    box[0], box[2] = row, col
+                box[1] = row + 1
+                box[2] = min(box[2], col)
+                box[3] = max(box[3], col + 1)
+            col += 1
+            if col == n_cols:
+                row, col = row + 1, 0
+    return boxes
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _cluster(
-    slice_xz: Pixels, label: int, half_widths: IntArray, min_samples: int
-) -> tuple[int, int, Pixels, RunArray, IntArray]:
-    """Clusters a label's pixels: the first row and column of the box about them; their mask and clusters in the box.
+    slice_xz: Pixels, label: int, box: IntArray, half_widths: IntArray, min_samples: int
+) -> tuple[Pixels, RunArray, IntArray]:
+    """Clusters a label's pixels, all in the box: their mask and clusters in it.
 
     Last, for each cluster, noise at the end, the number of its pixels and the sums of their rows and columns.
     """
-    row_first, row_stop, col_first, col_stop = _bounding_box(slice_xz, label)
+    row_first, row_stop, col_first, col_stop = box
     n_rows, n_cols = row_stop - row_first, col_stop - col_first
     pad, reach = half_widths[0], half_widths.size - 1
-    # One margin between two rows serves both.
-    stride = n_cols + pad
-    flat = np.zeros((n_rows + 2 * reach) * stride + 2 * pad, dtype=np.uint8)
-    mask = flat[reach * stride + pad :][: n_rows * stride].reshape((n_rows, stride))
+    # One margin between two rows serves both. Rows and what is before them are whole words, to be passed over as such.
+    stride, margin = (n_cols + pad + WORD - 1) // WORD * WORD, (pad + WORD - 1) // WORD * WORD
+    flat = np.zeros((n_rows + 2 * reach) * stride + 2 * margin, dtype=np.uint8)
+    mask = flat[reach * stride + margin :][: n_rows * stride].reshape((n_rows, stride))
     for row in range(n_rows):
         mask[row, :n_cols] = slice_xz[row_first + row, col_first:col_stop] == label
     if count_disc_pixels(half_widths) < 2**8:
-        flat_core = _find_core(flat, stride, half_widths, min_samples, np.uint8(0))
+        flat_core = _find_core(flat, stride, margin, half_widths, min_samples, np.uint8(0))
     else:
-        flat_core = _find_core(flat, stride, half_widths, min_samples, np.uint32(0))
+        flat_core = _find_core(flat, stride, margin, half_widths, min_samples, np.uint32(0))
     core = flat_core.reshape((n_rows, stride))
     # Below an eps of one column not even the next pixel is a neighbour, and every run is a single pixel.
     runs = _find_runs(core, n_cols, pad >= 1)
     numbers, n_clusters = _number_runs(runs, half_widths)
     clusters = _reached((n_rows, n_cols), runs, numbers, half_widths, n_clusters)
     sums = np.zeros((n_clusters + 1, 3), dtype=np.int64)
+    words = mask.view(np.uint64)
     for row in range(n_rows):
-        for col in range(n_cols):
-            if mask[row, col]:
-                number = clusters[row, col]
-                sums[number, 0] += 1
-                sums[number, 1] += row_first + row
-                sums[number, 2] += col_first + col
-    return row_first, col_first, mask[:, :n_cols], clusters, sums
+        for word in range(words.shape[1]):
+            if words[row, word] == 0:
+                continue
+            for col in range(WORD * word, WORD * word + WORD):
+                if mask[row, col]:
+                    of_cluster = sums[clusters[row, col]]
+                    of_cluster[0] += 1
+                    of_cluster[1] += row_first + row
+                    of_cluster[2] += col_first + col
+    return mask[:, :n_cols], clusters, sums
 
 
 def cluster_label(
@@ -219,7 +237,11 @@ def cluster_label(
         the lowest-numbered cluster within eps; 0 for noise and background), the mean pixel coordinate of each
         cluster, shape (n_clusters, 2), and its number of pixels, shape (n_clusters,).
     """
-    first_row, first_col, mask, clusters, sums = _cluster(slice_xz, label, half_widths, min_samples)
+    # Of labels of other types than the volumes' bytes there may be any number.
+    is_label = np.ascontiguousarray(slice_xz == label).view(np.uint8)
+    box = bounding_boxes(is_label)[1]
+    mask, clusters, sums = _cluster(is_label, 1, box, half_widths, min_samples)
+    first_row, _, first_col, _ = box
     sums = sums[:-1]
     image = np.zeros(slice_xz.shape, dtype=np.int32)
     box = image[first_row:, first_col:][: mask.shape[0], : mask.shape[1]]
@@ -229,19 +251,25 @@ def cluster_label(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def summarise_label(
-    slice_xz: Pixels, label: int, half_widths: IntArray, min_samples: int, summary: NDArray[np.float64]
+    slice_xz: Pixels,
+    label: int,
+    box: IntArray,
+    half_widths: IntArray,
+    min_samples: int,
+    summary: NDArray[np.float64],
 ) -> None:
     """Clusters the pixels of a label, and keeps of it only what rewards and observations need.
 
     Args:
         slice_xz: labels, indexed [across, depth].
         label: whose pixels.
+        box: box about them, a row of `bounding_boxes`.
         half_widths: half widths of the disc of neighbours, in pixels, as in `cluster_label`.
         min_samples: neighbours that make a core pixel, as in `cluster_label`.
         summary: filled with the number of clusters, the number of pixels in them, and the mean of their centres,
             (across, depth) in pixels, 0 where there is none; shape (4,).
     """
-    sums = _cluster(slice_xz, label, half_widths, min_samples)[4][:-1]
+    sums = _cluster(slice_xz, label, box, half_widths, min_samples)[2][:-1]
     summary[:] = 0.0
     summary[0] = len(sums)
     for of_cluster in sums:

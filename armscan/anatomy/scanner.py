@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numba
 import numpy as np
 
-from armscan.anatomy.clustering import IntArray, Pixels, summarise_label
+from armscan.anatomy.clustering import WORD, IntArray, Pixels, bounding_boxes, summarise_label
 from armscan.anatomy.landmarks import Landmarks
 from armscan.anatomy.tissues import N_TISSUES, Tissues
 from armscan.volumes.plane import FloatArray
@@ -37,10 +37,11 @@ def _look(
     """Fill a slice and its summary; `half_widths` has for each volume a row a tissue, ended by -1."""
     s_x, s_y, s_z = spacings_mm[which]
     sample_plane(labels_xyz, (s_x, s_y, s_z), matrix, offset_mm, slice_xz)
+    boxes = bounding_boxes(slice_xz)
     for tissue in range(tissue_labels.size):
-        widths = half_widths[which, tissue]
+        label, widths = tissue_labels[tissue], half_widths[which, tissue]
         widths = widths[: np.sum(widths >= 0)]
-        summarise_label(slice_xz, tissue_labels[tissue], widths, min_samples[which, tissue], landmarks[tissue])
+        summarise_label(slice_xz, label, boxes[label], widths, min_samples[which, tissue], landmarks[tissue])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -130,7 +131,9 @@ class Scanner:
         """
         volumes = self._typed_volumes = self._typed_volumes or numba.typed.List([each.labels for each in self.volumes])
         shapes = [self._shapes[i] for i in which]
-        slices = np.empty((len(which), max(n_across * n_depth for n_across, n_depth in shapes)), dtype=np.uint8)
+        longest = max(n_across * n_depth for n_across, n_depth in shapes)
+        # Rows of whole words, so that each begins with one.
+        slices = np.empty((len(which), -(-longest // WORD) * WORD), dtype=np.uint8)
         landmarks = np.empty((len(which), N_TISSUES, 4))
 
         def look_from(start: int, stop: int) -> None:

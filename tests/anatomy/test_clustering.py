@@ -7,7 +7,13 @@ from hypothesis import strategies as st
 from sklearn.cluster import DBSCAN
 
 from armscan.anatomy import PIXEL_TISSUES, MetricTissue, TissueClusters
-from armscan.anatomy.clustering import cluster_label, count_disc_pixels, disc_half_widths, summarise_label
+from armscan.anatomy.clustering import (
+    bounding_boxes,
+    cluster_label,
+    count_disc_pixels,
+    disc_half_widths,
+    summarise_label,
+)
 
 
 def cluster_image_by_sklearn(slice_xz, label, eps, min_samples, pixel=(1.0, 1.0)):
@@ -51,7 +57,7 @@ def test_cluster_label_equals_sklearns_dbscan(slice_xz, eps, min_samples):
         assert size == len(points)
         np.testing.assert_allclose(centre, points.mean(axis=0))
     summary = np.full(4, np.nan)
-    summarise_label(slice_xz, 1, disc_half_widths(eps), min_samples, summary)
+    summarise_label(slice_xz, 1, bounding_boxes(slice_xz)[1], disc_half_widths(eps), min_samples, summary)
     mean_centre = centres.mean(axis=0) if len(centres) else (0.0, 0.0)
     np.testing.assert_array_equal(summary, [len(sizes), sizes.sum(), *mean_centre])
 
