@@ -61,6 +61,10 @@ class FinderParameters:
     astray_share: float = number(0.3, at_least=0.0, at_most=1.0)
     """Share of the looks in training that are led astray, by up to some mm and degrees."""
 
+    phantom_share: float | None = None
+    """Share of the episodes in training that are on phantoms, where there are other volumes beside them; None: every
+    volume is as frequent as any other."""
+
     def __post_init__(self) -> None:
         for each in fields(self):
             if "limits" in each.metadata:
@@ -76,6 +80,8 @@ class FinderParameters:
                 f"agent.offsets_mm is {list(offsets)}, but it must be 2 to {MOST_LOOKS} numbers within "
                 f"+-{MOST_OFFSET_MM:g} mm, the last of them 0"
             )
+        if self.phantom_share is not None:
+            check_float("agent.phantom_share", self.phantom_share, at_least=0.0, at_most=1.0)
         if self.n_seen > n_offsets:
             raise InvalidValueError(
                 f"agent.n_seen is {self.n_seen}, but it must be at most {n_offsets}, the looks of agent.offsets_mm"

@@ -22,6 +22,8 @@ from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
 from armscan.errors import InvalidValueError, listed
 from armscan.volumes.plane import FloatArray
 
+# What the names of phantoms begin with.
+PHANTOM = "phantom-"
 # Looks led astray: spreads in mm and degrees between which each is drawn, in orders of magnitude.
 ASTRAY_MM, ASTRAY_DEG = (0.5, 6.0), (1.0, 8.0)
 # How much larger the scales of the loss are for the first look: normal, normal, along it, across.
@@ -91,12 +93,10 @@ class PlaneFinderLearner:
         torch.manual_seed(int(for_torch.generate_state(1)[0]))
         rng = np.random.default_rng(for_draws)
         seeds = [int(word) for word in for_envs.generate_state(self._envs.num_envs)]
-        observations, _ = reset_each(self._envs, seeds)
         losses: list[Tensor] = []
         n_before, start_s = self._n_env_steps, time.perf_counter()
         while self._n_env_steps - n_before < n_env_steps:
-            if losses:
-                observations, _ = self._envs.reset(options={"reset_mask": np.ones(self._envs.num_envs, np.bool_)})
+            observations, _ = reset_each(self._envs, None if losses else seeds, self._volumes(rng))
             losses.append(self._teach(observations, rng))
             self._n_env_steps += self.env_steps_at_once
         if not is_finite(self._module):
@@ -108,6 +108,15 @@ class PlaneFinderLearner:
             "speed/updates_per_s": len(losses) / seconds,
             **self._calibrate(int(for_calibration.generate_state(1)[0])),
         }
+
+    def _volumes(self, rng: np.random.Generator) -> dict[str, Any] | None:
+        """Draw the volume of each episode where phantoms have a share of them; None leaves that to the environments."""
+        phantom_share, names = self._finder.phantom_share, _teacher(self._envs).rules.names
+        groups = [[name for name in names if name.startswith(PHANTOM) == of_phantoms] for of_phantoms in (True, False)]
+        if phantom_share is None or not all(groups):
+            return None
+        chosen = (rng.random(self._envs.num_envs) >= phantom_share).astype(int)
+        return {"volume": [groups[each][int(rng.integers(len(groups[each])))] for each in chosen]}
 
     def _teach(self, observations: Observed, rng: np.random.Generator) -> Tensor:
         """Play an episode in every environment, and take a gradient step on its looks."""

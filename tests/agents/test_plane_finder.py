@@ -14,6 +14,7 @@ from armscan.agents.torch_export import export_program
 from armscan.envs import EnvFactory, MetricSliceObservation, RandomTransform
 from armscan.envs.actions import ActionBounds
 from armscan.errors import CheckpointError, InvalidValueError
+from armscan.volumes import LabelVolume
 from tests.agents.conftest import setup_for
 
 SMALL = {"num_envs": 4, "filters": (2, 2, 2), "hidden_sizes": (16,)}
@@ -137,6 +138,22 @@ def test_expected_errors_are_right_on_average_where_they_were_calibrated(phantom
     assert min(learner.expected_error) > 0.0
 
 
+@pytest.mark.parametrize("share", [None, 0.0, 0.25, 1.0])
+def test_phantoms_have_their_share_beside_other_volumes(phantom, share):
+    wrist = LabelVolume(phantom.labels, phantom.spacing, "wrist", phantom.optimal_action)
+    envs = partial(EnvFactory(**RULES).make_vector_env, volumes=[phantom, wrist], autoreset_mode="Disabled")
+    setup = setup_for(EnvFactory(**RULES), phantom, action_names=NAMES, total_env_steps=480, make_envs=envs)
+    learner = PlaneFinder(**SMALL | {"num_envs": 40}, phantom_share=share).agent(setup)
+    drawn = learner._volumes(np.random.default_rng(0))
+    if share is None:
+        assert drawn is None
+    else:
+        assert drawn["volume"].count("phantom-0") == pytest.approx(40 * share, abs=7)
+        assert set(drawn["volume"]) <= {"phantom-0", "wrist"}
+    learner.learn(120)
+    assert learner.n_env_steps == 120
+
+
 def test_learner_learns_two_looks_and_five(phantom):
     for offsets in ((9.0, 0.0), (9.0, -9.0, 9.0, -9.0, 0.0)):
         n = len(offsets)
@@ -171,6 +188,7 @@ def test_environments_that_do_not_fit_are_refused(phantom, rules, message):
         ({"sure_mm": 1.0}, "both or none"),
         ({"filters": (2, 2)}, "agent.filters"),
         ({"lr": 0.0}, "agent.lr"),
+        ({"phantom_share": 1.5}, "agent.phantom_share is 1.5"),
         ({"num_envs": 1000}, "agent.num_envs is 1000"),
     ],
 )
