@@ -100,6 +100,9 @@ def run_tracked(
                 )
             callbacks = [progress_reporter(job_label), tracked]
             result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, earlier=earlier)
+            if result.is_solved:
+                n_taken = result.reports[-1].n_env_steps
+                tell(f"solved: stopped at {n_taken:,} of {setup.budget.env_steps:,} steps")
         tell(f"playing {setup.n_episodes} episodes on the training volumes, and as many on the test volumes")
         evaluations = final_evaluations(setup)
         if job_label is None:
