@@ -34,14 +34,15 @@ class EpochMetrics(LazyLogger):
         self._values["train/length"].extend(log_data["lens"])
 
     def log_update_data(self, log_data: dict[str, Any], step: int) -> None:
-        """Gather losses and count gradient steps, of which PPO reports many at once."""
-        self._n_updates += log_data.get("gradient_steps", 1)
+        """Gather losses and count gradient steps, of which many may be reported at once, by their means."""
+        n_updates = log_data.get("gradient_steps", 1)
+        self._n_updates += n_updates
         for theirs, ours in self.UPDATE_NAMES:
             value = log_data.get(theirs)
             if isinstance(value, dict):
                 value = value["mean"]
             if value is not None:
-                self._values[ours].append(float(value))
+                self._values[ours] += [float(value)] * n_updates
 
     def take(self) -> dict[str, float]:
         """Return what was gathered since the last call: means, the worst episode, numbers of episodes and updates."""

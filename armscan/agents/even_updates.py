@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from tianshou.algorithm.algorithm_base import OffPolicyAlgorithm, TrainingStats
+from tianshou.algorithm.algorithm_base import TrainingStats
 from tianshou.data import CollectStatsBase
 from tianshou.trainer import OffPolicyTrainer, OffPolicyTrainerParams
+
+from armscan.agents.compiled_sac import CompiledSAC
 
 
 class EvenUpdatesTrainer(OffPolicyTrainer):
@@ -21,18 +21,20 @@ class EvenUpdatesTrainer(OffPolicyTrainer):
         learning_starts: environment steps before the first collection.
     """
 
-    def __init__(
-        self, algorithm: OffPolicyAlgorithm[Any], params: OffPolicyTrainerParams, learning_starts: int
-    ) -> None:
+    def __init__(self, algorithm: CompiledSAC, params: OffPolicyTrainerParams, learning_starts: int) -> None:
         super().__init__(algorithm, params)
         self._learning_starts = learning_starts
 
     def _update_step(self, collect_stats: CollectStatsBase) -> TrainingStats:
-        """Take the gradient steps that are due since the collection before; returns the last one's figures."""
+        """Take the gradient steps that are due since the collection before; returns figures of them."""
         collector = self.params.training_collector
         n_env_steps = collector.collect_step - self._learning_starts
         n_due = self._n_due(n_env_steps) - self._n_due(n_env_steps - collect_stats.n_collected_steps)
         stats = TrainingStats()
+        if n_due and self.algorithm.why_tianshou is None:
+            stats = self.algorithm.update_repeatedly(collector.buffer, self.params.batch_size, n_due)
+            self._update_moving_avg_stats_and_log_update_data(stats)
+            return stats
         for _ in range(n_due):
             stats = self._sample_and_update(collector.buffer)
         return stats

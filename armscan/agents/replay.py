@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tianshou.data import Batch, VectorReplayBuffer
 
 Tree = dict[str, Any]
@@ -28,6 +29,20 @@ class Replay(VectorReplayBuffer):
         children = np.random.SeedSequence(seed).spawn(1 + len(self.buffers))
         for ring, child in zip((self, *self.buffers), children, strict=True):
             ring._random_state.seed(child.generate_state(1))
+
+    def sample_indices(self, batch_size: int | None) -> NDArray[np.int64]:
+        """Return indices of transitions, each as likely as any other; all in order where `batch_size` is 0.
+
+        Tianshou asks every ring for its share of them, at the cost of a fifth of a compiled update.
+        """
+        if not batch_size:
+            in_order: NDArray[np.int64] = super().sample_indices(batch_size)
+            return in_order
+        ends = np.cumsum(self._lengths)
+        drawn = self._random_state.randint(0, ends[-1], batch_size)
+        ring = np.searchsorted(ends, drawn, side="right")
+        indices: NDArray[np.int64] = drawn + (self._offset - ends + self._lengths)[ring]
+        return indices
 
     def cut_off(self) -> None:
         """Mark episodes that have not ended as truncated, because their environments are reset."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from armscan.agents.hyperparameters import (
     PolicyParameters,
@@ -89,6 +89,7 @@ class SAC(PolicyParameters):
         from tianshou.algorithm.optim import AdamOptimizerFactory
         from tianshou.trainer import OffPolicyTrainerParams
 
+        from armscan.agents.compiled_sac import CompiledSAC
         from armscan.agents.even_updates import EvenUpdatesTrainer
         from armscan.agents.image_replay import replay_for
         from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
@@ -104,7 +105,10 @@ class SAC(PolicyParameters):
             observation_space=space,
         )
         optim = AdamOptimizerFactory(lr=self.lr)
-        algorithm: sac.SAC[Any] = sac.SAC(
+        replay = replay_for(space, n_kept, self.num_envs)
+        algorithm = CompiledSAC(
+            compute=setup.compute,
+            replay=replay,
             policy=policy,
             policy_optim=optim,
             critic=critics[0],
@@ -119,7 +123,7 @@ class SAC(PolicyParameters):
             ),
         )
         params = OffPolicyTrainerParams(
-            **training_parameters(policy, envs, replay_for(space, n_kept, self.num_envs)),
+            **training_parameters(policy, envs, replay),
             collection_step_num_env_steps=n_collected,
             update_step_num_gradient_steps_per_sample=self.utd_ratio,
             batch_size=self.batch_size,

@@ -17,6 +17,7 @@ from tianshou.data import Collector, collector
 from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
 from armscan.agents.compile_cache import cache_compiled
+from armscan.agents.compiled_sac import CompiledSAC
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.hyperparameters import Parameters
 from armscan.agents.inference import Inference
@@ -89,6 +90,14 @@ class TianshouLearner:
     def env_steps_at_once(self) -> int:
         """Those of one collection."""
         return int(self._trainer.params.collection_step_num_env_steps or 0)
+
+    @property
+    def update_note(self) -> str:
+        """How gradient steps are computed: `compiled`, or `Tianshou`, with the reason where there is one."""
+        if not isinstance(self._algorithm, CompiledSAC):
+            return "Tianshou"
+        reason = self._algorithm.why_tianshou
+        return "compiled" if reason is None else f"Tianshou, because {reason}"
 
     def warm_up(self) -> None:
         """Fill the replay buffer with random steps."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from operator import methodcaller
 from pathlib import Path
@@ -99,7 +99,7 @@ def run_tracked(
                     f"(training.eval_every_env_steps = {every} is less)"
                 )
             callbacks = [progress_reporter(job_label), tracked]
-            result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, earlier=earlier)
+            result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, tell=tell, earlier=earlier)
             if result.is_solved:
                 n_taken = result.reports[-1].n_env_steps
                 tell(f"solved: stopped at {n_taken:,} of {setup.budget.env_steps:,} steps")
@@ -122,11 +122,19 @@ def run_tracked(
 
 
 def train_agent(
-    setup: Experiment, folder: Path, callbacks: Sequence[Callback], *, run_id: str, earlier: Sequence[EpochReport] = ()
+    setup: Experiment,
+    folder: Path,
+    callbacks: Sequence[Callback],
+    *,
+    run_id: str,
+    tell: Callable[[str], None],
+    earlier: Sequence[EpochReport] = (),
 ) -> TrainingResult:
-    """Train the agent of a setup, which must be a `Learner`; see `train`."""
+    """Train the agent of a setup, which must be a `Learner`, and tell how its updates are computed; see `train`."""
     agent, budget = setup.agent, setup.budget
     assert isinstance(agent, Learner)
+    if note := getattr(agent, "update_note", None):
+        tell(f"update: {note}")
     seed = VALIDATION_SEED + setup.seed
     validate = partial(evaluate, agent, setup.validation_env, n_episodes=budget.validation_episodes, seed=seed)
     return train(agent, budget, validate, folder, callbacks, provenance=setup.provenance(run_id), earlier=earlier)

@@ -122,7 +122,7 @@ def trained(config: Any, tracking: dict[str, Any] | None, before: Callable[[], N
         before()
         clock.start()
         start_s = time.perf_counter()
-        train_agent(setup, Path(folder), callbacks, run_id="measured")
+        train_agent(setup, Path(folder), callbacks, run_id="measured", tell=print)
         wall_s, threads_s = time.perf_counter() - start_s, clock.computed_s()
         calls_s = callbacks[0].calls_s if callbacks else [0.0]
         return Cost(wall_s, sum(calls_s), max(calls_s), threads_s)

@@ -124,7 +124,9 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
         attempt.opened(tracked)
         with tracked:
             try:
-                result = train_agent(setup, folder, [tracked, reporter], run_id=tracked.run_id, earlier=earlier)
+                result = train_agent(
+                    setup, folder, [tracked, reporter], run_id=tracked.run_id, tell=log, earlier=earlier
+                )
             except optuna.TrialPruned as error:
                 pruned = error
             else:

@@ -1,0 +1,75 @@
+"""The weights of a network and Adam's state as vectors, which compiled code changes in place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from armscan.agents.sac_kernels import Adam, Floats, Weights
+
+
+class AdamVectors:
+    """The weights that an optimiser moves, and its state, as vectors of which torch's tensors are views.
+
+    So whoever looks at the network or at the optimiser sees what compiled code has made of them, and the other way
+    round; both may take gradient steps in turn.
+
+    Args:
+        optimiser: Adam, with one group of parameters.
+
+    Attributes:
+        weights: the vectors.
+    """
+
+    def __init__(self, optimiser: torch.optim.Optimizer) -> None:
+        self._optimiser = optimiser
+        values = flattened(self._parameters)
+        gradient, exp_avg, exp_avg_sq = (np.zeros_like(values) for _ in range(3))
+        steps = np.zeros(len(self._parameters), np.float32)
+        self.weights = Weights(values, gradient, exp_avg, exp_avg_sq, steps)
+        self._take_over_state(optimiser)
+        # Loading puts other tensors in the place of the views.
+        optimiser.register_load_state_dict_post_hook(self._take_over_state)
+
+    def settings(self) -> Adam:
+        """Return the optimiser's settings as they are now."""
+        group: dict[str, Any] = self._optimiser.param_groups[0]
+        beta1, beta2 = group["betas"]
+        return Adam(group["lr"], beta1, beta2, group["eps"])
+
+    @property
+    def _parameters(self) -> list[nn.Parameter]:
+        return list(self._optimiser.param_groups[0]["params"])
+
+    def _take_over_state(self, optimiser: torch.optim.Optimizer) -> None:
+        """Copy the optimiser's state, which is empty before its first step, into the vectors, and link it to them."""
+        is_new = not optimiser.state
+        vectors = {"step": self.weights.steps, "exp_avg": self.weights.exp_avg, "exp_avg_sq": self.weights.exp_avg_sq}
+        for key, vector in vectors.items():
+            if is_new:
+                vector[:] = 0.0
+            else:
+                vector[:] = torch.cat([optimiser.state[each][key].reshape(-1) for each in self._parameters]).numpy()
+            views = _views(vector, self._parameters, is_scalar=key == "step")
+            for parameter, view in zip(self._parameters, views, strict=True):
+                optimiser.state[parameter][key] = view
+
+
+def flattened(parameters: list[nn.Parameter]) -> Floats:
+    """Return the values of parameters as one vector, of which they become views."""
+    vector: Floats = torch.cat([each.detach().reshape(-1) for each in parameters]).numpy()
+    for parameter, view in zip(parameters, _views(vector, parameters), strict=True):
+        parameter.data = view
+    return vector
+
+
+def _views(vector: Floats, parameters: list[nn.Parameter], *, is_scalar: bool = False) -> list[torch.Tensor]:
+    """Return the part of a vector that is of each parameter, in its shape; with `is_scalar` one number of each."""
+    tensor = torch.from_numpy(vector)
+    if is_scalar:
+        return list(tensor.unbind())
+    ends = np.cumsum([each.numel() for each in parameters])
+    return [tensor[end - each.numel() : end].view_as(each) for end, each in zip(ends, parameters, strict=True)]

@@ -1,0 +1,199 @@
+"""Tianshou's SAC with a compiled update, wherever one can be compiled."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import math
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numba.core.event import Event, Listener, install_listener
+from threadpoolctl import ThreadpoolController
+from tianshou.algorithm.modelfree import sac
+from tianshou.data import ReplayBuffer
+from tianshou.utils.net.common import Net
+from tianshou.utils.net.continuous import ContinuousActorProbabilistic, ContinuousCritic
+from torch import nn
+
+from armscan.agents import sac_kernels as kernels
+from armscan.agents.adam_vectors import AdamVectors, flattened
+from armscan.agents.compute import Compute
+from armscan.agents.replay import Replay
+from armscan.utils.log import log
+
+# Gradient steps of one call: enough that calling costs little, few enough that an interrupt is heeded soon.
+N_AT_ONCE = 16
+
+
+@dataclass(kw_only=True)
+class UpdateStats(sac.SACTrainingStats):
+    """Means over some gradient steps."""
+
+    gradient_steps: int
+    """How many there were."""
+
+
+class CompiledSAC(sac.SAC[Any]):
+    """Tianshou's SAC whose gradient steps are compiled, in place of some 9,500 Python calls each.
+
+    Batches and noise are drawn as Tianshou draws them, so that both updates agree but for rounding, and each can go on
+    from the other's state. Policy, buffer, collector, trainer and the format of the state are Tianshou's.
+
+    Args:
+        compute: device and precision of the tensors.
+        replay: replay buffer that it learns from.
+        arguments: those of Tianshou's SAC.
+
+    Attributes:
+        why_tianshou: why updates are left to Tianshou; None where they are compiled.
+    """
+
+    def __init__(self, *, compute: Compute, replay: ReplayBuffer, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        self.why_tianshou = why_tianshou(self, compute, replay)
+        if self.why_tianshou is not None:
+            return
+        optimisers: list[Any] = [self.policy_optim, self.critic_optim, self.critic2_optim]
+        self._adams = [AdamVectors(each._optim) for each in optimisers]
+        self._targets = flattened(list(self.critic_old.parameters())), flattened(list(self.critic2_old.parameters()))
+        self._entropy = AdamVectors(self.alpha._optim if isinstance(self.alpha, sac.AutoAlpha) else _fixed(self.alpha))
+        self._target_entropy = float(self.alpha._target_entropy) if isinstance(self.alpha, sac.AutoAlpha) else 0.0
+        self._sizes = [np.array(layer_sizes(network)) for network in (self.policy.actor, self.critic)]
+        actor: Any = self.policy.actor
+        self._n_free = int(actor.output_dim)
+        self._layers: tuple[kernels.Layers, kernels.Layers] | None = None
+
+    def update(self, buffer: ReplayBuffer, sample_size: int | None) -> Any:
+        """Take a gradient step; see Tianshou's."""
+        if self.why_tianshou is None and sample_size:
+            return self.update_repeatedly(buffer, sample_size, 1)
+        return super().update(buffer, sample_size)
+
+    def update_repeatedly(self, buffer: ReplayBuffer, sample_size: int, n_updates: int) -> UpdateStats:
+        """Take compiled gradient steps.
+
+        Args:
+            buffer: replay buffer.
+            sample_size: transitions of each batch.
+            n_updates: number of gradient steps, 1 or more.
+        """
+        start_s = time.perf_counter()
+        transitions = kernels.Transitions(buffer.obs, buffer.obs_next, buffer.act, buffer.rew, buffer.terminated)
+        losses = np.empty((n_updates, 5))
+        agent, (actor_layers, critic_layers) = self._agent(), self._layers_for(sample_size)
+        with _blas().limit(limits=1), install_listener("numba:compile", _CompilationNote()):
+            for start in range(0, n_updates, N_AT_ONCE):
+                part = losses[start : start + N_AT_ONCE]
+                indices = np.stack([buffer.sample_indices(sample_size) for _ in part])
+                noise = torch.empty(len(part), 2, sample_size, self._n_free)
+                for drawn in noise.flatten(0, 1):
+                    drawn.normal_()
+                kernels.update(transitions, indices, noise.numpy(), agent, actor_layers, critic_layers, part)
+        actor_loss, critic1_loss, critic2_loss, alpha_loss, alpha = losses.mean(axis=0).tolist()
+        return UpdateStats(
+            actor_loss=actor_loss,
+            critic1_loss=critic1_loss,
+            critic2_loss=critic2_loss,
+            alpha=alpha,
+            alpha_loss=alpha_loss if isinstance(self.alpha, sac.AutoAlpha) else None,
+            train_time=time.perf_counter() - start_s,
+            gradient_steps=n_updates,
+        )
+
+    def _agent(self) -> kernels.Agent:
+        actor, critic, critic2 = self._adams
+        return kernels.Agent(
+            actor.weights,
+            (critic.weights, critic2.weights),
+            self._targets,
+            (actor.settings(), critic.settings(), critic2.settings()),
+            kernels.Entropy(self._entropy.weights, self._entropy.settings(), self._target_entropy),
+            self.gamma,
+            self.tau,
+        )
+
+    def _layers_for(self, n: int) -> tuple[kernels.Layers, kernels.Layers]:
+        """Return memory for the layers of actor and critic; their gradients are never needed at once."""
+        if self._layers is None or self._layers[0].values.size != n * self._sizes[0].sum():
+            gradient = np.empty(n * max(sizes.sum() for sizes in self._sizes), np.float32)
+            actor, critic = (
+                kernels.Layers(sizes, np.empty(n * sizes.sum(), np.float32), gradient) for sizes in self._sizes
+            )
+            self._layers = actor, critic
+        return self._layers
+
+
+def why_tianshou(algorithm: sac.SAC[Any], compute: Compute, replay: ReplayBuffer) -> str | None:
+    """Return why the updates of an algorithm are left to Tianshou; None where they can be compiled."""
+    optimisers: list[Any] = [*algorithm._optimizers]
+    entropy = [algorithm.alpha._optim] if isinstance(algorithm.alpha, sac.AutoAlpha) else []
+    sizes = [layer_sizes(network) for network in (algorithm.policy.actor, algorithm.critic, algorithm.critic2)]
+    if None in sizes or sizes[1] != sizes[2] or type(algorithm.policy) is not sac.SACPolicy:
+        return "its networks are not fully connected with ReLU"
+    if type(replay) is not Replay:
+        return f"its replay buffer is {type(replay).__name__}"
+    if not compute.is_plain:
+        return f"it computes with {compute.precision} on {compute.torch_device}"
+    if compute.compile:
+        return "compute.compile=true"
+    if algorithm.n_step_return_horizon != 1:
+        return f"its returns look {algorithm.n_step_return_horizon} steps ahead"
+    is_plain = all(_is_plain(each) for each in [*entropy, *(each._optim for each in optimisers)])
+    if not is_plain or algorithm.lr_schedulers or any(each._max_grad_norm is not None for each in optimisers):
+        return "its optimisers are not plain Adam"
+    return None
+
+
+def layer_sizes(network: Any) -> list[int] | None:
+    """Return the sizes of a network's input and hidden layers; None if they are not fully connected with ReLU."""
+    if type(network) is ContinuousActorProbabilistic and network._unbounded:
+        n_heads = 2
+    elif type(network) is ContinuousCritic and not network.apply_preprocess_net_to_obs_only:
+        n_heads = 1
+    else:
+        return None
+    parts = [part for part in network.modules() if not any(True for _ in part.children())]
+    n_hidden = (len(parts) - n_heads) // 2
+    if [type(part) for part in parts] != [nn.Linear, nn.ReLU] * n_hidden + [nn.Linear] * n_heads:
+        return None
+    linear = [part for part in parts if isinstance(part, nn.Linear)]
+    is_plain = all(each.bias is not None and each.weight.dtype == torch.float32 for each in linear)
+    if type(network.preprocess) is not Net or network.preprocess.softmax or not is_plain:
+        return None
+    return [linear[0].in_features, *(each.out_features for each in linear[:-n_heads])]
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    """Return what limits the threads of BLAS: small products are fastest on one, and then the same to the bit."""
+    # Its BLAS is the one that numba calls.
+    importlib.import_module("scipy.linalg.cython_blas")
+    return ThreadpoolController().select(user_api="blas")
+
+
+class _CompilationNote(Listener):
+    """Tells when the update begins to be compiled; once it has been, numba finds it in its cache."""
+
+    def on_start(self, event: Event) -> None:
+        if event.data["dispatcher"] is kernels.update:
+            log("compiling SAC's update for this machine, which takes up to a minute; later runs find it in the cache")
+
+    def on_end(self, event: Event) -> None:
+        pass
+
+
+def _is_plain(optimiser: Any) -> bool:
+    group = optimiser.param_groups[0]
+    return type(optimiser) is torch.optim.Adam and not (
+        len(optimiser.param_groups) > 1 or group["weight_decay"] or group["amsgrad"] or group["maximize"]
+    )
+
+
+def _fixed(alpha: sac.Alpha) -> torch.optim.Adam:
+    """Return an optimiser that never moves the logarithm of a fixed coefficient."""
+    log_alpha = math.log(alpha.value) if alpha.value > 0.0 else -math.inf
+    return torch.optim.Adam([nn.Parameter(torch.tensor(log_alpha))], lr=0.0)

@@ -1,0 +1,363 @@
+"""A gradient step of SAC for fully connected networks with ReLU, compiled: BLAS for products, loops for the rest.
+
+Everything is float32 and changed in place. The weights of a network are one vector: for each layer its weights, shape
+(n_out, n_in), then its biases; a head follows the hidden layers, of an actor two: mean and logarithm of the spread.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.volumes.plane import FloatArray
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+F = np.float32
+# As Tianshou has them: bounds of the logarithm of the spread, and what keeps the logarithm of 1 - tanh(x)^2 finite.
+LOG_STD_MIN, LOG_STD_MAX, EPS = F(-20.0), F(2.0), np.finfo(np.float32).eps
+LOG_SQRT_2PI = F(0.5 * math.log(2.0 * math.pi))
+
+# Sums may be reordered, so that loops over them are vectorised. NaN stays NaN: a training that diverges must show it.
+compiled = numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"}, boundscheck=False
+)
+
+
+class Transitions(NamedTuple):
+    """All transitions of a replay buffer, the first axis of each part."""
+
+    obs: Floats
+    obs_next: Floats
+    act: Floats
+    rew: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+
+
+class Weights(NamedTuple):
+    """Weights of a network, their gradient, and Adam's state; shape (n,), `steps` (1 or more,)."""
+
+    values: Floats
+    gradient: Floats
+    exp_avg: Floats
+    exp_avg_sq: Floats
+    steps: Floats
+
+
+class Adam(NamedTuple):
+    """Settings of an optimiser."""
+
+    lr: float
+    beta1: float
+    beta2: float
+    eps: float
+
+
+class Drawn(NamedTuple):
+    """Actions that were drawn, shape (n, n_free) each, but for the logarithms of their probabilities, shape (n,)."""
+
+    log_std: Floats
+    std: Floats
+    actions: Floats
+    log_prob: Floats
+
+
+class Layers(NamedTuple):
+    """Values of a network's input and hidden layers for a batch, one layer after another, and their gradient."""
+
+    sizes: Ints
+    values: Floats
+    gradient: Floats
+
+
+class Entropy(NamedTuple):
+    """The entropy coefficient; a fixed one has a learning rate of 0."""
+
+    log_alpha: Weights
+    adam: Adam
+    target: float
+
+
+class Agent(NamedTuple):
+    """Networks and settings of SAC; the targets are the critics' lagging copies."""
+
+    actor: Weights
+    critics: tuple[Weights, Weights]
+    targets: tuple[Floats, Floats]
+    adams: tuple[Adam, Adam, Adam]
+    entropy: Entropy
+    gamma: float
+    tau: float
+
+
+@compiled
+def _layer(values: Floats, sizes: Ints, n_rows: int, which: int) -> Floats:
+    """Return a view of one layer, shape (n_rows, sizes[which])."""
+    start = n_rows * sizes[:which].sum()
+    return values[start : start + n_rows * sizes[which]].reshape(n_rows, sizes[which])
+
+
+@compiled
+def _linear(x: Floats, weights: Floats, start: int, out: Floats, is_hidden: bool) -> int:
+    """Fill a layer's values, of a hidden one after ReLU; returns where the next layer's weights start."""
+    n_out: int = out.shape[1]
+    end: int = start + n_out * x.shape[1]
+    np.dot(x, weights[start:end].reshape(n_out, x.shape[1]).T, out)
+    bias = weights[end : end + n_out]
+    for i in range(out.shape[0]):
+        for j in range(n_out):
+            value = out[i, j] + bias[j]
+            out[i, j] = F(0.0) if is_hidden and value < F(0.0) else value
+    return end + n_out
+
+
+@compiled
+def _linear_gradient(x: Floats, d_out: Floats, gradient: Floats, start: int) -> None:
+    """Fill the gradient of a layer's weights."""
+    n_out, end = d_out.shape[1], start + d_out.shape[1] * x.shape[1]
+    np.dot(d_out.T, x, gradient[start:end].reshape(n_out, x.shape[1]))
+    d_bias = gradient[end : end + n_out]
+    d_bias[:] = F(0.0)
+    for i in range(d_out.shape[0]):
+        for j in range(n_out):
+            d_bias[j] += d_out[i, j]
+
+
+@compiled
+def _input_gradient(d_out: Floats, weights: Floats, start: int, d_x: Floats) -> None:
+    """Fill the gradient of a layer's input."""
+    n_out, n_in = d_out.shape[1], d_x.shape[1]
+    np.dot(d_out, weights[start : start + n_out * n_in].reshape(n_out, n_in), d_x)
+
+
+@compiled
+def _forward(weights: Floats, layers: Layers, n_rows: int) -> int:
+    """Fill the hidden layers; returns where the weights of the first head start."""
+    start: int = 0
+    for which in range(1, layers.sizes.size):
+        out = _layer(layers.values, layers.sizes, n_rows, which)
+        start = _linear(_layer(layers.values, layers.sizes, n_rows, which - 1), weights, start, out, True)
+    return start
+
+
+@compiled
+def _backward(weights: Weights, layers: Layers, n_rows: int, start: int, of_input: bool) -> None:
+    """Fill the gradient of the input, or else of all hidden layers' weights, from that of the last layer's values."""
+    for which in range(layers.sizes.size - 1, 0, -1):
+        x = _layer(layers.values, layers.sizes, n_rows, which - 1)
+        out = _layer(layers.values, layers.sizes, n_rows, which)
+        d_out = _layer(layers.gradient, layers.sizes, n_rows, which)
+        for i in range(n_rows):
+            for j in range(out.shape[1]):
+                d_out[i, j] = F(0.0) if out[i, j] <= F(0.0) else d_out[i, j]
+        start -= out.shape[1] * (x.shape[1] + 1)
+        if not of_input:
+            _linear_gradient(x, d_out, weights.gradient, start)
+        if of_input or which > 1:
+            d_x = _layer(layers.gradient, layers.sizes, n_rows, which - 1)
+            _input_gradient(d_out, weights.values, start, d_x)
+
+
+@compiled
+def adam_step(weights: Weights, settings: Adam) -> None:
+    """Take a step of Adam, as torch's."""
+    weights.steps[:] += F(1.0)
+    n_steps = weights.steps[0]
+    step_size = F(settings.lr / (1.0 - settings.beta1**n_steps))
+    root = F(math.sqrt(1.0 - settings.beta2**n_steps))
+    share1, share2 = F(1.0 - settings.beta1), F(1.0 - settings.beta2)
+    beta2, eps = F(settings.beta2), F(settings.eps)
+    for i in range(weights.values.size):
+        gradient = weights.gradient[i]
+        exp_avg = weights.exp_avg[i] + share1 * (gradient - weights.exp_avg[i])
+        exp_avg_sq = beta2 * weights.exp_avg_sq[i] + share2 * gradient * gradient
+        weights.exp_avg[i], weights.exp_avg_sq[i] = exp_avg, exp_avg_sq
+        weights.values[i] -= step_size * exp_avg / (np.sqrt(exp_avg_sq) / root + eps)
+
+
+@compiled
+def _act(actor: Weights, layers: Layers, noise: Floats) -> Drawn:
+    """Draw an action for each observation that the first of the actor's layers holds."""
+    n, n_free = noise.shape
+    log_std, std, actions = np.empty((n, n_free), F), np.empty((n, n_free), F), np.empty((n, n_free), F)
+    log_prob = np.zeros(n, F)
+    mean_head = _forward(actor.values, layers, n)
+    features = _layer(layers.values, layers.sizes, n, layers.sizes.size - 1)
+    std_head = _linear(features, actor.values, mean_head, actions, False)
+    _linear(features, actor.values, std_head, log_std, False)
+    for i in range(n):
+        for j in range(n_free):
+            log_s = min(max(log_std[i, j], LOG_STD_MIN), LOG_STD_MAX)
+            std[i, j] = np.exp(log_s)
+            actions[i, j] = np.tanh(actions[i, j] + std[i, j] * noise[i, j])
+            log_prob[i] -= F(0.5) * noise[i, j] * noise[i, j] + log_s + LOG_SQRT_2PI
+            log_prob[i] -= np.log(F(1.0) - actions[i, j] * actions[i, j] + EPS)
+    return Drawn(log_std, std, actions, log_prob)
+
+
+@compiled
+def _judge(critic: Floats, layers: Layers, obs: Floats, actions: Floats, values: Floats) -> int:
+    """Fill a critic's values, shape (n, 1); returns where the weights of its head start."""
+    n, n_obs = obs.shape
+    x = _layer(layers.values, layers.sizes, n, 0)
+    x[:, :n_obs] = obs
+    x[:, n_obs:] = actions
+    head: int = _forward(critic, layers, n)
+    _linear(_layer(layers.values, layers.sizes, n, layers.sizes.size - 1), critic, head, values, False)
+    return head
+
+
+@compiled
+def _critic_gradient(critic: Weights, layers: Layers, head: int, d_values: Floats, of_input: bool) -> None:
+    """Fill the gradient of a critic's input, or else of its weights, from that of its values."""
+    n, last = d_values.shape[0], layers.sizes.size - 1
+    if not of_input:
+        _linear_gradient(_layer(layers.values, layers.sizes, n, last), d_values, critic.gradient, head)
+    _input_gradient(d_values, critic.values, head, _layer(layers.gradient, layers.sizes, n, last))
+    _backward(critic, layers, n, head, of_input)
+
+
+@compiled
+def _update_critic(critic: Weights, layers: Layers, adam: Adam, obs: Floats, actions: Floats, returns: Floats) -> float:
+    """Take a gradient step of a critic; returns its loss."""
+    n = returns.size
+    values, d_values = np.empty((n, 1), F), np.empty((n, 1), F)
+    head = _judge(critic.values, layers, obs, actions, values)
+    loss = 0.0
+    for i in range(n):
+        error = values[i, 0] - returns[i]
+        loss += error * error
+        d_values[i, 0] = F(2.0) * error / F(n)
+    _critic_gradient(critic, layers, head, d_values, False)
+    adam_step(critic, adam)
+    return loss / n
+
+
+@compiled
+def _update_actor(
+    agent: Agent, layers: Layers, critic_layers: Layers, noise: Floats, alpha: np.float32
+) -> tuple[float, float]:
+    """Take a gradient step of the actor; returns its loss, and the mean logarithmic probability of its actions."""
+    n, n_free = noise.shape
+    obs = _layer(layers.values, layers.sizes, n, 0)
+    drawn = _act(agent.actor, layers, noise)
+    values, d_values, d_actions = np.empty((2, n, 1), F), np.ones((n, 1), F), np.empty((2, n, n_free), F)
+    for k in range(2):
+        head = _judge(agent.critics[k].values, critic_layers, obs, drawn.actions, values[k])
+        _critic_gradient(agent.critics[k], critic_layers, head, d_values, True)
+        d_actions[k] = _layer(critic_layers.gradient, critic_layers.sizes, n, 0)[:, obs.shape[1] :]
+
+    loss = mean_log_prob = 0.0
+    d_mean, d_log_std = np.empty((n, n_free), F), np.empty((n, n_free), F)
+    for i in range(n):
+        value1, value2 = values[0, i, 0], values[1, i, 0]
+        loss += alpha * drawn.log_prob[i] - min(value1, value2)
+        mean_log_prob += drawn.log_prob[i]
+        # Only the smaller value counts; torch halves the gradient between equal ones.
+        share = F(1.0) if value1 < value2 else F(0.5) if value1 == value2 else F(0.0)
+        for j in range(n_free):
+            action, log_s = drawn.actions[i, j], drawn.log_std[i, j]
+            slope = F(1.0) - action * action
+            d_value = share * d_actions[0, i, j] + (F(1.0) - share) * d_actions[1, i, j]
+            d_mean[i, j] = (alpha * F(2.0) * action / (slope + EPS) - d_value) * slope / F(n)
+            d_log_s = d_mean[i, j] * noise[i, j] * drawn.std[i, j] - alpha / F(n)
+            d_log_std[i, j] = d_log_s if LOG_STD_MIN <= log_s <= LOG_STD_MAX else F(0.0)
+    _actor_gradient(agent.actor, layers, d_mean, d_log_std)
+    adam_step(agent.actor, agent.adams[0])
+    return loss / n, mean_log_prob / n
+
+
+@compiled
+def _actor_gradient(actor: Weights, layers: Layers, d_mean: Floats, d_log_std: Floats) -> None:
+    """Fill the gradient of an actor's weights from that of its two heads."""
+    n, n_free, last = d_mean.shape[0], d_mean.shape[1], layers.sizes.size - 1
+    features = _layer(layers.values, layers.sizes, n, last)
+    d_features, of_std = _layer(layers.gradient, layers.sizes, n, last), np.empty_like(features)
+    n_head = n_free * (features.shape[1] + 1)
+    mean_head, std_head = actor.values.size - 2 * n_head, actor.values.size - n_head
+    _linear_gradient(features, d_mean, actor.gradient, mean_head)
+    _linear_gradient(features, d_log_std, actor.gradient, std_head)
+    _input_gradient(d_mean, actor.values, mean_head, d_features)
+    _input_gradient(d_log_std, actor.values, std_head, of_std)
+    d_features += of_std
+    _backward(actor, layers, n, mean_head, False)
+
+
+@compiled
+def _update_coefficient(entropy: Entropy, mean_log_prob: float) -> float:
+    """Take a gradient step of the entropy coefficient; returns its loss."""
+    deficit = entropy.target + mean_log_prob
+    loss: float = -entropy.log_alpha.values[0] * deficit
+    entropy.log_alpha.gradient[0] = -deficit
+    adam_step(entropy.log_alpha, entropy.adam)
+    return loss
+
+
+@compiled
+def _returns(
+    transitions: Transitions,
+    index: Ints,
+    obs_next: Floats,
+    drawn: Drawn,
+    agent: Agent,
+    layers: Layers,
+    alpha: np.float32,
+) -> Floats:
+    """Return what the critics should say of a batch, by the actions that were drawn after it."""
+    values, returns = np.empty((2, index.size, 1), F), np.empty(index.size, F)
+    for k in range(2):
+        _judge(agent.targets[k], layers, obs_next, drawn.actions, values[k])
+    for i in range(index.size):
+        future = min(values[0, i, 0], values[1, i, 0]) - alpha * drawn.log_prob[i]
+        is_over = transitions.terminated[index[i]]
+        returns[i] = transitions.rew[index[i]] + (0.0 if is_over else agent.gamma * future)
+    return returns
+
+
+@compiled
+def update(
+    transitions: Transitions,
+    indices: Ints,
+    noise: Floats,
+    agent: Agent,
+    actor_layers: Layers,
+    critic_layers: Layers,
+    losses: FloatArray,
+) -> None:
+    """Take k gradient steps, each of the critics, then of the actor and the entropy coefficient; move the targets.
+
+    Args:
+        transitions: all transitions of the replay buffer.
+        indices: of the transitions of each batch, shape (k, n).
+        noise: standard normal, for the actions after the transitions and those before; shape (k, 2, n, n_free).
+        agent: networks and settings.
+        actor_layers: memory for the actor's layers.
+        critic_layers: memory for a critic's layers.
+        losses: filled with the losses of actor, critics and entropy coefficient, and the coefficient; shape (k, 5).
+    """
+    n, tau = indices.shape[1], F(agent.tau)
+    obs, actions = _layer(actor_layers.values, actor_layers.sizes, n, 0), np.empty(noise.shape[2:], F)
+    for step, index in enumerate(indices):
+        alpha = F(np.exp(agent.entropy.log_alpha.values[0]))
+        for i in range(n):
+            obs[i] = transitions.obs_next[index[i]]
+        drawn = _act(agent.actor, actor_layers, noise[step, 0])
+        returns = _returns(transitions, index, obs, drawn, agent, critic_layers, alpha)
+        for i in range(n):
+            obs[i] = transitions.obs[index[i]]
+            actions[i] = transitions.act[index[i]]
+        for k in range(2):
+            losses[step, 1 + k] = _update_critic(
+                agent.critics[k], critic_layers, agent.adams[1 + k], obs, actions, returns
+            )
+        losses[step, 0], mean_log_prob = _update_actor(agent, actor_layers, critic_layers, noise[step, 1], alpha)
+        losses[step, 3] = _update_coefficient(agent.entropy, mean_log_prob)
+        losses[step, 4] = np.exp(agent.entropy.log_alpha.values[0])
+        for k in range(2):
+            source, target = agent.critics[k].values, agent.targets[k]
+            for i in range(target.size):
+                target[i] = tau * source[i] + (F(1.0) - tau) * target[i]
