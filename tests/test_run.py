@@ -102,7 +102,7 @@ def test_run_trains_evaluates_and_tracks(tmp_path, monkeypatch):
     # Where the code is not that of its commit, beside them what differs.
     assert artifacts - {"code.diff"} == {
         *("best.pt", "last.pt", "config.yaml", "volumes.json", "environment.json"),
-        *("episode.gif", "evaluation.json", "learning_curve.png", "policy"),
+        *("episode.gif", "evaluation.json", "baselines.json", "results.html", "learning_curve.png", "policy"),
     }
     assert ("code.diff" in artifacts) == (tracked.data.tags["git.dirty"] == "true")
     assert tracked.data.tags["policy"] == "kept"
@@ -201,7 +201,8 @@ def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_pat
         assert child.info.run_name == f"{child.data.tags['choice.agent']}-cluster-zy-phantom-seed0"
         assert {"training_volumes/success_rate", "test_volumes/mean_distance_deg"} <= child.data.metrics.keys()
         artifacts = {file.path for file in client.list_artifacts(child.info.run_id)}
-        kept = {"config.yaml", "volumes.json", "environment.json", "episode.gif", "evaluation.json"}
+        kept = {"config.yaml", "volumes.json", "environment.json", "episode.gif"}
+        kept |= {"evaluation.json", "baselines.json", "results.html"}
         assert artifacts - {"code.diff"} == kept
 
 

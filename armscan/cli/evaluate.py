@@ -140,14 +140,15 @@ def evaluate(
         for file in record_video(applied, n_episodes=n_episodes, seed=seed, out=out):
             print(f"look at   {from_here(file)}")
         return
-    from rich.console import Console
-
     from armscan.evaluation.track import evaluate_and_track
-    from armscan.experiment.console import print_where_to_look
+    from armscan.experiment.console import print_table, print_where_to_look, wide_console
 
     report, file = evaluate_and_track(applied, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
-    for table in evaluation.report_tables(report):
-        Console().print(table)
+    console = wide_console()
+    for part in evaluation.report_tables(report, console.width):
+        console.print(part)
+    for label, table in report.tables().items():
+        print_table(label, table, how=label == list(report.tables())[-1])
     print_where_to_look(Path.cwd(), tracking, files=(str(file),))
 
 

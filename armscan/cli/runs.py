@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from armscan.tracking import TrackingStore
 
 STATUSES = ("finished", "failed", "killed", "running")
-SORTS = ("started", "duration", "success", "steps", "size")
+SORTS = ("started", "duration", "plane", "success", "steps", "size")
 REPRODUCTIONS = Path("reproductions")
 SELECTION = (
     click.option("--experiment", metavar="NAME", help="Only runs of this MLflow experiment."),

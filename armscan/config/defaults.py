@@ -25,8 +25,9 @@ PLAN = "--plan"
 CLUSTER = "cluster"
 # Hydra's options for several runs.
 MULTIRUN = ("-m", "--multirun")
-# What says where and how things are computed and kept, not what; and the seed, by which runs of the same thing differ.
-NOT_COMPARED = ("tracking", "device", "compute.device", "seed")
+# What says where and how things are computed, kept and told, not what; and the seed, by which runs of the same thing
+# differ.
+NOT_COMPARED = ("tracking", "device", "compute.device", "seed", "evaluation.on_plane")
 # The phantoms, where a command asks for volumes.
 PHANTOM = "phantom"
 

@@ -112,6 +112,11 @@ class Rules:
         return [self._view(*seen) for seen in zip(scenes, slices, landmarks, strict=True)]
 
     @property
+    def transform(self) -> RandomTransform | None:
+        """The motions of the volume at reset; None for none."""
+        return self._sampler.transform
+
+    @property
     def bounds(self) -> dict[str, ActionBounds]:
         """Bounds of the actions on each volume, by its name."""
         return {name: self._sampler.bounds(volume) for name, volume in self.volumes.items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -14,38 +14,23 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
-from armscan.training import Evaluation, MetricEstimates
+from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.metrics import NOT_STARTED_SOLVED
+from armscan.training.result_table import interval_text
 
 TOTAL = "all volumes"
 # What MLflow takes in the name of a metric.
 REFUSED_BY_MLFLOW = re.compile(r"[^A-Za-z0-9_\-. /:]")
-SUMMARY_ROWS = (
-    ("success rate", "success_rate", "{:.1%}"),
-    ("mean steps", "mean_steps", "{:.2f}"),
-    ("median steps", "median_steps", "{:.1f}"),
-    ("95th percentile of steps", "p95_steps", "{:.1f}"),
-    ("mean final reward", "mean_final_reward", "{:.3f}"),
-    ("mean best reward", "mean_best_reward", "{:.3f}"),
-    ("mean distance (mm)", "mean_distance_mm", "{:.1f}"),
-    ("median distance (mm)", "median_distance_mm", "{:.1f}"),
-    ("mean angle (°)", "mean_distance_deg", "{:.1f}"),
-    ("median angle (°)", "median_distance_deg", "{:.1f}"),
-    ("mean Dice, bones", "mean_dice_bones", "{:.2f}"),
-    ("mean Dice, tendons", "mean_dice_tendons", "{:.2f}"),
-    ("mean Dice, artery", "mean_dice_artery", "{:.2f}"),
-    ("time per plane (ms)", "mean_seconds_per_plane", "{:.2f}"),
+AGENT = "agent"
+# What the table of results has no room for.
+FURTHER_ROWS = (
+    ("final reward, mean", "mean_final_reward", "{:.3f}"),
+    ("best reward, mean", "mean_best_reward", "{:.3f}"),
+    ("steps, median", "median_steps", "{:.1f}"),
+    ("steps, 95th percentile", "p95_steps", "{:.1f}"),
+    ("time per plane (ms), mean", "mean_seconds_per_plane", "{:.2f}"),
 )
-COUNTS = (("volumes", "n_volumes"), ("episodes", "n_episodes"), ("started solved", "n_started_solved"))
-N_ROWS_OF_THE_OTHERS = 3
-"""Of the rows above, how many are also shown of the episodes that did not start solved."""
-VOLUME_COLUMNS = (
-    ("success", "success_rate", "{:.0%}"),
-    ("steps", "mean_steps", "{:.1f}"),
-    ("mm", "mean_distance_mm", "{:.1f}"),
-    ("°", "mean_distance_deg", "{:.1f}"),
-    ("Dice", "mean_dice", "{:.2f}"),
-)
+OF_THE_OTHERS = (("success, by reward", "success_rate", "{:.1%}"), ("steps, mean", "mean_steps", "{:.2f}"))
 
 
 @dataclass(frozen=True)
@@ -56,19 +41,39 @@ class EvaluationReport:
         evaluations: evaluations by what their volumes are called.
         has_total: whether all of them are put together too; not where some volumes were trained on and others not.
         facts: agent, data and settings of the evaluation, as plain values for the JSON file.
+        baselines: episodes of the baselines, by their names, then by what the volumes are called. Default: none.
     """
 
     evaluations: Mapping[str, Evaluation]
     has_total: bool
     facts: Mapping[str, Any]
+    baselines: Mapping[str, Mapping[str, Evaluation]] = field(default_factory=dict)
 
     @cached_property
     def by_split(self) -> dict[str, MetricEstimates]:
         """By what the volumes are called, and of all together under `all volumes`."""
-        metrics = {label: MetricEstimates.of(evaluation) for label, evaluation in self.evaluations.items()}
+        return self._by_split(self.evaluations)
+
+    @cached_property
+    def baselines_by_split(self) -> dict[str, dict[str, MetricEstimates]]:
+        """Those of the baselines, by their names, then as `by_split`."""
+        return {name: self._by_split(evaluations) for name, evaluations in self.baselines.items()}
+
+    def tables(self) -> dict[str, ResultTable]:
+        """Return the agent beside the baselines, by what the volumes are called."""
+        return {
+            label: ResultTable(
+                {AGENT: figures, **{name: each[label] for name, each in self.baselines_by_split.items()}}
+            )
+            for label, figures in self.by_split.items()
+        }
+
+    def _by_split(self, evaluations: Mapping[str, Evaluation]) -> dict[str, MetricEstimates]:
+        metrics = {label: MetricEstimates.of(evaluation) for label, evaluation in evaluations.items()}
         if self.has_total and len(metrics) > 1:
-            everything = tuple(episode for each in self.evaluations.values() for episode in each.episodes)
-            metrics[TOTAL] = MetricEstimates.of(Evaluation(everything))
+            everything = tuple(episode for each in evaluations.values() for episode in each.episodes)
+            first = next(iter(evaluations.values()))
+            metrics[TOTAL] = MetricEstimates.of(Evaluation(everything, first.on_plane))
         return metrics
 
     @cached_property
@@ -97,6 +102,14 @@ class EvaluationReport:
                 label: [asdict(episode) for episode in evaluation.episodes]
                 for label, evaluation in self.evaluations.items()
             },
+            "on_plane": [list(each) for each in next(iter(self.evaluations.values())).on_plane],
+            "baselines": {
+                name: {
+                    "splits": {label: _plain(metrics) for label, metrics in self.baselines_by_split[name].items()},
+                    "episodes": {label: list(map(asdict, each.episodes)) for label, each in evaluations.items()},
+                }
+                for name, evaluations in self.baselines.items()
+            },
         }
 
     def metrics(self) -> dict[str, dict[str, float]]:
@@ -105,56 +118,39 @@ class EvaluationReport:
         for volumes in self.by_volume.values():
             for name, metrics in volumes.items():
                 groups[f"volume/{REFUSED_BY_MLFLOW.sub('_', name)}"] = metrics.metrics()
+        for name, by_split in self.baselines_by_split.items():
+            for label, table in self.tables().items():
+                shown = [column.metric for column in table.quantities]
+                groups[f"{name}/{label}".replace(" ", "_")] = by_split[label].shown_metrics(shown)
         return groups
 
 
-def report_tables(report: EvaluationReport) -> list[Table]:
-    """Return the table of the splits, and for each of them that of its volumes."""
-    return [_summary(report.by_split), *(_by_volume(*each) for each in report.by_volume.items())]
+def report_tables(report: EvaluationReport, width: int) -> list[Table | Text]:
+    """Return what stands beside the tables of results: each volume of each group, and further figures.
+
+    Args:
+        report: the report.
+        width: width of the terminal, in characters.
+    """
+    parts: list[Table | Text] = []
+    for label, volumes in report.by_volume.items():
+        parts += [Text(f"{label}, each", style="italic"), *ResultTable(volumes).lines(width)]
+    return [*parts, _further(report.by_split)]
 
 
-def metrics_in_markdown(metrics: Mapping[str, MetricEstimates]) -> str:
-    """Return the metrics by what their volumes are called, each with its interval, as a table in Markdown."""
-    rows = [["metrics, with 95 % intervals", *metrics], ["---", *("---:" for _ in metrics)]]
-    for text, key, form in SUMMARY_ROWS:
-        cells = (_cell(_shown(each, key), form, apart=" (") for each in metrics.values())
-        rows.append([text, *(f"{cell})" if "(" in cell else cell for cell in cells)])
-    for text, count in COUNTS:
-        rows.append([text, *(str(getattr(each, count)) for each in metrics.values())])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-
-
-def _summary(metrics: Mapping[str, MetricEstimates]) -> Table:
-    table = Table(title="metrics, with 95 % intervals", title_justify="left")
+def _further(metrics: Mapping[str, MetricEstimates]) -> Table:
+    table = Table(title="further figures of the agent", title_justify="left", box=SIMPLE_HEAD)
     table.add_column("")
     for label in metrics:
         table.add_column(label, justify="right")
     apart = "\n" if len(metrics) > 1 else "  "
-    for text, key, form in SUMMARY_ROWS:
+    for text, key, form in FURTHER_ROWS:
         table.add_row(text, *(_cell(_shown(each, key), form, apart=apart) for each in metrics.values()))
-        if key == "success_rate":
-            wilson = (each.estimates["success_rate_wilson"] for each in metrics.values())
-            table.add_row("  its interval by Wilson", *(_interval(estimate, form) for estimate in wilson))
-    table.add_section()
-    for text, count in COUNTS:
-        table.add_row(text, *(str(getattr(each, count)) for each in metrics.values()))
     table.add_section()
     table.add_row("those not started solved:")
-    for text, key, form in SUMMARY_ROWS[:N_ROWS_OF_THE_OTHERS]:
+    for text, key, form in OF_THE_OTHERS:
         others = (_shown(each, key + NOT_STARTED_SOLVED) for each in metrics.values())
         table.add_row(f"  {text}", *(_cell(estimate, form, apart=apart) for estimate in others))
-    return table
-
-
-def _by_volume(label: str, volumes: Mapping[str, MetricEstimates]) -> Table:
-    table = Table(title=f"{label}, each", title_justify="left", box=SIMPLE_HEAD)
-    table.add_column("volume", overflow="fold")
-    table.add_column("n", justify="right")
-    for heading, _, _ in VOLUME_COLUMNS:
-        table.add_column(heading, justify="right")
-    for name, metrics in volumes.items():
-        cells = (_cell(metrics.estimates[key], form, apart="\n") for _, key, form in VOLUME_COLUMNS)
-        table.add_row(Text(name), str(metrics.n_episodes), *cells)
     return table
 
 
@@ -167,14 +163,7 @@ def _shown(metrics: MetricEstimates, key: str) -> Estimate:
 def _cell(estimate: Estimate, form: str, *, apart: str) -> str:
     if math.isnan(estimate.value):
         return "-"
-    return f"{form.format(estimate.value)}{apart}{_interval(estimate, form)}"
-
-
-def _interval(estimate: Estimate, form: str) -> str:
-    low, high = form.format(estimate.low), form.format(estimate.high)
-    # Of two percentages, one sign is enough; a dash between numbers below zero would be read as another minus.
-    between = " to " if estimate.low < 0 else "–"
-    return f"{low.removesuffix('%')}{between}{high}"
+    return f"{form.format(estimate.value)}{apart}{interval_text(estimate, form)}"
 
 
 def _plain(metrics: MetricEstimates) -> dict[str, Any]:

@@ -14,9 +14,9 @@ from armscan.envs import EnvFactory
 from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed
 from armscan.evaluation.agent_source import TrainedAgent
 from armscan.evaluation.volumes import TrainingVolumes, Volumes, known_volumes, own_split, volume_groups
-from armscan.experiment.build import apply_crop, make_agent, make_env_factory
+from armscan.experiment.build import apply_crop, make_agent, make_env_factory, on_plane_of
 from armscan.tracking import FoundRun
-from armscan.training import PARTS, Evaluation, Split, TrainingDomain, evaluate
+from armscan.training import PARTS, Evaluation, Split, TrainingDomain, evaluate, evaluate_baselines
 from armscan.training.domain import smallest_slice
 from armscan.training.rollout import Env
 
@@ -46,13 +46,27 @@ class PreparedAgent:
 
     def evaluate(
         self, n_episodes: int, seed: int, tell: Callable[[str], None] = lambda _: None
-    ) -> dict[str, Evaluation]:
-        """Return the episodes, `n_episodes` for each environment, in turn on its volumes; `tell` hears how it goes."""
-        evaluations = {}
+    ) -> tuple[dict[str, Evaluation], dict[str, dict[str, Evaluation]]]:
+        """Play episodes, `n_episodes` for each environment, in turn on its volumes.
+
+        Args:
+            n_episodes: number of episodes.
+            seed: seed of the first episode; the others follow from it.
+            tell: hears how it goes. Default: nobody does.
+
+        Returns:
+            The episodes by what their volumes are called, and those of each baseline by its name.
+        """
+        evaluations: dict[str, Evaluation] = {}
+        baselines: dict[str, dict[str, Evaluation]] = {}
+        on_plane = on_plane_of(self.subject.config)
         for label, env in self.envs.items():
             tell(f"playing {n_episodes} episodes on {len(env.get_wrapper_attr('volumes'))} {label}")
-            evaluations[label] = evaluate(self.agent, env, n_episodes=n_episodes, seed=FIRST_SEED + seed)
-        return evaluations
+            how = {"n_episodes": n_episodes, "seed": FIRST_SEED + seed}
+            evaluations[label] = evaluate(self.agent, env, **how, on_plane=on_plane)
+            for name, evaluation in evaluate_baselines(env, **how, on_plane=on_plane).items():
+                baselines.setdefault(name, {})[label] = evaluation
+        return evaluations, baselines
 
 
 def apply(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from collections.abc import Mapping
 from functools import partial
@@ -13,6 +14,7 @@ from armscan.errors import InvalidValueError
 from armscan.evaluation.report import EvaluationReport
 from armscan.evaluation.runner import PreparedAgent
 from armscan.evaluation.volumes import check_out, data_name, file_name
+from armscan.reports.html import page
 from armscan.tracking import EVALUATED_TAG, TrackedRun, check_artifacts, deliver_pending, open_store
 from armscan.utils.files import atomic_write
 
@@ -73,18 +75,26 @@ def evaluate_and_track(
         folder=FOLDER,
         parent_id=subject.run.run_id if subject.run else None,
     ) as tracked:
-        evaluations = applied.evaluate(n_episodes, seed, tell=partial(print, flush=True))
+        evaluations, baselines = applied.evaluate(n_episodes, seed, tell=partial(print, flush=True))
         # An agent's own training and test volumes are never merged into one total.
         report = EvaluationReport(
-            evaluations, has_total=applied.data is not None, facts={**facts, "tracked_as": tracked.run_id}
+            evaluations,
+            has_total=applied.data is not None,
+            facts={**facts, "tracked_as": tracked.run_id},
+            baselines=baselines,
         )
         for group, metrics in report.metrics().items():
             named = {f"{group}/{name}": value for name, value in metrics.items()}
             tracked.log_metrics(named, n_env_steps=subject.n_env_steps)
-        file = out or FOLDER / f"{file_name(f'{subject.name}-{data}')}-{tracked.run_id[:8]}{SUFFIX}"
+        own = FOLDER / f"{file_name(f'{subject.name}-{data}')}-{tracked.run_id[:8]}{SUFFIX}"
+        file = out or own
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, lambda opened: opened.write(text.encode()), follow_link=True)
         tracked.log_files(file)
+        tables = "".join(f"<h2>{html.escape(label)}</h2>{table.html()}" for label, table in report.tables().items())
+        shown = own.with_suffix(".html")
+        atomic_write(shown, lambda opened: opened.write(page(tracked.name, tables).encode()))
+        tracked.log_files(shown)
     return report, file
 
 

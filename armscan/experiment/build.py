@@ -15,7 +15,16 @@ from armscan.config.defaults import CLUSTER, to_plain
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError, listed
 from armscan.tracking import check_settings
-from armscan.training import Budget, CheckpointProvenance, Fingerprints, Split, TrainingDomain
+from armscan.training import (
+    ON_PLANE,
+    Budget,
+    CheckpointProvenance,
+    Fingerprints,
+    OnPlane,
+    Split,
+    TrainingDomain,
+    check_on_plane,
+)
 from armscan.training.domain import smallest_slice, with_crops
 from armscan.training.rollout import Env
 from armscan.utils.log import silence_library_warnings
@@ -25,7 +34,7 @@ from armscan.volumes import LabelVolume
 T = TypeVar("T")
 SECTIONS = ("data", "obs", "reward", "agent", "network", "tracking", "env", "training", "evaluation", "compute")
 SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
-EVALUATION_KEYS = ("episodes",)
+EVALUATION_KEYS = ("episodes", "on_plane")
 TRACKING_KEYS = ("uri", "experiment", "artifacts", "wait_s", "system_metrics_s", "policy")
 
 
@@ -39,6 +48,7 @@ class Experiment:
         agent: the agent, which may be a learner.
         budget: the training's budget.
         n_episodes: number of episodes of each final evaluation.
+        on_plane: limits within which a plane counts as the labelled one.
         seed: seed of everything that is drawn.
         smallest_slice_px: shape (across, depth) that the slices of all volumes have at least; images are cropped to it
             by default, in every split.
@@ -49,6 +59,7 @@ class Experiment:
     agent: Agent
     budget: Budget
     n_episodes: int
+    on_plane: tuple[OnPlane, ...]
     seed: int
     smallest_slice_px: tuple[int, int]
 
@@ -124,6 +135,7 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
         agent=agent,
         budget=budget,
         n_episodes=n_episodes,
+        on_plane=on_plane_of(config),
         seed=seed,
         smallest_slice_px=smallest,
     )
@@ -140,6 +152,7 @@ def check_words(config: DictConfig) -> None:
     to_plain(config)
     check_seed("seed", config.seed)
     check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
+    on_plane_of(config)
     _made(config, "training", Budget)
     _made(config, "compute", Compute)
     instantiate(config.env, _convert_="object")
@@ -152,6 +165,12 @@ def _made(config: DictConfig, section: str, kind: type[T]) -> T:
     if not isinstance(made, kind):
         raise InvalidValueError(f"{section} builds {made!r}, but it must build a {kind.__name__}")
     return made
+
+
+def on_plane_of(config: DictConfig) -> tuple[OnPlane, ...]:
+    """Return the limits within which a plane counts as the labelled one; those by default for older runs."""
+    node = config.evaluation.get("on_plane", ON_PLANE)
+    return check_on_plane("evaluation.on_plane", OmegaConf.to_container(node) if OmegaConf.is_config(node) else node)
 
 
 def apply_crop(config: DictConfig, trained_px: tuple[int, int], here_px: tuple[int, int]) -> DictConfig:

@@ -2,55 +2,88 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
+from rich.text import Text
 
 from armscan.config.command_hints import armscan_command
 from armscan.experiment.job import INTERRUPTED, JobOutcome
-from armscan.training import TEST, Evaluation
+from armscan.experiment.results import TITLES, RunResult
+from armscan.training import TEST, MetricEstimates, ResultTable
+from armscan.training.result_table import HOW, with_baselines
 
 # Of a run's id, where there is no room for all of it.
 ID_CHARS = 8
-RESULT_ROWS = (
-    ("success rate", "success_rate", "{:.1%}"),
-    ("mean steps", "mean_steps", "{:.2f}"),
-    ("mean final reward", "mean_final_reward", "{:.3f}"),
-    ("mean distance to the plane", "mean_distance_mm", "{:.1f} mm"),
-    ("mean angle to the plane", "mean_distance_deg", "{:.1f}°"),
-    ("mean Dice with its slice", "mean_dice", "{:.2f}"),
-    ("episodes", "episodes", "{:.0f}"),
-    ("... of which started solved", "episodes_started_solved", "{:.0f}"),
-    ("success rate of the others", "success_rate_not_started_solved", "{:.1%}"),
-    ("mean steps of the others", "mean_steps_not_started_solved", "{:.2f}"),
-)
+# Of what is no terminal: a log takes longer lines.
+LOG_CHARS = 160
 
 
-def print_results(title: str, evaluations: Mapping[str, Evaluation]) -> None:
-    """Print a table with a column for each evaluation, by the name of its volumes."""
-    figures = {name: evaluation.metrics() for name, evaluation in evaluations.items()}
-    table = Table(title=title, title_justify="left")
-    table.add_column("")
-    for name in figures:
-        table.add_column(name, justify="right")
-    for text, key, form in RESULT_ROWS:
-        table.add_row(text, *("-" if f[key] != f[key] else form.format(f[key]) for f in figures.values()))
-    Console().print(table)
+def print_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, how: bool = True) -> None:
+    """Print a table of results, as it fits the terminal.
+
+    Args:
+        title: line above it.
+        table: the table.
+        notes: what has to be said of it, a sentence each. Default: nothing.
+        how: whether to say how its figures are made. Default: true.
+    """
+    console = wide_console()
+    console.print(Text(title, style="italic"))
+    for part in table.show(console.width):
+        console.print(part)
+    if how and table.quantities:
+        console.print(Text(HOW, style="dim"))
+    for note in notes:
+        console.print(Text(f"note: {note}"), soft_wrap=True)
 
 
-def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -> None:
-    """Print the table of a multirun's jobs: outcomes, and MLflow run IDs, by the jobs' numbers."""
-    table = Table(title=f"jobs ({TEST})", title_justify="left")
-    for heading in ("job", "run", "overrides", "outcome", "success rate", "mean steps"):
-        table.add_column(heading)
-    for number, outcome in outcomes.items():
-        judged = outcome.metrics.get(TEST, {})
-        figures = [f"{judged['success_rate']:.1%}", f"{judged['mean_steps']:.2f}"] if judged else ["-", "-"]
-        ended = {None: "done", INTERRUPTED: INTERRUPTED}.get(outcome.failure, "failed")
-        table.add_row(number, run_ids.get(number, "-")[:ID_CHARS], outcome.varied, ended, *figures)
-    Console().print(table)
+def print_results(title: str, reached: RunResult) -> None:
+    """Print the result of a run."""
+    print_table(title, reached.table(), reached.notes())
+
+
+def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -> ResultTable:
+    """Print the table of a multirun's jobs, and return it.
+
+    Args:
+        outcomes: outcome of each job, by its number.
+        run_ids: MLflow run ID of each job that started a run, by its number.
+    """
+    table = jobs_table(outcomes, run_ids)
+    print_table(f"jobs ({TEST})", table)
+    return table
+
+
+def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -> ResultTable:
+    """Return the table of a multirun's jobs, with the baselines below them."""
+    figures = {
+        number: {name: MetricEstimates.of_metrics(metrics) for name, metrics in outcome.metrics.items()}
+        for number, outcome in outcomes.items()
+    }
+    tested = {number: each.pop(TEST, MetricEstimates.of_metrics({})) for number, each in figures.items()}
+    baselines = {
+        number: {name: of_name for name, of_name in each.items() if name not in TITLES}
+        for number, each in figures.items()
+        if each
+    }
+    results = with_baselines(tested, baselines)
+    ended = {None: "done", INTERRUPTED: INTERRUPTED}
+    facts = {
+        "run": [run_ids.get(number, "-")[:ID_CHARS] for number in outcomes],
+        "overrides": [outcome.varied for outcome in outcomes.values()],
+        "outcome": [ended.get(outcome.failure, "failed") for outcome in outcomes.values()],
+    }
+    n_baselines = len(results) - len(outcomes)
+    return ResultTable(results, {heading: [*values, *[""] * n_baselines] for heading, values in facts.items()})
+
+
+def wide_console() -> Console:
+    """Return a console as wide as the terminal; what is no terminal takes longer lines."""
+    console = Console()
+    return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=LOG_CHARS)
 
 
 def print_where_to_look(

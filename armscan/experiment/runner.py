@@ -6,11 +6,9 @@ The configuration is read only here, in `setup` and in `build`.
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from operator import methodcaller
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -21,13 +19,12 @@ from armscan.experiment.build import Experiment, check_keys, set_up
 from armscan.experiment.console import print_results, print_where_to_look
 from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
+from armscan.experiment.results import RunResult
 from armscan.tracking import TrackedRun, draw_learning_curve
 from armscan.training import (
-    TEST,
-    TRAINING,
+    VALIDATION,
     Callback,
     EpochReport,
-    Evaluation,
     TrainingResult,
     evaluate,
     record_episode,
@@ -35,18 +32,17 @@ from armscan.training import (
 )
 from armscan.training.progress import progress_reporter
 from armscan.utils.files import (
-    EVALUATION_FILE,
     LAST_CHECKPOINT,
     LEARNING_CURVE_FILE,
+    RESULTS_PAGE,
     VIDEO_FILE,
-    atomic_write,
     check_free,
     folder_lock,
     named_if_full,
 )
 
-# First seeds of the episodes that are played for each purpose, so that none is played for two.
-VALIDATION_SEED, TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED, VIDEO_SEED = 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6
+# First seeds of the episodes that are played for each purpose, so that none is played for two; see also `results`.
+VALIDATION_SEED, VIDEO_SEED = 10**6, 4 * 10**6
 
 
 def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict[str, float]]:
@@ -104,21 +100,22 @@ def run_tracked(
                 n_taken = result.reports[-1].n_env_steps
                 tell(f"solved: stopped at {n_taken:,} of {setup.budget.env_steps:,} steps")
         tell(f"playing {setup.n_episodes} episodes on the training volumes, and as many on the test volumes")
-        evaluations = final_evaluations(setup)
+        reached = RunResult.of(setup, result)
         if job_label is None:
             how = f"as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
-            print_results(f"results ({'deterministic policy, ' if result else ''}{how})", evaluations)
+            print_results(f"results ({'deterministic policy, ' if result else ''}{how})", reached)
         record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)
-        keep_results(tracked, result, evaluations, folder)
+        keep_results(tracked, result, reached, folder)
         if isinstance(setup.agent, Learner):
             # Deferred: exporting a policy loads more than training does, and is the last that a run does.
             from armscan.policies.build import save_policy
 
             save_policy(setup.agent, setup.test_env, tracked, folder, tell)
     if job_label is None:
-        print_where_to_look(folder, tracking_uri, files=(LEARNING_CURVE_FILE, VIDEO_FILE) if result else (VIDEO_FILE,))
+        files = (RESULTS_PAGE, *((LEARNING_CURVE_FILE,) if result else ()), VIDEO_FILE)
+        print_where_to_look(folder, tracking_uri, files=files)
         print(f"evaluate  {armscan_command('evaluate', tracked.run_id, '--data', 'FOLDER', tracking=tracking_uri)}")
-    return {name: evaluation.metrics() for name, evaluation in evaluations.items()}
+    return reached.metrics()
 
 
 def train_agent(
@@ -136,46 +133,37 @@ def train_agent(
     if note := getattr(agent, "update_note", None):
         tell(f"update: {note}")
     seed = VALIDATION_SEED + setup.seed
-    validate = partial(evaluate, agent, setup.validation_env, n_episodes=budget.validation_episodes, seed=seed)
+    validate = partial(
+        evaluate,
+        agent,
+        setup.validation_env,
+        n_episodes=budget.validation_episodes,
+        seed=seed,
+        on_plane=setup.on_plane,
+    )
     return train(agent, budget, validate, folder, callbacks, provenance=setup.provenance(run_id), earlier=earlier)
 
 
-def final_evaluations(setup: Experiment) -> dict[str, Evaluation]:
-    """Return the final evaluations of a setup's agent, on the training and on the test volumes, by their names."""
-    agent, n_episodes, seed = setup.agent, setup.n_episodes, setup.seed
-    return {
-        TRAINING: evaluate(agent, setup.training_env, n_episodes=n_episodes, seed=TRAINING_VOLUMES_SEED + seed),
-        TEST: evaluate(agent, setup.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED + seed),
-    }
-
-
-def keep_results(
-    tracked: TrackedRun, result: TrainingResult | None, evaluations: Mapping[str, Evaluation], folder: Path
-) -> None:
-    """Log the final evaluations, and keep what the run has made in its folder.
+def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: RunResult, folder: Path) -> None:
+    """Log the final figures, and keep what the run has made in its folder.
 
     Args:
         tracked: the run.
-        result: the training's; evaluations are logged at its best epoch, whose weights they judge. None where there was
+        result: the training's; figures are logged at its best epoch, whose weights they judge. None where there was
             nothing to learn.
-        evaluations: evaluations by the name of their volumes.
-        folder: the run's folder; the learning curve's picture and the evaluations' figures are added to it.
+        reached: the final evaluations, and the baselines.
+        folder: the run's folder; the learning curve's picture, the episodes and the table are added to it.
     """
-    for name, evaluation in evaluations.items():
-        prefix = name.replace(" ", "_").replace("-", "_")
-        figures = {f"{prefix}/{figure}": value for figure, value in evaluation.metrics().items()}
-        tracked.log_metrics(figures, n_env_steps=result.best.n_env_steps if result else 0)
+    for name, metrics in reached.metrics().items():
+        figures = {f"{name.replace(' ', '_')}/{figure}": value for figure, value in metrics.items()}
+        # The last validation is logged by the training.
+        if name != VALIDATION:
+            tracked.log_metrics(figures, n_env_steps=result.best.n_env_steps if result else 0)
     if result:
         tracked.log_metrics({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
         draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
-    write_evaluations(evaluations, folder)
+    reached.write(folder, title=tracked.name)
     tracked.log_results(folder)
-
-
-def write_evaluations(evaluations: Mapping[str, Evaluation], folder: Path) -> None:
-    """Write evaluations with all their episodes into a run's folder, by the name of their volumes."""
-    contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
-    atomic_write(folder / EVALUATION_FILE, methodcaller("write", json.dumps(contents, indent=1).encode()))
 
 
 @contextlib.contextmanager

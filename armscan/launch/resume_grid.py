@@ -14,10 +14,10 @@ from armscan.config.defaults import to_plain
 from armscan.experiment.build import check_keys, set_up
 from armscan.experiment.job import JOB_TAG, Invocation, Job
 from armscan.experiment.provenance import provenance_files, sha256_tags
+from armscan.experiment.results import LAST_VALIDATION, figures_of
 from armscan.experiment.resume import resume_run
 from armscan.experiment.runner import run_experiment
 from armscan.tracking import TrackingStore, open_store
-from armscan.training import TEST, TRAINING
 from armscan.utils.files import LAST_CHECKPOINT
 
 if TYPE_CHECKING:
@@ -55,8 +55,6 @@ def _adopt(client: TrackingStore, run: Run, job: Job) -> None:
 
 
 def _metrics_of(run: Run) -> Metrics:
-    prefixes = {name: f"{name.replace(' ', '_')}/" for name in (TRAINING, TEST)}
     return {
-        name: {key.removeprefix(prefix): value for key, value in run.data.metrics.items() if key.startswith(prefix)}
-        for name, prefix in prefixes.items()
+        name: figures.metrics() for name, figures in figures_of(run.data.metrics).items() if name != LAST_VALIDATION
     }

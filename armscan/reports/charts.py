@@ -15,6 +15,7 @@ from plotly.subplots import make_subplots
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
 from armscan.training import MetricEstimates
+from armscan.training.on_plane import PREFIX
 from armscan.volumes.plane import FloatArray
 
 # By figure, axis and number of the group.
@@ -31,7 +32,8 @@ BANDS, SEEDS = "band", "seed"
 # What is shown beside the thick lines, by the button.
 SHOWN = {"bands and seeds": (BANDS, SEEDS), "bands": (BANDS,), "neither": ()}
 LABEL_CHARS = 38
-FINAL = {"success_rate": "success rate", "mean_steps": "mean steps", "mean_distance_mm": "mean distance (mm)"}
+# Beside the leading rate.
+FINAL = {"median_distance_mm": "distance (mm), median", "mean_steps": "steps, mean"}
 Points = dict[str, list[Any]]
 
 
@@ -56,6 +58,11 @@ def colours(n: int) -> list[str]:
     return [str(palette[number % len(palette)]) for number in range(n)]
 
 
+def is_rate(name: str) -> bool:
+    """Return whether a metric is a share of episodes."""
+    return "success_rate" in name or PREFIX in name
+
+
 def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str, str]) -> Figure:
     """Return the figures of `titles` below each other, with switches for the axis and for the lines of single seeds."""
     entry_px = SAMPLE_PX + LETTER_PX * max(len(group.label) for group in groups)
@@ -71,7 +78,7 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
                     **trace.look, **trace.over[0], name=group.label, legendgroup=str(number), row=row, col=1
                 )
                 traces.append(trace)
-        figure.update_yaxes(title=title, row=row, col=1, **(RATE_AXIS if "success_rate" in name else {}))
+        figure.update_yaxes(title=title, row=row, col=1, **(RATE_AXIS if is_rate(name) else {}))
     named: set[str] = set()
     for drawn, trace in zip(figure.data, traces, strict=True):
         # One line of each group stands in the legend.
@@ -98,14 +105,17 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
 
 def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Figure:
     """Return what each group has reached at the end, with its interval, and beside it what single seeds have."""
-    figure = make_subplots(rows=1, cols=len(FINAL), shared_yaxes=True, horizontal_spacing=0.04)
-    for column, (name, title) in enumerate(FINAL.items(), start=1):
+    limits = next(figures.on_plane[0] for figures in reached if figures is not None)
+    titles = {limits.metric: limits.title, **FINAL}
+    figure = make_subplots(rows=1, cols=len(titles), shared_yaxes=True, horizontal_spacing=0.04)
+    for column, (name, title) in enumerate(titles.items(), start=1):
         here = {"mode": "markers", "showlegend": False, "row": 1, "col": column}
         for group, colour, figures in zip(groups, colours(len(groups)), reached, strict=True):
-            if figures is None:
+            if figures is None or name not in figures.estimates:
                 continue
-            value, low, high = figures.estimates[name]
-            seeds = {each.label: each.evaluation.metrics()[name] for each in group.trainings if each.evaluation}
+            value, low, high = figures.estimate(name)
+            metrics = {each.label: each.evaluation.metrics() for each in group.trainings if each.evaluation}
+            seeds = {label: of_seed[name] for label, of_seed in metrics.items() if name in of_seed}
             figure.add_scatter(
                 x=list(seeds.values()),
                 y=[_wrapped(group.label)] * len(seeds),
@@ -122,7 +132,7 @@ def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
                 marker={"color": colour, "size": 11, "symbol": "diamond"},
                 **here,
             )
-        figure.update_xaxes(title=title, row=1, col=column, **(RATE_AXIS if "success_rate" in name else {}))
+        figure.update_xaxes(title=title, row=1, col=column, **(RATE_AXIS if is_rate(name) else {}))
     figure.update_yaxes(autorange="reversed", automargin=True)
     height = AROUND_PX + GROUP_PX * len(groups)
     return figure.update_layout(height=height, margin={"t": 20, "b": 50, "l": 10, "r": 20}, template="plotly_white")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from armscan.reports.charts import MANY, Curves, final_chart, learning_curves
 from armscan.reports.csv_tables import all_numbers, run_rows
@@ -17,6 +16,7 @@ from armscan.reports.notes import notes_on
 from armscan.reports.significance import (
     COMPARED_BY,
     Pair,
+    baseline_metrics,
     compare_groups,
     complement,
     evaluated_trainings,
@@ -25,29 +25,21 @@ from armscan.reports.significance import (
 from armscan.reports.videos import videos
 from armscan.stats.aggregation import FEWEST_SEEDS
 from armscan.stats.bootstrap import Estimate
-from armscan.training import MetricEstimates
+from armscan.training import MetricEstimates, ResultTable
+from armscan.training.result_table import with_baselines
 
-SHOWN = {
-    "success rate": ("success_rate", "{:.1%}"),
-    "mean steps": ("mean_steps", "{:.2f}"),
-    "distance (mm)": ("mean_distance_mm", "{:.1f}"),
-    "angle (°)": ("mean_distance_deg", "{:.1f}"),
-    "Dice": ("mean_dice", "{:.2f}"),
-}
 # A chart drawn while hidden has no width.
 FITTED = "this.querySelectorAll('.js-plotly-plot').forEach((chart) => Plotly.Plots.resize(chart))"
 HOW_CURVES = (
-    "On the validation volumes, after each epoch. Thick: the seeds of a group together, their interquartile mean (of "
-    "success rates the mean; of fewer than four seeds both are the mean). Band: its 95 % interval by a bootstrap of "
-    "the seeds; a group of one seed has none. Thin: each seed. A training that ran to its end before others of its "
-    "group is carried on with its last value; where one was cut off or is still running, the curve of its group ends. "
+    "On the validation volumes, after each epoch. Thick: the mean of the seeds of a group. Band: its 95 % interval by "
+    "a bootstrap of the seeds; a group of one seed has none. Thin: each seed. A training that ran to its end before "
+    "others of its group is carried on with its last value; where one was cut off or is still running, the curve of "
+    "its group ends. "
     "Seconds are wall time of training and validation, on the machine of the run."
 )
 HOW_FINAL = (
-    "The final evaluation, with the weights of the best epoch, on test volumes that had no part in anything before: "
-    "means over all episodes of all seeds, and 95 % intervals that draw seeds, then volumes, then episodes. Where all "
-    "episodes went alike, as at a success rate of 100 %, such an interval has no width; Wilson's, which takes episodes "
-    "as independent, stands in its place. In the chart diamonds are these means, dots the seeds."
+    "The final evaluation, with the weights of the best epoch, on test volumes that had no part in anything before, "
+    "over all episodes of all seeds, beside the baselines. In the chart diamonds are these figures, dots the seeds."
 )
 HOW_BETTER = (
     "How likely a training of the row's group is better than one of the column's group: the share of pairs of seeds, "
@@ -82,7 +74,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     pairs = {figure: list(compare_groups(groups, figure)) for figure in COMPARED_BY}
     parts = [
         _summary(groups),
-        notes_on(groups, left_out, has_other_volumes=any(each.probability is None for each in pairs["mean_steps"])),
+        notes_on(groups, left_out, has_other_volumes=any(each.probability is None for each in pairs["on_plane_rate"])),
         *_learning(groups, curves),
         *_final(groups, reached),
         *_better(groups, pairs),
@@ -131,23 +123,21 @@ def _final(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -
     if not any(reached):
         yield "<p>None of these runs has kept a final evaluation.</p>"
         return
-    rows = [_final_row(group, figures) for group, figures in zip(groups, reached, strict=True)]
-    yield f"<p>{HOW_FINAL}</p>{table(rows)}{chart(final_chart(groups, reached))}"
+    yield f"<p>{HOW_FINAL}</p>{final_table(groups, reached).html()}{chart(final_chart(groups, reached))}"
 
 
-def _final_row(group: Group, figures: MetricEstimates | None) -> dict[str, Any]:
-    cost = {
-        "training, s": _span([training.wall_s for training in group.trainings]),
-        "environment steps": _span([training.env_steps for training in group.trainings]),
+def final_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> ResultTable:
+    """Return the table of what groups have reached, with what it took, and of the baselines."""
+    nothing = MetricEstimates.of_metrics({})
+    figures = {group.title: each or nothing for group, each in zip(groups, reached, strict=True)}
+    baselines = {group.title: baseline_metrics(group) for group in groups if evaluated_trainings(group)}
+    results = with_baselines(figures, baselines)
+    costs = {
+        "training, s": [_span([training.wall_s for training in group.trainings]) for group in groups],
+        "environment steps": [_span([training.env_steps for training in group.trainings]) for group in groups],
     }
-    if figures is None:
-        return {"group": group.title, **cost}
-    shown = {title: _text(figures.estimates[name], form) for title, (name, form) in SHOWN.items()}
-    success = figures.estimates["success_rate"]
-    if success.low == success.high:
-        shown["success rate"] = _text(figures.estimates["success_rate_wilson"], "{:.1%}")
-    counts = f"{len(evaluated_trainings(group))}, {figures.n_volumes}, {figures.n_episodes}"
-    return {"group": group.title, **shown, "seeds, volumes, episodes": counts, **cost}
+    n_baselines = len(results) - len(groups)
+    return ResultTable(results, {heading: [*texts, *[""] * n_baselines] for heading, texts in costs.items()})
 
 
 def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[str]:
@@ -200,16 +190,10 @@ def _cell(probability: Estimate | None, *, is_few: bool, is_sure: bool) -> Marku
     return Markup(f'<div style="background: {shade}" title="{ends}">{shown}{below}</div>')
 
 
-def _text(estimate: Estimate, form: str) -> Markup:
-    value, low, high = (form.format(number) for number in estimate)
-    return Markup(f"{value}<br><small>{low} to {high}</small>")
-
-
 def _span(values: Sequence[float]) -> str:
     """Return the mean of what is known, with the lowest and the highest where they differ."""
     known = [value for value in values if not math.isnan(value)]
     if not known:
         return "–"
     low, high, mean = min(known), max(known), sum(known) / len(known)
-    ends = f"<br><small>{low:,.0f} to {high:,.0f}</small>" if high > low else ""
-    return Markup(f"{mean:,.0f}{ends}")
+    return f"{mean:,.0f}" + (f" ({low:,.0f}–{high:,.0f})" if high > low else "")

@@ -9,7 +9,7 @@ import numpy as np
 
 from armscan.reports.groups import Group
 from armscan.reports.load import Series, TrackedTraining
-from armscan.stats.aggregation import Band, band_over_seeds, mean_for
+from armscan.stats.aggregation import Band, band_over_seeds
 from armscan.volumes.plane import FloatArray
 
 # What curves are drawn over, and how a series says it.
@@ -55,7 +55,7 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
         return None
     places = _places(known)
     scores = np.array([np.interp(places, *line) for _, line in known])
-    band = band_over_seeds(scores, mean_for(figure))
+    band = band_over_seeds(scores, np.mean)
     return Curve(places, band, len(known), {training.label: line for training, line in known})
 
 

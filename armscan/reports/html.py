@@ -16,13 +16,17 @@ from armscan.errors import InvalidValueError
 
 REPORT_FILE = "report.html"
 PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="generator" content="armscan"><title>{title}</title>
+<html lang="en"><head><meta charset="utf-8"><meta name="generator" content="armscan">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>
 <style>
-body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2rem auto; padding: 0 1rem; }}
+body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1160px; margin: 2rem auto; padding: 0 1rem; }}
 table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
 .chart {{ overflow-x: auto; }}
 td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; }}
 td small {{ color: #555; white-space: nowrap; }}
+.results td, .results th {{ padding: .2rem .4rem; font-size: 13px; vertical-align: top; }}
+.results td {{ text-align: right; white-space: nowrap; }}
+.results td:first-child {{ text-align: left; white-space: normal; min-width: 7rem; }}
 summary {{ cursor: pointer; font-weight: bold; margin: 1.5rem 0; }}
 .matrices {{ display: flex; flex-wrap: wrap; gap: 0 2rem; }}
 .matrices > div {{ max-width: 100%; }}
@@ -31,7 +35,7 @@ summary {{ cursor: pointer; font-weight: bold; margin: 1.5rem 0; }}
 .videos {{ display: flex; flex-wrap: wrap; gap: 1rem; }}
 .videos figure {{ margin: 0; flex: 1 1 20rem; max-width: 34rem; }}
 .videos img {{ width: 100%; }}
-</style><script>{plotly}</script></head><body><h1>{title}</h1>
+</style><script>{script}</script></head><body><h1>{title}</h1>
 {body}
 </body></html>
 """
@@ -74,8 +78,19 @@ def write_page(folder: Path, title: str, parts: Sequence[str], tables: Mapping[s
     links = "".join(f'<li><a href="{each}.csv">{each}.csv</a></li>' for each in tables)
     body = "\n".join([*parts, f"<h2>Numbers</h2><ul>{links}</ul>"])
     file = folder / REPORT_FILE
-    file.write_text(PAGE.format(title=html.escape(title), plotly=get_plotlyjs(), body=body))
+    file.write_text(page(title, body, script=get_plotlyjs()))
     return file
+
+
+def page(title: str, body: str, *, script: str = "") -> str:
+    """Return a page that needs no server.
+
+    Args:
+        title: title and first heading.
+        body: pieces of HTML.
+        script: JavaScript of the page. Default: none.
+    """
+    return PAGE.format(title=html.escape(title), script=script, body=body)
 
 
 def _is_report(file: Path) -> bool:

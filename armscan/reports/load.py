@@ -16,15 +16,16 @@ from armscan.errors import TrackingError
 from armscan.reports.select import ID_CHARS, SelectedRuns
 from armscan.tracking import TrackingStore
 from armscan.tracking.store import store_errors
-from armscan.training import TEST, Evaluation
-from armscan.utils.files import EVALUATION_FILE, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE, sha256
+from armscan.training import ON_PLANE, TEST, Evaluation
+from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE, sha256
 from armscan.volumes.plane import FloatArray
 
 WALL = "wall_s"
 VALIDATION = {
-    "validation/success_rate": "success rate",
-    "validation/mean_steps": "mean steps",
-    "validation/mean_return": "mean return",
+    f"validation/{ON_PLANE[0].metric}": ON_PLANE[0].title,
+    "validation/success_rate": "success, by reward",
+    "validation/mean_steps": "steps, mean",
+    "validation/mean_return": "return, mean",
 }
 # The beginnings of what else is drawn.
 OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
@@ -62,6 +63,7 @@ class TrackedTraining:
         choices: what was chosen of each group of the configuration.
         series: its curves by the name of the figure.
         evaluation: final evaluation on the test volumes, None where it has kept none.
+        baselines: episodes of the baselines there, by their names. Default: none, as of older runs.
         volumes: fingerprints of its test volumes by name, None where it has kept none.
         video: an episode as an animated GIF, None where it has kept none.
     """
@@ -75,6 +77,7 @@ class TrackedTraining:
     choices: Mapping[str, str]
     series: Mapping[str, Series] = field(repr=False)
     evaluation: Evaluation | None = field(repr=False)
+    baselines: Mapping[str, Evaluation] = field(default_factory=dict, repr=False)
     volumes: Mapping[str, str] | None = field(repr=False)
     video: bytes | None = field(repr=False)
 
@@ -130,7 +133,10 @@ def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> Tr
     with store_errors(store.uri):
         series = _series(store, run)
         files = _files(store, run, folder)
-    evaluation = _parsed(run, files, EVALUATION_FILE, lambda contents: Evaluation.of_plain(contents[TEST]["episodes"]))
+    evaluation = _parsed(run, files, EVALUATION_FILE, lambda contents: Evaluation.of_dict(contents[TEST]))
+    baselines = _parsed(
+        run, files, BASELINES_FILE, lambda contents: {name: Evaluation.of_dict(each) for name, each in contents.items()}
+    )
     params = migrate(run.data.params)
     n_env_steps = max((each.env_steps[-1] for name, each in series.items() if name in VALIDATION), default=0.0)
     is_cut = found.is_pruned and n_env_steps < float(params.get(BUDGET, "inf"))
@@ -144,6 +150,7 @@ def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> Tr
         choices={tag.removeprefix(CHOICE): value for tag, value in sorted(tags.items()) if tag.startswith(CHOICE)},
         series=series,
         evaluation=evaluation if evaluation and evaluation.episodes else None,
+        baselines=baselines or {},
         volumes=_parsed(run, files, VOLUMES_FILE, lambda contents: dict(contents["test"])),
         video=files.get(VIDEO_FILE),
     )
@@ -169,7 +176,7 @@ def _files(store: TrackingStore, run: Run, folder: Path) -> dict[str, bytes]:
     names = {artifact.path for artifact in store.list_artifacts(run.info.run_id)}
     return {
         name: Path(store.download_artifacts(run.info.run_id, name, str(folder))).read_bytes()
-        for name in names & {EVALUATION_FILE, VIDEO_FILE, VOLUMES_FILE}
+        for name in names & {EVALUATION_FILE, BASELINES_FILE, VIDEO_FILE, VOLUMES_FILE}
     }
 
 
@@ -182,5 +189,5 @@ def _parsed(run: Run, files: Mapping[str, bytes], name: str, read: Callable[[Any
         raise damaged
     try:
         return read(json.loads(contents))
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise damaged from error

@@ -12,11 +12,12 @@ from armscan.reports.groups import Group
 from armscan.reports.load import TrackedTraining
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
-from armscan.training import Evaluation, MetricEstimates
+from armscan.training import MetricEstimates
 from armscan.volumes.plane import FloatArray
 
-# Metrics of `Evaluation.metrics` that groups are compared by; true where higher is better.
-COMPARED_BY = {"mean_steps": False, "success_rate": True, "mean_distance_mm": False}
+# Rate of the leading limits, and metrics of `Evaluation.metrics`, that groups are compared by; true where higher is
+# better.
+COMPARED_BY = {"on_plane_rate": True, "median_distance_mm": False, "success_rate": True, "mean_steps": False}
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,8 @@ def evaluated_trainings(group: Group) -> list[TrackedTraining]:
 
 def final_metrics(group: Group) -> MetricEstimates | None:
     """Return the final metrics of a group, with intervals over seeds, volumes and episodes; None if not evaluated."""
-    played = [(each.run_id, each.evaluation.episodes) for each in group.trainings if each.evaluation is not None]
-    if not played:
-        return None
-    of_runs, of_all = zip(*((run_id, episode) for run_id, episodes in played for episode in episodes), strict=True)
-    return MetricEstimates.of(Evaluation(of_all), of_runs)
+    played = {each.run_id: each.evaluation for each in group.trainings if each.evaluation is not None}
+    return MetricEstimates.of_trainings(played) if played else None
 
 
 def compare_groups(groups: Sequence[Group], figure: str) -> Iterator[Pair]:
@@ -77,11 +75,25 @@ def metrics_by_volume(training: TrackedTraining) -> dict[str, dict[str, float]]:
     return {name: each.metrics() for name, each in sorted(training.evaluation.by_volume().items())}
 
 
+def baseline_metrics(group: Group) -> dict[str, MetricEstimates]:
+    """Return the metrics of the baselines on the test volumes of a group, by their names; its trainings have the same.
+
+    The baselines are not trained, and play the same episodes for every seed.
+    """
+    kept = next((training.baselines for training in group.trainings if training.baselines), {})
+    return {name: MetricEstimates.of(evaluation) for name, evaluation in kept.items()}
+
+
 def _scores(group: Group, figure: str) -> FloatArray:
     """Return a metric of the group's trainings, shape (seeds, volumes), on the volumes that all of them share."""
-    rows = [metrics_by_volume(training) for training in evaluated_trainings(group)]
+    rows = [_compared(training) for training in evaluated_trainings(group)]
     common = sorted(set.intersection(*(set(row) for row in rows))) if rows else []
     return np.array([[row[volume][figure] for volume in common] for row in rows])
+
+
+def _compared(training: TrackedTraining) -> dict[str, dict[str, float]]:
+    by_volume = training.evaluation.by_volume() if training.evaluation else {}
+    return {name: each.metrics() | {"on_plane_rate": each.on_plane_rate} for name, each in by_volume.items()}
 
 
 def _volumes(group: Group) -> Mapping[str, str | None] | None:

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from armscan.config.command_hints import armscan_command
 from armscan.errors import TrackingError
 from armscan.evaluation import EvaluationReport
-from armscan.evaluation.report import REFUSED_BY_MLFLOW, metrics_in_markdown
+from armscan.evaluation.report import REFUSED_BY_MLFLOW
 from armscan.tracking import EVALUATED_TAG, FoundRun
-from armscan.training import Evaluation
-from armscan.utils.files import EVALUATION_FILE
+from armscan.training import ON_PLANE, TEST, Evaluation, ResultTable
+from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE
 
 # What MLflow's databases take of a description.
 MAX_CHARS = 5000
 OWN_VOLUMES = "own volumes"
-TAGGED = ("success_rate", "mean_steps", "mean_distance_mm", "mean_distance_deg", "mean_dice")
+TAGGED = (
+    *("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps"),
+    *("mean_distance_mm", "mean_distance_deg", "mean_dice"),
+)
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ class Card:
             text += f"\n\nNothing is known of how good it is: `{command}` says it."
         tags: dict[str, str] = {}
         for title, report in reports.items():
-            section = f"\n\n### {title}\n\n{metrics_in_markdown(report.by_split)}"
+            section = f"\n\n### {title}\n\n{_table(report).markdown()}"
             # Where there is no room for both, the run's own evaluation stays.
             if len(text + section) <= MAX_CHARS:
                 text += section
@@ -87,19 +91,53 @@ def _latest(run: FoundRun) -> tuple[str, str] | None:
 
 def _read(run: FoundRun, run_id: str, file: str, folder: Path) -> EvaluationReport:
     """Return the evaluation in an artifact, of the run itself or of one by `armscan evaluate`."""
-    text = Path(run.client.download_artifacts(run_id, file, str(folder))).read_bytes()
+    contents = _json(run, run_id, file, folder)
     try:
-        contents = json.loads(text)
-        if run_id == run.run_id:
-            contents = {"episodes": {label: each["episodes"] for label, each in contents.items()}}
         facts = {key: contents[key] for key in ("data", "changes") if run_id != run.run_id}
-        evaluations = {label: Evaluation.of_plain(some) for label, some in contents["episodes"].items()}
+        if run_id == run.run_id:
+            evaluations = {label: Evaluation.of_dict(each) for label, each in contents.items()}
+            baselines = _own_baselines(run, folder)
+        else:
+            limits = contents.get("on_plane", ON_PLANE)
+            evaluations = _evaluations(contents["episodes"], limits)
+            kept = contents.get("baselines", {})
+            baselines = {name: _evaluations(each["episodes"], limits) for name, each in kept.items()}
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise _damaged(run_id, file) from error
     is_read = not facts or (isinstance(facts["data"], str) and isinstance(facts["changes"], dict))
-    if not (is_read and evaluations and all(evaluation.episodes for evaluation in evaluations.values())):
+    played = [*evaluations.values(), *(each for by_label in baselines.values() for each in by_label.values())]
+    if not (is_read and evaluations and all(evaluation.episodes for evaluation in played)):
         raise _damaged(run_id, file)
-    return EvaluationReport(evaluations, has_total=facts.get("data", OWN_VOLUMES) != OWN_VOLUMES, facts=facts)
+    has_total = facts.get("data", OWN_VOLUMES) != OWN_VOLUMES
+    return EvaluationReport(evaluations, has_total=has_total, facts=facts, baselines=baselines)
+
+
+def _own_baselines(run: FoundRun, folder: Path) -> dict[str, dict[str, Evaluation]]:
+    """Return the baselines that a run has kept, on its test volumes; none of older runs."""
+    if BASELINES_FILE not in run.files:
+        return {}
+    contents = _json(run, run.run_id, BASELINES_FILE, folder)
+    return {name: {TEST: Evaluation.of_dict(each)} for name, each in contents.items()}
+
+
+def _json(run: FoundRun, run_id: str, file: str, folder: Path) -> Any:
+    text = Path(run.client.download_artifacts(run_id, file, str(folder))).read_bytes()
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise _damaged(run_id, file) from error
+
+
+def _evaluations(episodes: Mapping[str, object], limits: object) -> dict[str, Evaluation]:
+    return {label: Evaluation.of_plain(some, limits) for label, some in episodes.items()}
+
+
+def _table(report: EvaluationReport) -> ResultTable:
+    """Return the agent on all volumes, and the baselines on the last of them: the test volumes, or all of a folder."""
+    figures = dict(report.by_split)
+    label = TEST if TEST in figures else list(figures)[-1]
+    baselines = {name: each[label] for name, each in report.baselines_by_split.items() if label in each}
+    return ResultTable({**figures, **{f"{name}, {label}": each for name, each in baselines.items()}})
 
 
 def _damaged(run_id: str, file: str) -> TrackingError:
@@ -110,6 +148,6 @@ def _tags(report: EvaluationReport) -> dict[str, str]:
     return {
         f"{REFUSED_BY_MLFLOW.sub('_', label.replace(' ', '_'))}/{name}": f"{estimate.value:.4g}"
         for label, figures in report.by_split.items()
-        for name in TAGGED
+        for name in (*(limits.metric for limits in figures.on_plane), *TAGGED)
         if (estimate := figures.estimates[name]).value == estimate.value
     }

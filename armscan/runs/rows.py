@@ -17,12 +17,14 @@ from requests import RequestException
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.tracking import TrackingStore
 from armscan.tracking.sync import ENDED
+from armscan.training import ON_PLANE
 
 PARENT_TAG = "mlflow.parentRunId"
 # What rows are sorted by.
 SORTS = {
     "started": "started",
     "duration": "duration_s",
+    "plane": "on_plane_rate",
     "success": "success_rate",
     "steps": "mean_steps",
     "size": "n_bytes",
@@ -104,6 +106,11 @@ class RunRow:
         # MLflow keeps the end of a run that goes on again.
         end = self.run.info.end_time if self.run.info.status in ENDED else None
         return None if end is None else (end - self.run.info.start_time) / 1000
+
+    @property
+    def on_plane_rate(self) -> float | None:
+        """On-plane rate on the test volumes, within the limits by default; None where it was not evaluated by them."""
+        return self.run.data.metrics.get(f"test_volumes/{ON_PLANE[0].metric}")
 
     @property
     def success_rate(self) -> float | None:

@@ -11,7 +11,8 @@ from rich.text import Text
 
 from armscan.config.command_hints import armscan_command, resume_command
 from armscan.errors import printable
-from armscan.experiment.console import ID_CHARS, RESULT_ROWS
+from armscan.experiment.console import ID_CHARS
+from armscan.experiment.results import figures_of, result_table
 from armscan.runs.query import experiment_ids, search
 from armscan.runs.rows import PARENT_TAG, RunRow, artifacts_of
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
@@ -22,9 +23,6 @@ from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
 # How a run was started, as far as it has kept it; the first that is there is shown.
 STARTED_BY = ("command", "overrides")
-# Groups with this metric were evaluated; they come first.
-EVALUATED = "/success_rate"
-FIRST = ("validation", "training_volumes")
 MAX_VALUE_CHARS = 200
 
 
@@ -85,20 +83,12 @@ def _print_pairs(console: Console, title: str, pairs: dict[str, str], right: str
 
 
 def _print_figures(console: Console, run: Run) -> None:
-    """Print the last validation and the final evaluations beside each other; not those of single volumes."""
-    found = [name.removesuffix(EVALUATED) for name in run.data.metrics if name.endswith(EVALUATED)]
-    groups = [group for group in FIRST if group in found]
-    groups += sorted(group for group in found if group not in FIRST and "/" not in group)
-    if not groups:
-        return
-    console.print("\nfigures", style="bold")
-    headings = ("last validation" if group == FIRST[0] else group.replace("_", " ") for group in groups)
-    table = narrow_table("", *(f"{heading}>" for heading in headings))
-    for text, key, form in RESULT_ROWS:
-        values = [run.data.metrics.get(f"{group}/{key}") for group in groups]
-        if any(value is not None for value in values):
-            table.add_row(text, *("-" if value is None else form.format(value) for value in values))
-    console.print(table)
+    """Print the final evaluations, the baselines and the last validation; not those of single volumes."""
+    figures = figures_of(run.data.metrics)
+    if figures:
+        console.print("\nfigures", style="bold")
+        for part in result_table(figures).show(console.width):
+            console.print(part)
 
 
 def _print_folder(console: Console, run: Run) -> OwnFolder | None:

@@ -19,6 +19,7 @@ from armscan.errors import printable
 from armscan.experiment.console import ID_CHARS
 from armscan.runs.prune import PruneItem
 from armscan.runs.rows import PARENT_TAG, RunRow
+from armscan.training import ON_PLANE
 
 MISSING = "-"
 # Of a name, which a multirun's words may be.
@@ -59,9 +60,13 @@ def write_rows(rows: Sequence[RunRow], form: str) -> None:
 
 def _table(rows: Sequence[RunRow]) -> Table:
     """Return a table that fits 80 columns: names have what is left, in as many lines as they need."""
-    table = narrow_table("id", "name", "status", "started", "took>", "success>", "steps>", "size>", "below>")
+    # In lines of its own: names need the columns.
+    plane = "on\nplane,\n{:g} mm\n{:g}°".format(*ON_PLANE[0])
+    table = narrow_table(
+        "id", "name", "status", "started", "took>", f"{plane}>", "success>", "steps,\nmean>", "size>", "below>"
+    )
     for row in rows:
-        success, steps = row.success_rate, row.mean_steps
+        on_plane, success, steps = row.on_plane_rate, row.success_rate, row.mean_steps
         size = decimal(row.n_bytes) + ("" if row.in_store is not None else "+?")
         table.add_row(
             row.run.info.run_id[:ID_CHARS],
@@ -69,7 +74,7 @@ def _table(rows: Sequence[RunRow]) -> Table:
             row.run.info.status.lower(),
             format_start(row.run),
             format_duration(row.duration_s),
-            MISSING if success is None else f"{success:.0%}",
+            *(MISSING if rate is None else f"{rate:.0%}" for rate in (on_plane, success)),
             MISSING if steps is None else f"{steps:.1f}",
             size,
             str(len(row.below) or ""),
@@ -98,7 +103,8 @@ def narrow_table(*headings: str) -> Table:
 
 
 COLUMNS = (
-    *("run_id", "name", "status", "experiment_id", "parent", "started", "duration_s", "success_rate", "mean_steps"),
+    *("run_id", "name", "status", "experiment_id", "parent", "started", "duration_s"),
+    *(ON_PLANE[0].metric, "success_rate", "mean_steps"),
     *("size_bytes", "folder_bytes", "artifact_bytes", "below", "agent", "obs", "projection", "folder", "host"),
 )
 
@@ -107,7 +113,8 @@ def _values(row: RunRow) -> dict[str, Any]:
     info, tags = row.run.info, row.run.data.tags
     values = (
         *(info.run_id, info.run_name, info.status, info.experiment_id, tags.get(PARENT_TAG)),
-        *(row.started.isoformat(timespec="seconds"), row.duration_s, row.success_rate, row.mean_steps),
+        *(row.started.isoformat(timespec="seconds"), row.duration_s),
+        *(row.on_plane_rate, row.success_rate, row.mean_steps),
         *(row.n_bytes, row.in_folder, row.in_store, len(row.below)),
         *(tags.get("choice.agent"), tags.get("choice.obs"), row.run.data.params.get("projection")),
         *(tags.get("folder"), tags.get("host")),

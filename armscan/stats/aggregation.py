@@ -40,17 +40,12 @@ def interquartile_mean(values: ArrayLike, axis: int | None = None) -> Any:
     return trim_mean(values, QUARTER, axis=axis)
 
 
-def mean_for(figure: str) -> Mean:
-    """Return what a figure's values are put together by: of success rates, where every failure counts, the mean."""
-    return np.mean if "success_rate" in figure else interquartile_mean
-
-
 def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
     """Return the mean over seeds and volumes, with an interval that draws seeds, each with all its volumes.
 
     Args:
         scores: scores, shape (seeds, volumes).
-        mean: function that aggregates the values; see `mean_for`.
+        mean: function that aggregates the values, such as `numpy.mean`.
         seed: seed of the resamples; default: 0.
 
     Returns:
@@ -68,7 +63,7 @@ def band_over_seeds(scores: FloatArray, mean: Mean) -> Band:
 
     Args:
         scores: scores, shape (seeds, points), all finite.
-        mean: function that aggregates the values; see `mean_for`.
+        mean: function that aggregates the values over an axis, such as `numpy.mean`.
 
     Returns:
         The band, without an interval where there is one seed.

@@ -61,6 +61,19 @@ def quantile(share: float) -> Statistic:
     return statistic
 
 
+def interquartile_mean(samples: FloatArray) -> FloatArray:
+    """Return the mean over the last axis without the lowest and the highest quarter, ignoring NaN as `mean` does.
+
+    Of n values, n // 4 are left out at each end, as `scipy.stats.trim_mean` does.
+    """
+    # NaNs come last.
+    ordered = np.sort(samples, axis=-1)
+    n_known = (~np.isnan(samples)).sum(axis=-1, keepdims=True)
+    n_cut = n_known // 4
+    places = np.arange(samples.shape[-1])
+    return mean(np.where((places >= n_cut) & (places < n_known - n_cut), ordered, np.nan))
+
+
 def estimates(
     columns: Mapping[str, tuple[Statistic, Sequence[float]]],
     volumes: Sequence[Hashable],

@@ -13,14 +13,22 @@ if TYPE_CHECKING:
 
 
 def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: str) -> None:
-    """Draw steps to success and success rate by environment step, as a PNG file."""
+    """Draw on-plane rate, success rate and mean steps by environment step, as a PNG file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     steps = [report.n_env_steps for report in reports]
     figure = Figure(figsize=(8, 5.4), layout="constrained")
     FigureCanvasAgg(figure)
-    lengths, successes = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+    rates, lengths = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+    limits = reports[0].evaluation.on_plane[0]
+    for label, values, colour in (
+        (limits.title, [report.evaluation.on_plane_rate for report in reports], "tab:blue"),
+        ("success, by reward", [report.evaluation.success_rate for report in reports], "tab:green"),
+    ):
+        rates.plot(steps, [100 * value for value in values], marker="o", color=colour, label=label)
+    rates.set_ylabel("of validation episodes (%)")
+    rates.set_ylim(-3, 103)
     lengths.plot(
         steps, [report.evaluation.mean_steps for report in reports], marker="o", label="validation, deterministic"
     )
@@ -30,15 +38,13 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
     if trained:
         lengths.plot(*zip(*trained, strict=True), marker=".", alpha=0.6, label="training, exploring")
     best = [report for report in reports if report.is_best][-1]
-    lengths.axvline(best.n_env_steps, color="grey", linestyle=":", label=f"best epoch, kept: step {best.n_env_steps}")
-    lengths.set_ylabel("mean steps an episode")
+    for axes in (rates, lengths):
+        axes.axvline(best.n_env_steps, color="grey", linestyle=":", label=f"best epoch, kept: step {best.n_env_steps}")
+    lengths.set_ylabel("steps, mean")
     lengths.set_ylim(bottom=0)
-    lengths.legend()
-    successes.plot(steps, [100 * report.evaluation.success_rate for report in reports], marker="o", color="tab:green")
-    successes.set_ylabel("success in validation (%)")
-    successes.set_ylim(-3, 103)
-    successes.set_xlabel("environment steps")
-    for axes in (lengths, successes):
+    lengths.set_xlabel("environment steps")
+    for axes in (rates, lengths):
+        axes.legend()
         axes.grid(alpha=0.3)
     figure.suptitle(title)
     atomic_write(path, lambda file: figure.savefig(file, dpi=110, format=path.suffix[1:]))

@@ -1,5 +1,6 @@
 """One training: splits, rollouts, checkpoints, callbacks, progress, video."""
 
+from armscan.training.baselines import evaluate_baselines
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from armscan.training.checkpointing import CheckpointProvenance, resume_from_checkpoint
@@ -7,6 +8,8 @@ from armscan.training.domain import TrainingDomain
 from armscan.training.episodes import evaluate
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint, fingerprints_in
 from armscan.training.metrics import MetricEstimates
+from armscan.training.on_plane import ON_PLANE, OnPlane, check_on_plane
+from armscan.training.result_table import ResultTable
 from armscan.training.rollout import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation
 from armscan.training.splits import PARTS, Split, mixed_data, nifti_data, phantom_data
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
@@ -16,6 +19,7 @@ from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 __all__ = [
     "BEST_CHECKPOINT",
     "LAST_CHECKPOINT",
+    "ON_PLANE",
     "PARTS",
     "TEST",
     "TRAINING",
@@ -28,13 +32,17 @@ __all__ = [
     "Evaluation",
     "Fingerprints",
     "MetricEstimates",
+    "OnPlane",
+    "ResultTable",
     "SolvedCriterion",
     "Split",
     "TrainingDomain",
     "TrainingResult",
     "VideoRecorder",
+    "check_on_plane",
     "check_unchanged",
     "evaluate",
+    "evaluate_baselines",
     "fingerprint",
     "fingerprints_in",
     "load_checkpoint",

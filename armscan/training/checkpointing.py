@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,9 @@ from armscan.errors import CheckpointError
 from armscan.training.callbacks import EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprints_in
-from armscan.training.rollout import EpisodeResult, Evaluation
+from armscan.training.on_plane import ON_PLANE
+from armscan.training.rollout import Evaluation
 from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
-
-EPISODE_FIELDS = tuple(each.name for each in fields(EpisodeResult))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,9 +113,8 @@ def _written(reports: Sequence[EpochReport]) -> str:
         [
             {
                 **{name: getattr(report, name) for name in ("epoch", "n_env_steps", "wall_s", "metrics", "is_best")},
-                "episodes": {
-                    name: [getattr(episode, name) for episode in report.evaluation.episodes] for name in EPISODE_FIELDS
-                },
+                "on_plane": report.evaluation.on_plane,
+                "episodes": report.evaluation.columns(),
             }
             for report in reports
         ]
@@ -127,10 +125,9 @@ def _read(text: Any, path: Path) -> list[EpochReport]:
     try:
         reports = []
         for record in json.loads(text):
-            columns = record.pop("episodes")
-            rows = zip(*(columns[name] for name in EPISODE_FIELDS), strict=True)
-            episodes = tuple(EpisodeResult(**dict(zip(EPISODE_FIELDS, row, strict=True))) for row in rows)
-            reports.append(EpochReport(**record, evaluation=Evaluation(episodes)))
+            # Earlier versions have kept no limits.
+            evaluation = Evaluation.of_columns(record.pop("episodes"), record.pop("on_plane", ON_PLANE))
+            reports.append(EpochReport(**record, evaluation=evaluation))
         # One of them is the best.
         next(report for report in reports if report.is_best)
     except (TypeError, ValueError, KeyError, AttributeError, StopIteration) as error:

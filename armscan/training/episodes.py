@@ -19,6 +19,7 @@ from armscan.envs.episode import Episode
 from armscan.envs.factory import side_by_side
 from armscan.envs.history import rows_of
 from armscan.envs.vector_env import reset_each, step_each
+from armscan.training.on_plane import ON_PLANE, OnPlane
 from armscan.training.rollout import Env, EpisodeResult, Evaluation
 from armscan.utils.validation import check_int
 
@@ -26,7 +27,9 @@ from armscan.utils.validation import check_int
 MOST_SIDE_BY_SIDE = 64
 
 
-def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluation:
+def evaluate(
+    agent: Agent, env: Env, *, n_episodes: int, seed: int, on_plane: tuple[OnPlane, ...] = ON_PLANE
+) -> Evaluation:
     """Play episodes on each of the environment's volumes in turn, many of them side by side.
 
     Each is, bit for bit, the episode that `play` plays.
@@ -36,13 +39,14 @@ def evaluate(agent: Agent, env: Env, *, n_episodes: int, seed: int) -> Evaluatio
         env: an `ArmscanEnv`, with or without its wrappers; its rules are played by, it is left as it is.
         n_episodes: number of episodes; a multiple of the number of volumes treats them alike.
         seed: seed of the first episode, the next has the next: the same seed gives the same episodes to every agent.
+        on_plane: limits within which a plane counts as the labelled one. Default: those of `Evaluation`.
     """
     names = list(env.get_wrapper_attr("volumes"))
     count = check_int("episodes", n_episodes, at_least=1)
     planned = [(names[i % len(names)], seed + i) for i in range(count)]
     envs, player = side_by_side(env, min(count, MOST_SIDE_BY_SIDE)), batch_agent(agent)
     batches = (planned[i : i + envs.num_envs] for i in range(0, count, envs.num_envs))
-    return Evaluation(tuple(chain.from_iterable(_play_all(player, envs, batch) for batch in batches)))
+    return Evaluation(tuple(chain.from_iterable(_play_all(player, envs, batch) for batch in batches)), on_plane)
 
 
 def _play_all(

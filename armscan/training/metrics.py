@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
+from typing import Any
 
 import numpy as np
 
-from armscan.stats.bootstrap import Estimate, Statistic, estimates, mean, quantile, wilson
+from armscan.stats.bootstrap import Estimate, Statistic, estimates, interquartile_mean, mean, quantile, wilson
+from armscan.training.on_plane import OnPlane, limits_among
 from armscan.training.rollout import MEANS, Evaluation
 
-# Suffix of metrics over the episodes that did not start solved.
-NOT_STARTED_SOLVED = "_not_started_solved"
-MEDIAN, P95 = quantile(0.5), quantile(0.95)
+# Suffix of metrics over the episodes that did not start solved, and of rates with Wilson's interval.
+NOT_STARTED_SOLVED, WILSON = "_not_started_solved", "_wilson"
+# Suffixes of the ends of an interval, and the names of the counts.
+ENDS = ("_low", "_high")
+COUNTS = ("volumes", "episodes", "episodes_started_solved")
+MEDIAN, P90, P95 = quantile(0.5), quantile(0.9), quantile(0.95)
 
 # By name, the statistic, and what of an episode it is of.
 METRICS: dict[str, tuple[Statistic, str]] = {
     **{name: (mean, value) for name, value in MEANS.items()},
+    "iqm_steps": (interquartile_mean, "n_steps"),
     "median_steps": (MEDIAN, "n_steps"),
     "p95_steps": (P95, "n_steps"),
-    "median_distance_mm": (MEDIAN, "distance_mm"),
-    "median_distance_deg": (MEDIAN, "distance_deg"),
+    **{f"median_{value}": (MEDIAN, value) for value in ("distance_mm", "distance_deg")},
+    **{f"p90_{value}": (P90, value) for value in ("distance_mm", "distance_deg")},
     **{f"mean_{value}": (mean, value) for value in ("dice_bones", "dice_tendons", "dice_artery", "seconds_per_plane")},
 }
 
@@ -31,17 +38,21 @@ class MetricEstimates:
     """Sums and means over some episodes.
 
     Args:
+        n_seeds: number of trainings that they are of.
         n_volumes: number of volumes that they are on.
         n_episodes: number of episodes.
         n_started_solved: number of those that started on a rewarded plane.
         estimates: metrics by name, over all episodes; those whose names end with `_not_started_solved` over the others
-            only. `success_rate_wilson` is the success rate with Wilson's interval.
+            only. Those whose names end with `_wilson` are rates with Wilson's interval.
+        on_plane: limits of the on-plane rates among them, the leading ones first.
     """
 
+    n_seeds: int
     n_volumes: int
     n_episodes: int
     n_started_solved: int
-    estimates: dict[str, Estimate]
+    estimates: Mapping[str, Estimate]
+    on_plane: tuple[OnPlane, ...]
 
     @classmethod
     def of(cls, evaluation: Evaluation, trainings: Sequence[Hashable] | None = None) -> MetricEstimates:
@@ -53,32 +64,74 @@ class MetricEstimates:
         """
         episodes = evaluation.episodes
         volumes = [episode.volume for episode in episodes]
-        are_solved = [episode.starts_solved for episode in episodes]
-        columns: dict[str, tuple[Statistic, list[float]]] = {}
+        is_other = [not episode.starts_solved for episode in episodes]
+        rates = {"success_rate": [float(episode.is_success) for episode in episodes]}
+        for limits in evaluation.on_plane:
+            rates[limits.metric] = [float(limits.holds(each.distance_mm, each.distance_deg)) for each in episodes]
+        columns: dict[str, tuple[Statistic, list[float]]] = {name: (mean, values) for name, values in rates.items()}
         for name, (statistic, value) in METRICS.items():
-            values = [float(getattr(episode, value)) for episode in episodes]
-            columns[name] = statistic, values
-            of_others = np.where(are_solved, math.nan, values).tolist()
-            columns[name + NOT_STARTED_SOLVED] = statistic, of_others
-        others = [episode for episode in episodes if not episode.starts_solved]
+            columns[name] = statistic, [float(getattr(episode, value)) for episode in episodes]
+        for name, (statistic, values) in list(columns.items()):
+            columns[name + NOT_STARTED_SOLVED] = statistic, np.where(is_other, values, math.nan).tolist()
+        wilsons = {}
+        for name, values in rates.items():
+            of_others = list(compress(values, is_other))
+            wilsons[name + WILSON] = wilson(int(sum(values)), len(values))
+            wilsons[name + WILSON + NOT_STARTED_SOLVED] = wilson(int(sum(of_others)), len(of_others))
         return cls(
+            n_seeds=1 if trainings is None else len(set(trainings)),
             n_volumes=len(set(volumes)),
             n_episodes=len(episodes),
-            n_started_solved=len(episodes) - len(others),
-            estimates=estimates(columns, volumes, trainings=trainings)
-            | {
-                f"success_rate_wilson{suffix}": wilson(sum(episode.is_success for episode in some), len(some))
-                for suffix, some in (("", episodes), (NOT_STARTED_SOLVED, others))
-            },
+            n_started_solved=len(episodes) - sum(is_other),
+            estimates=estimates(columns, volumes, trainings=trainings) | wilsons,
+            on_plane=evaluation.on_plane,
         )
+
+    @classmethod
+    def of_trainings(cls, evaluations: Mapping[Any, Evaluation]) -> MetricEstimates:
+        """Compute them over the episodes of several trainings.
+
+        Args:
+            evaluations: the episodes of each training, by what tells it from the others; at least one.
+        """
+        played = [(training, each) for training, evaluation in evaluations.items() for each in evaluation.episodes]
+        trainings, episodes = zip(*played, strict=True)
+        first = next(iter(evaluations.values()))
+        return cls.of(Evaluation(episodes, first.on_plane), trainings)
+
+    @classmethod
+    def of_metrics(cls, metrics: Mapping[str, float], *, n_seeds: int = 1) -> MetricEstimates:
+        """Return what `metrics` gave, or a run has kept; without an interval where there is none.
+
+        Args:
+            metrics: numbers by name.
+            n_seeds: number of trainings that they are of. Default: 1.
+        """
+        ends = {name + end for name in metrics for end in ENDS if name + end in metrics}
+        n_volumes, n_episodes, n_started_solved = (int(metrics.get(name, 0)) for name in COUNTS)
+        found = {
+            name: Estimate(value, *(metrics.get(name + end, math.nan) for end in ENDS))
+            for name, value in metrics.items()
+            if name not in ends and name not in COUNTS
+        }
+        return cls(n_seeds, n_volumes, n_episodes, n_started_solved, found, limits_among(found))
+
+    def estimate(self, name: str) -> Estimate:
+        """Return a figure as it is shown: NaN where there is none, a rate without width with Wilson's interval."""
+        estimate = self.estimates.get(name, Estimate(math.nan, math.nan, math.nan))
+        return self.estimates.get(name + WILSON, estimate) if estimate.low == estimate.high else estimate
 
     def metrics(self) -> dict[str, float]:
         """Return all numbers by name, the ends of an interval as `..._low` and `..._high`."""
-        metrics: dict[str, float] = {
-            "volumes": self.n_volumes,
-            "episodes": self.n_episodes,
-            "episodes_started_solved": self.n_started_solved,
-        }
-        for name, (value, low, high) in self.estimates.items():
-            metrics |= {name: value, f"{name}_low": low, f"{name}_high": high}
+        return self._metrics(self.estimates)
+
+    def shown_metrics(self, names: Iterable[str]) -> dict[str, float]:
+        """Return the numbers of these figures likewise, as they are shown."""
+        return self._metrics({name: self.estimate(name) for name in names})
+
+    def _metrics(self, estimates: Mapping[str, Estimate]) -> dict[str, float]:
+        counts = (self.n_volumes, self.n_episodes, self.n_started_solved)
+        metrics: dict[str, float] = dict(zip(COUNTS, counts, strict=True))
+        for name, estimate in estimates.items():
+            metrics |= dict(zip((name, *(name + end for end in ENDS)), estimate, strict=True))
         return metrics

@@ -18,7 +18,7 @@ def progress_reporter(label: str | None = None) -> Callback:
 
 
 class ProgressBar:
-    """A bar with environment steps, return, success rate, episode length and time left."""
+    """A bar with environment steps, on-plane rate, success rate, mean steps of the validation, and time left."""
 
     def __init__(self) -> None:
         # On a narrow terminal the numbers keep their width; the bar shrinks.
@@ -72,8 +72,10 @@ class ProgressLines:
 
 
 def _summary(report: EpochReport) -> str:
-    metrics = report.evaluation.metrics()
+    """Return what the validation of an epoch has measured, the leading rate first."""
+    evaluation = report.evaluation
+    leading, metrics = evaluation.on_plane[0], evaluation.metrics()
     return (
-        f"return {metrics['mean_return']:6.2f}  success {metrics['success_rate']:4.0%}  "
-        f"length {metrics['mean_steps']:5.2f}"
+        f"{leading.title} {evaluation.on_plane_rate:4.0%}  success {metrics['success_rate']:4.0%}  "
+        f"steps {metrics['mean_steps']:5.2f}"
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import statistics
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from operator import attrgetter
 from typing import Any, Self, get_type_hints
 
@@ -11,6 +12,7 @@ import gymnasium as gym
 
 from armscan.envs.rules import Observed
 from armscan.errors import InvalidValueError
+from armscan.training.on_plane import ON_PLANE, OnPlane, check_on_plane
 from armscan.volumes.plane import FloatArray
 
 # What evaluations are called by, after the volumes that they are on.
@@ -79,22 +81,56 @@ class EpisodeResult:
         return statistics.fmean((self.dice_bones, self.dice_tendons, self.dice_artery))
 
 
+EPISODE_FIELDS = tuple(each.name for each in fields(EpisodeResult))
+
+
 @dataclass(frozen=True)
 class Evaluation:
-    """Episodes and what they add up to; every mean is over all episodes unless its name says otherwise."""
+    """Episodes and what they add up to; every mean is over all episodes unless its name says otherwise.
+
+    Args:
+        episodes: the episodes.
+        on_plane: limits within which a plane counts as the labelled one, the leading ones first. Default: 5 mm and
+            10 degrees, and 2 mm and 5 degrees.
+    """
 
     episodes: tuple[EpisodeResult, ...]
+    on_plane: tuple[OnPlane, ...] = ON_PLANE
 
     @classmethod
-    def of_plain(cls, episodes: object) -> Self:
+    def of_plain(cls, episodes: object, on_plane: object = ON_PLANE) -> Self:
         """Return the evaluation of episodes that were read from JSON, as `to_dict` has given them.
+
+        Args:
+            episodes: the episodes, as a list.
+            on_plane: the limits, as pairs. Default: those of evaluations that have kept none.
 
         Raises:
             InvalidValueError: if they are no list, or one of them is none: a value is missing, unknown, or no number.
         """
         if not isinstance(episodes, list):
             raise InvalidValueError(f"the episodes are a {type(episodes).__name__}, but they must be a list")
-        return cls(tuple(_episode_of(each) for each in episodes))
+        return cls(tuple(_episode_of(each) for each in episodes), check_on_plane("on_plane", on_plane))
+
+    @classmethod
+    def of_dict(cls, contents: Mapping[str, Any]) -> Self:
+        """Return the evaluation that `to_dict` has given; see `of_plain`."""
+        return cls.of_plain(contents["episodes"], contents.get("on_plane", ON_PLANE))
+
+    @classmethod
+    def of_columns(cls, columns: Mapping[str, Sequence[Any]], on_plane: object = ON_PLANE) -> Self:
+        """Return the evaluation that `columns` was of; see `of_plain`."""
+        rows = zip(*columns.values(), strict=True)
+        return cls.of_plain([dict(zip(columns, row, strict=True)) for row in rows], on_plane)
+
+    def columns(self) -> dict[str, list[Any]]:
+        """Return each value of the episodes as a list, by its name, which takes less room than the episodes."""
+        return {name: [getattr(episode, name) for episode in self.episodes] for name in EPISODE_FIELDS}
+
+    @property
+    def on_plane_rate(self) -> float:
+        """Share of the episodes that ended within the leading limits of the labelled plane."""
+        return self._on_plane_rate(self.on_plane[0])
 
     @property
     def success_rate(self) -> float:
@@ -119,8 +155,10 @@ class Evaluation:
 
     def metrics(self) -> dict[str, float]:
         """Return the figures by name; those of episodes that did not start solved stand beside those of all."""
-        unsolved = Evaluation(tuple(episode for episode in self.episodes if not episode.starts_solved))
+        unsolved = self._of(episode for episode in self.episodes if not episode.starts_solved)
         return {
+            **{limits.metric: self._on_plane_rate(limits) for limits in self.on_plane},
+            **{f"median_{name}": self._median(name) for name in ("distance_mm", "distance_deg")},
             **{name: self._mean(name) for name in MEANS},
             "episodes": len(self.episodes),
             "episodes_started_solved": len(self.episodes) - len(unsolved.episodes),
@@ -131,11 +169,22 @@ class Evaluation:
     def by_volume(self) -> dict[str, Evaluation]:
         """Return the episodes of each volume."""
         names = dict.fromkeys(episode.volume for episode in self.episodes)
-        return {name: Evaluation(tuple(each for each in self.episodes if each.volume == name)) for name in names}
+        return {name: self._of(each for each in self.episodes if each.volume == name) for name in names}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures and every episode, ready for JSON."""
-        return {"metrics": self.metrics(), "episodes": [asdict(episode) for episode in self.episodes]}
+        limits = [list(each) for each in self.on_plane]
+        return {"metrics": self.metrics(), "on_plane": limits, "episodes": list(map(asdict, self.episodes))}
+
+    def _of(self, episodes: Iterable[EpisodeResult]) -> Evaluation:
+        return replace(self, episodes=tuple(episodes))
+
+    def _on_plane_rate(self, limits: OnPlane) -> float:
+        are_on_plane = [limits.holds(each.distance_mm, each.distance_deg) for each in self.episodes]
+        return statistics.fmean(are_on_plane) if are_on_plane else float("nan")
+
+    def _median(self, name: str) -> float:
+        return statistics.median(map(attrgetter(name), self.episodes)) if self.episodes else float("nan")
 
     def _mean(self, name: str) -> float:
         return statistics.fmean(map(attrgetter(MEANS[name]), self.episodes)) if self.episodes else float("nan")

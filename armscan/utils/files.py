@@ -27,6 +27,8 @@ DIFF_FILE, ENVIRONMENT_FILE = "code.diff", "environment.json"
 RESUMED_DIFF_FILE = "resumed_{0}_" + DIFF_FILE
 # What came of it; of a trial's training, the run that it is.
 EVALUATION_FILE, RUN_FILE = "evaluation.json", "run.json"
+# The baselines' episodes, and the page with the table of both.
+BASELINES_FILE, RESULTS_PAGE = "baselines.json", "results.html"
 LEARNING_CURVE_FILE, VIDEO_FILE = "learning_curve.png", "episode.gif"
 # Whether the same came of it as of the run that it repeats.
 REPRODUCTION_FILE = "reproduction.json"
@@ -34,7 +36,10 @@ RECORDS = (RUN_FILE, REPRODUCTION_FILE)
 POLICY_FOLDER = "policy"
 # All that a run makes in its folder, beside what Hydra and the outbox leave there: before it is tracked, and after.
 STARTED_WITH = (CONFIG_FILE, VOLUMES_FILE, ENVIRONMENT_FILE, DIFF_FILE)
-RESULTS = (BEST_CHECKPOINT, LAST_CHECKPOINT, EVALUATION_FILE, LEARNING_CURVE_FILE, VIDEO_FILE)
+RESULTS = (
+    *(BEST_CHECKPOINT, LAST_CHECKPOINT, EVALUATION_FILE, BASELINES_FILE, RESULTS_PAGE),
+    *(LEARNING_CURVE_FILE, VIDEO_FILE),
+)
 # The tags of a run that hold the sums of what it was started with.
 SHA256_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
 LOCK_FILE = ".lock"

@@ -120,7 +120,7 @@ def test_evaluate_judges_a_run_as_it_was_trained(tmp_path, data_folder):
     for words in (["--episodes=3"], ["--episodes=4", f"--data={data_folder}", "--success-threshold=0.1"]):
         ended = subprocess.run([*command, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
         assert (ended.returncode, ended.stderr) == (0, "")
-        assert "success rate" in ended.stdout
+        assert "on plane,  " in ended.stdout
     children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
     assert len(children) == 2
     assert {file.path for file in client.list_artifacts(run.info.run_id)} >= {"best.pt", "config.yaml"}
@@ -131,10 +131,12 @@ def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(answer,
     code, printed, errors = answer(run_id, "--episodes=5", "--max-steps=3", "--success-threshold=0.04")
     assert (code, errors) == (0, "")
     for word in (
-        "success rate",
-        "by Wilson",
-        "95th percentile of steps",
-        "Dice, artery",
+        "on plane,",
+        "5 mm 10°",
+        "random",
+        "sweep 5 mm",
+        "steps, 95th percentile",
+        "Dice artery,",
         "phantom-2000000",
         "not started solved",
     ):
@@ -155,7 +157,8 @@ def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(answer,
             assert child.data.metrics[f"{group}/{figure}"] == pytest.approx(numbers["value"])
             assert child.data.metrics[f"{group}/{figure}_low"] == pytest.approx(numbers["low"])
     assert child.data.params["env.max_steps"] == "3"
-    assert client.list_artifacts(child.info.run_id)[0].path.endswith(".json")
+    assert {file.path[-5:] for file in client.list_artifacts(child.info.run_id)} == {".json", ".html"}
+    assert 0.0 <= child.data.metrics["random/test_volumes/on_plane_5mm_10deg"] <= 1.0
     # The run itself stays as it was, and an evaluation is nothing to evaluate.
     assert not client.get_run(run_id).data.metrics
     code, _, errors = answer(contents["tracked_as"])

@@ -71,7 +71,7 @@ def test_final_figures_are_of_all_seeds_volumes_and_episodes(make_training):
 
 def test_success_without_a_failure_has_the_interval_of_wilson(written, make_training):
     page, _ = written(make_training(0), make_training(1))
-    assert "100.0%<br><small>67.6% to 100.0%</small>" in page
+    assert "100.0%<br><small>67.6–100.0</small>" in page
 
 
 def test_the_film_is_of_the_median_training(written, make_training):

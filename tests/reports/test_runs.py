@@ -75,7 +75,8 @@ def test_report_of_a_multirun_groups_its_jobs_and_has_every_number_beside_it(ans
     }
     pairs = rows(folder / "improvement.csv")
     assert [(row["figure"], row["better"], row["than"]) for row in pairs] == [
-        (figure, "agent=sac", "agent=ppo") for figure in ("mean_steps", "success_rate", "mean_distance_mm")
+        (figure, "agent=sac", "agent=ppo")
+        for figure in ("on_plane_rate", "median_distance_mm", "success_rate", "mean_steps")
     ]
 
 

@@ -150,7 +150,7 @@ def test_long_names_stay_whole_and_odd_ones_are_no_markup(make_run, answer):
     make_run("sac-[bold]-cluster_slice_channels-rz+rx+tx+ty-stack4-memory2-phantom-seed0")
     table = answer("list")[1]
     assert max(map(len, table.splitlines())) <= 80
-    name = "".join(line[9:].split(" ")[0] for line in table.splitlines()[1:])
+    name = "".join(line[9:].split(" ")[0] for line in table.splitlines()[4:])
     assert name == "sac-[bold]-cluster_slice_channels-rz+rx+tx+ty-stack4-memory2-phantom-seed0"
 
 
@@ -166,7 +166,7 @@ def test_show_tells_everything_of_a_run(make_run, store, answer, tmp_path):
         *(run_id, "failed after", "no reason", "agent=sac seed=3", 40 * "a", "something.new", "[red]x", child[:8]),
         *(
             "last validation",
-            "test volumes",
+            "test",
             "75.0%",
             "9.25",
             "best.pt",

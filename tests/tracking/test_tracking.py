@@ -11,6 +11,7 @@ import pytest
 
 import armscan
 from armscan.errors import InvalidValueError, TrackingError, UntrustedError
+from armscan.experiment.results import RunResult
 from armscan.experiment.runner import keep_results
 from armscan.tracking import (
     VERSION_TAG,
@@ -71,7 +72,7 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
         keep_results(
             tracked,
             TrainingResult(tuple(REPORTS), is_solved=False, wall_s=3.0),
-            {"test volumes": evaluation_of(2, 4)},
+            RunResult({"test volumes": evaluation_of(2, 4)}, {"random": evaluation_of(9)}),
             folder,
         )
     run = client.get_run(tracked.run_id)
@@ -80,11 +81,14 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
     assert run.data.tags["overrides"] == "seed=3"
     assert run.data.tags["git.commit"] == source().tags["git.commit"]
     assert run.data.metrics["test_volumes/mean_steps"] == 3.0
+    assert run.data.metrics["test_volumes/on_plane_5mm_10deg"] == 1.0
+    assert run.data.metrics["test_volumes/mean_steps_low"] == 2.0
+    assert run.data.metrics["random/mean_steps"] == 9.0
     assert run.data.metrics["best_env_step"] == 300
     history = client.get_metric_history(tracked.run_id, "validation/mean_steps")
     assert [(point.step, point.value) for point in history] == [(100, 9.0), (200, 4.0), (300, 3.0)]
     files = {file.path for file in client.list_artifacts(tracked.run_id)}
-    assert files == {"best.pt", "evaluation.json", "learning_curve.png"}
+    assert files == {"best.pt", "evaluation.json", "baselines.json", "results.html", "learning_curve.png"}
 
 
 def test_tracked_run_keeps_a_folder_with_all_in_it_and_what_makes_it_a_model_last(store, tmp_path):

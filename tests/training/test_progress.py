@@ -35,6 +35,6 @@ def test_progress_bar_shows_all_of_its_figures_in_80_columns(narrow):
     bar.on_start(240_000, [report])
     bar.on_end()
     (line,) = narrow.export_text().strip().splitlines()
-    for figure in ("120000/240000", "return -123.46", "success 100%", "length 50.00", "-:--:--"):
+    for figure in ("120000/240000", "on plane, 5 mm 10° 100%", "success 100%", "steps 50.00", "-:--:--"):
         assert figure in line
     assert "━" in line

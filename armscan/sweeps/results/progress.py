@@ -17,8 +17,9 @@ from rich.text import Text
 
 from armscan.config.command_hints import armscan_command
 from armscan.errors import StorageAwayError
-from armscan.experiment.console import print_where_to_look
-from armscan.sweeps.results.summary import final_results, shown_of, values_of
+from armscan.experiment.console import print_table, print_where_to_look
+from armscan.experiment.results import volume_notes
+from armscan.sweeps.results.summary import final_results, final_table, values_of
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.open import OpenedStudy, Phase
@@ -183,17 +184,9 @@ def _print_final_results(opened: OpenedStudy) -> bool:
         print("error: no final evaluation, because no trial or no final training has finished", file=sys.stderr)
         return False
     n_seeds = ", ".join(sorted({str(result.n_seeds) for result in results}))
-    # A title of the table would be as narrow as the table.
-    print(
-        f"result, with {n_seeds} other seed(s) each: interquartile means over seeds and test volumes, of success rates "
-        "means; 95 % intervals"
-    )
-    names = shown_of(results[0])
-    table = Table("trial", *(name.removeprefix("test/").replace("_", " ") for name in names))
+    title = f"result on the test volumes, with {n_seeds} other seed(s) each"
+    print_table(title, final_table(results), volume_notes(results[0].figures))
     trials = opened.search.scheduler.study.get_trials(deepcopy=False)
-    for result in results:
-        table.add_row(str(result.number), *(result.text(name).replace(" (", "\n(") for name in names))
-    Console().print(table)
     for result in results:
         print(f"trial {result.number}: {' '.join(overrides_of(trials[result.number].params))}")
     return True

@@ -22,7 +22,7 @@ from optuna.visualization import (
 from plotly import graph_objects
 
 from armscan.reports.html import chart, table, video_address, write_page
-from armscan.sweeps.results.summary import ConfigResult, final_results, shown_of, values_of
+from armscan.sweeps.results.summary import ConfigResult, final_results, final_table, values_of
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINALIST, METRICS, RETRIED, RETRY_OF, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.study import best_trials
@@ -57,18 +57,13 @@ def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folde
             for trial in trials
             if trial.state == TrialState.FAIL
         ],
-        "result": [
-            {"trial": result.number, "seeds": result.n_seeds, "figure": name, "mean": mean, "low": low, "high": high}
-            for result in found
-            for name, (mean, low, high) in result.means.items()
-        ],
+        "result": list(_result_rows(found)),
         "importances": _importances(study, objectives),
     }
     parts = [
         _summary(study, trials, objectives),
-        "<h2>Result</h2><p>The best settings, trained with new seeds, on the test volumes: "
-        "interquartile means over seeds and volumes, of success rates means, and 95 % intervals.</p>",
-        table(_result_rows(found, trials)) if found else "<p>No final evaluation yet.</p>",
+        "<h2>Result</h2><p>The best settings, trained with new seeds, on the test volumes, beside the baselines.</p>",
+        _result(found, trials) if found else "<p>No final evaluation yet.</p>",
         _videos(final_trials),
         *_charts(study, objectives, tables["importances"]),
         "<h2>How trials have ended</h2>",
@@ -141,16 +136,20 @@ def _cause(trial: FrozenTrial) -> str:
     return str(trial.user_attrs.get(FAILURE, "not known"))
 
 
-def _result_rows(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
-    return [
-        {
-            "trial": result.number,
-            "values": " ".join(overrides_of(trials[result.number].params)),
-            "seeds": result.n_seeds,
-            **{name.removeprefix("test/"): result.text(name) for name in shown_of(result)},
-        }
-        for result in found
-    ]
+def _result(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> str:
+    """Return the table of the result, and the settings of each trial in it."""
+    values = {result.number: html.escape(" ".join(overrides_of(trials[result.number].params))) for result in found}
+    items = "".join(f"<li>trial {number}: <code>{text}</code></li>" for number, text in values.items())
+    return f"{final_table(found).html()}<ul>{items}</ul>"
+
+
+def _result_rows(found: Sequence[ConfigResult]) -> Iterator[dict[str, Any]]:
+    """Yield every figure of the result, also those of the baselines."""
+    for result in found:
+        for of, figures in {"agent": result.figures, **result.baselines}.items():
+            for name, (value, low, high) in figures.estimates.items():
+                row = {"trial": result.number, "of": of, "seeds": figures.n_seeds, "figure": f"test/{name}"}
+                yield row | {"value": value, "low": low, "high": high}
 
 
 def _importances(study: optuna.Study, objectives: Sequence[str]) -> list[dict[str, Any]]:

@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.stats.aggregation import mean_for, over_seeds
-from armscan.stats.bootstrap import Estimate
-from armscan.sweeps.scheduling.state import FINALIST, METRICS
+from armscan.stats.aggregation import over_seeds
+from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
+from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
+from armscan.training.metrics import COUNTS
+from armscan.training.on_plane import limits_among
+from armscan.training.result_table import with_baselines
 
 OF_VOLUME = re.compile(r"test/volume/(.+)/(\w+)")
-SHOWN = ("test/success_rate", "test/mean_steps", "test/mean_distance_mm", "test/mean_distance_deg")
+OF_TEST = "test/"
 
 
 @dataclass(frozen=True)
@@ -24,18 +27,18 @@ class ConfigResult:
 
     Args:
         number: of the trial that found it.
-        n_seeds: number of final trainings.
-        means: by metric: its mean over the seeds, with its interval.
+        figures: figures over all final trainings, with their intervals.
+        baselines: those of the baselines on the same volumes, by their names.
     """
 
     number: int
-    n_seeds: int
-    means: Mapping[str, Estimate]
+    figures: MetricEstimates
+    baselines: Mapping[str, MetricEstimates]
 
-    def text(self, name: str) -> str:
-        """Return a metric with its interval, such as `1.52 (1.4 to 1.7)`."""
-        mean, low, high = (f"{round(number, 3):g}" for number in self.means[name])
-        return mean if low == "nan" else f"{mean} ({low} to {high})"
+    @property
+    def n_seeds(self) -> int:
+        """The number of final trainings."""
+        return self.figures.n_seeds
 
 
 def values_of(trial: FrozenTrial, objectives: Iterable[str]) -> str:
@@ -43,39 +46,57 @@ def values_of(trial: FrozenTrial, objectives: Iterable[str]) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in zip(objectives, trial.values, strict=True))
 
 
-def shown_of(result: ConfigResult) -> list[str]:
-    """Return the names of the metrics that a table shows: the most telling, or all if it has none of these."""
-    return [name for name in SHOWN if name in result.means] or list(result.means)
+def final_table(results: Sequence[ConfigResult]) -> ResultTable:
+    """Return the table of a study's result, a line for each configuration and for each baseline."""
+    figures = {f"trial {result.number}": result.figures for result in results}
+    return ResultTable(with_baselines(figures, {f"trial {each.number}": each.baselines for each in results}))
 
 
-def final_results(trials: Sequence[FrozenTrial], *, seed: int = 0) -> list[ConfigResult]:
-    """Return the final evaluation of each configuration.
+def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
+    """Return the final evaluation of each configuration, over all episodes of all its trainings.
 
-    The interquartile mean over seeds and test volumes (of success rates the mean, where every failure counts), with an
-    interval by a bootstrap of the seeds: Agarwal et al. 2021 (arXiv:2108.13264), but that each seed is drawn with all
-    its volumes, because one training was evaluated on all of them.
+    The intervals draw seeds, each with all its volumes, because one training was evaluated on all of them. Of trials
+    that have kept no episodes, which older ones have not, they are of the means of seeds and volumes.
 
     Args:
         trials: of the final evaluation; unfinished ones are left out.
-        seed: of the resamples; the same trials and seed give the same intervals.
     """
-    of_number: dict[int, list[dict[str, float]]] = {}
+    of_number: dict[int, list[FrozenTrial]] = {}
     for trial in trials:
         if trial.state == TrialState.COMPLETE:
-            of_number.setdefault(int(trial.user_attrs[FINALIST]), []).append(trial.user_attrs[METRICS])
-    return [_config_result(number, of_seeds, seed) for number, of_seeds in of_number.items()]
+            of_number.setdefault(int(trial.user_attrs[FINALIST]), []).append(trial)
+    return [_config_result(number, of_seeds) for number, of_seeds in of_number.items()]
 
 
-def _config_result(number: int, of_seeds: Sequence[Mapping[str, float]], seed: int) -> ConfigResult:
+def _config_result(number: int, of_seeds: Sequence[FrozenTrial]) -> ConfigResult:
+    kept = [_episodes(trial) for trial in of_seeds]
+    if not all(kept):
+        return ConfigResult(number, _of_means([trial.user_attrs[METRICS] for trial in of_seeds]), {})
+    seeds = [trial.user_attrs[FINAL_SEED] for trial in of_seeds]
+    figures = MetricEstimates.of_trainings(dict(zip(seeds, (each[TEST] for each in kept), strict=True)))
+    # The baselines have no part in the training: each seed has met the same.
+    baselines = {name: MetricEstimates.of(each) for name, each in kept[0].items() if name != TEST}
+    return ConfigResult(number, figures, baselines)
+
+
+def _episodes(trial: FrozenTrial) -> dict[str, Evaluation]:
+    kept = trial.system_attrs.get(EPISODES, {})
+    return {name: Evaluation.of_columns(each["episodes"], each["on_plane"]) for name, each in kept.items()}
+
+
+def _of_means(of_seeds: Sequence[Mapping[str, float]]) -> MetricEstimates:
+    """Return the means of the metrics that all seeds have, with intervals that draw seeds."""
     common = set.intersection(*map(set, of_seeds))
     of_seeds = [{name: value for name, value in metrics.items() if name in common} for metrics in of_seeds]
-    names = [name for name in of_seeds[0] if name.startswith("test/") and not OF_VOLUME.fullmatch(name)]
-    means = {name: over_seeds(_scores(name, of_seeds), mean_for(name), seed=seed) for name in names}
-    return ConfigResult(number, len(of_seeds), means)
+    names = [name for name in of_seeds[0] if name.startswith(OF_TEST) and not OF_VOLUME.fullmatch(name)]
+    means = {name.removeprefix(OF_TEST): over_seeds(_scores(name, of_seeds), np.mean) for name in names}
+    volumes = {match[1] for name in common if (match := OF_VOLUME.fullmatch(name))}
+    episodes, solved = (sum(int(each.get(OF_TEST + name, 0)) for each in of_seeds) for name in COUNTS[1:])
+    return MetricEstimates(len(of_seeds), len(volumes), episodes, solved, means, limits_among(means))
 
 
 def _scores(name: str, of_seeds: Sequence[Mapping[str, float]]) -> NDArray[np.float64]:
     """Return a metric of shape (seeds, test volumes), or (seeds, 1) if it is not known for each volume."""
-    metric = name.removeprefix("test/")
+    metric = name.removeprefix(OF_TEST)
     volumes = [key for key in of_seeds[0] if (found := OF_VOLUME.fullmatch(key)) and found[2] == metric]
     return np.array([[metrics[key] for key in volumes or [name]] for metrics in of_seeds])

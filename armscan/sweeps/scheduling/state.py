@@ -18,6 +18,8 @@ LEASE, ENV_STEPS, METRICS, FAILURE = "lease", "env_steps", "figures", "failure"
 RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
 # In the study of final trainings: the trial whose configuration is trained, and the seed.
 FINALIST, FINAL_SEED = "judged", "judged_seed"
+# A system attribute: the episodes of the final evaluation.
+EPISODES = "episodes"
 # What a retry has from the attempt before.
 KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED)
 # Of a study: trials whose failures are ignored.

@@ -19,9 +19,9 @@ from optuna.trial import Trial
 from armscan.config.compose import compose
 from armscan.config.defaults import CLUSTER, to_plain
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.scheduling.state import ENV_STEPS, RETRY_OF, SEEDS, PendingWrites
+from armscan.sweeps.scheduling.state import ENV_STEPS, EPISODES, RETRY_OF, SEEDS, PendingWrites
 from armscan.tracking import TrackedRun
-from armscan.training import Split
+from armscan.training import Evaluation, Split
 from armscan.utils.validation import check_float
 
 # User attributes of a trial.
@@ -104,6 +104,17 @@ class Attempt:
         if any(each not in self.seeds_done for each in self.seeds):
             # The next report may be long in coming, and a retry must not train this seed again.
             self.writes.flush_with(self.transaction, lambda: True)
+
+    def keep_episodes(self, evaluations: Mapping[str, Evaluation]) -> None:
+        """Keep the episodes of the final evaluation, by what they are of, in the storage.
+
+        They are no user attributes, which the dashboard would show in full.
+        """
+        plain: dict[str, Any] = {
+            name: {"on_plane": each.on_plane, "episodes": each.columns()} for name, each in evaluations.items()
+        }
+        storage, trial_id = self.trial.storage, self.trial._trial_id
+        self.writes.append(partial(storage.set_trial_system_attr, trial_id, EPISODES, plain))
 
     def report(self, metrics: Mapping[str, float], *, seed: int, n_env_steps: int, grid: int, total: int) -> None:
         """Report how a training is going.

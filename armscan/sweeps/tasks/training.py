@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import optuna
@@ -17,19 +18,28 @@ from armscan.errors import CheckpointError, InvalidValueError
 from armscan.experiment.build import Experiment, build_experiment, check_keys, set_up
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
-from armscan.experiment.runner import VIDEO_SEED, final_evaluations, train_agent, write_evaluations
+from armscan.experiment.results import RunResult
+from armscan.experiment.runner import VIDEO_SEED, train_agent
 from armscan.stats.aggregation import interquartile_mean
 from armscan.sweeps.scheduling.state import ENV_STEPS
 from armscan.sweeps.tasks.attempt import Attempt, volumes_of
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
-from armscan.training import TEST, Budget, EpochReport, Evaluation, record_episode, resume_from_checkpoint
+from armscan.training import (
+    TEST,
+    Budget,
+    EpochReport,
+    Evaluation,
+    TrainingResult,
+    record_episode,
+    resume_from_checkpoint,
+)
 from armscan.utils.files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, RUN_FILE, VIDEO_FILE, atomic_write, folder_lock
 from armscan.utils.log import log
 from armscan.utils.retry import RETRY_S
 
 # Of each training, beside the metrics of its best validation.
 TRAINING_METRICS = (ENV_STEPS, "training_s", "solved")
-Conclude = Callable[[Experiment, TrackedRun, Path], dict[str, float]]
+Conclude = Callable[[Experiment, TrainingResult, TrackedRun, Path], dict[str, float]]
 
 
 @dataclass
@@ -92,12 +102,17 @@ class TrainingTask:
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
         """Train, evaluate, record a video and keep the policy; returns the metrics of the test."""
         (seed,) = attempt.seeds
-        return _trained(attempt, seed, _concluded)
+        return _trained(attempt, seed, partial(_concluded, attempt))
 
 
-def _concluded(setup: Experiment, tracked: TrackedRun, folder: Path) -> dict[str, float]:
-    evaluations = final_evaluations(setup)
-    write_evaluations(evaluations, folder)
+def _concluded(
+    attempt: Attempt, setup: Experiment, result: TrainingResult, tracked: TrackedRun, folder: Path
+) -> dict[str, float]:
+    """Judge a trained agent beside the baselines, and keep what comes of it; returns the metrics of the test."""
+    reached = RunResult.of(setup, result)
+    reached.write(folder, title=tracked.name)
+    tested = reached.evaluations[TEST]
+    attempt.keep_episodes({TEST: tested, **reached.baselines})
     agent, seed = setup.agent, VIDEO_SEED + setup.seed
     record_episode(agent, setup.video_env, folder / VIDEO_FILE, seed=seed)
     assert isinstance(agent, Learner)
@@ -105,8 +120,8 @@ def _concluded(setup: Experiment, tracked: TrackedRun, folder: Path) -> dict[str
     from armscan.policies.build import save_policy
 
     save_policy(agent, setup.test_env, tracked, folder, log)
-    metrics = {f"test/{name}": value for name, value in evaluations[TEST].metrics().items()}
-    for volume, evaluation in evaluations[TEST].by_volume().items():
+    metrics = {f"test/{name}": value for name, value in tested.metrics().items()}
+    for volume, evaluation in tested.by_volume().items():
         metrics |= {f"test/volume/{volume}/{name}": value for name, value in evaluation.metrics().items()}
     return metrics
 
@@ -130,7 +145,7 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
             except optuna.TrialPruned as error:
                 pruned = error
             else:
-                concluded = conclude(setup, tracked, folder) if conclude else {}
+                concluded = conclude(setup, result, tracked, folder) if conclude else {}
             draw_learning_curve(reporter.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
             attempt.show_picture(folder / LEARNING_CURVE_FILE)
             # A finished training is not resumed; the best checkpoint stays.

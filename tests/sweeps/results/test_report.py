@@ -90,7 +90,7 @@ def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
         ("pruned", "behind the others at environment step 100", "2"),
     ]
     (steps, success) = rows(folder / "result.csv")
-    assert (steps["figure"], float(steps["mean"]), success["mean"]) == ("test/mean_steps", 2.5, "1.0")
+    assert (steps["figure"], float(steps["value"]), success["value"]) == ("test/mean_steps", 2.5, "1.0")
     assert float(steps["low"]) < 2.5 < float(steps["high"])
     assert [row["key"] for row in rows(folder / "importances.csv")] == ["agent.lr"]
 

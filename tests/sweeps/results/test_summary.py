@@ -1,13 +1,18 @@
 """What the trainings that judge say of a configuration."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from optuna.trial import TrialState, create_trial
 from rliable.library import get_interval_estimates
-from rliable.metrics import aggregate_iqm
+from rliable.metrics import aggregate_mean
 
-from armscan.sweeps.results.summary import final_results
-from armscan.sweeps.scheduling.state import FINALIST, METRICS
+from armscan.sweeps.results.summary import final_results, final_table
+from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
+from armscan.training import Evaluation
+from tests.training.test_result_table import made_episodes, recomputed
 
 
 def judged(number, metrics, state=TrialState.COMPLETE):
@@ -23,12 +28,12 @@ def figures_of(of_volumes):
 def test_verdict_is_over_seeds_and_test_volumes():
     scores = np.random.default_rng(0).gamma(2.0, 2.0, (5, 8))
     (result,) = final_results([judged(7, figures_of(list(of_seed))) for of_seed in scores])
-    assert (result.number, result.n_seeds) == (7, 5)
-    assert result.means.keys() == {"test/mean_steps", "test/success_rate"}
-    mean, low, high = result.means["test/mean_steps"]
-    assert mean == pytest.approx(aggregate_iqm(scores))
+    assert (result.number, result.n_seeds, result.figures.n_volumes) == (7, 5, 8)
+    assert result.figures.estimates.keys() == {"mean_steps", "success_rate"}
+    mean, low, high = result.figures.estimates["mean_steps"]
+    assert mean == pytest.approx(aggregate_mean(scores))
     assert low < mean < high
-    assert result.means["test/success_rate"] == (1.0, 1.0, 1.0)
+    assert result.figures.estimates["success_rate"] == (1.0, 1.0, 1.0)
 
 
 def test_verdict_of_the_same_trials_is_the_same_and_lacks_those_that_have_not_finished():
@@ -37,13 +42,12 @@ def test_verdict_of_the_same_trials_is_the_same_and_lacks_those_that_have_not_fi
     trials.append(judged(2, figures_of([0.0]), TrialState.FAIL))
     first, second = final_results(trials), final_results(trials)
     assert first == second
-    assert first != final_results(trials, seed=1)
     assert [result.n_seeds for result in first] == [6, 6]
 
 
 def test_verdict_of_one_seed_has_no_interval():
     (result,) = final_results([judged(0, figures_of([2.0]))])
-    mean, low, high = result.means["test/mean_steps"]
+    mean, low, high = result.figures.estimates["mean_steps"]
     assert mean == 2.0
     assert np.isnan([low, high]).all()
 
@@ -51,7 +55,7 @@ def test_verdict_of_one_seed_has_no_interval():
 def test_verdict_leaves_out_figures_that_some_seeds_lack():
     uneven = [judged(0, figures_of([2.0]) | {f"test/only_{seed}": 1.0}) for seed in range(2)]
     (result,) = final_results(uneven)
-    assert result.means.keys() == {"test/mean_steps", "test/success_rate"}
+    assert result.figures.estimates.keys() == {"mean_steps", "success_rate"}
 
 
 def test_verdict_leaves_the_draws_of_others_alone(monkeypatch):
@@ -64,6 +68,49 @@ def test_verdict_leaves_the_draws_of_others_alone(monkeypatch):
 def test_verdict_on_one_volume_has_the_interval_of_rliable():
     scores = np.random.default_rng(0).gamma(2.0, 2.0, (20, 1))
     (result,) = final_results([judged(7, figures_of(list(of_seed))) for of_seed in scores])
-    _, ends = get_interval_estimates({"it": scores}, lambda each: np.array([aggregate_iqm(each)]), reps=10_000)
+    _, ends = get_interval_estimates({"it": scores}, lambda each: np.array([aggregate_mean(each)]), reps=10_000)
     # But for what is left to chance, as rliable takes no seed: of few scores, an interval may end on one or on another.
-    assert result.means["test/mean_steps"][1:] == pytest.approx(ends["it"][:, 0], rel=0.05)
+    assert result.figures.estimates["mean_steps"][1:] == pytest.approx(ends["it"][:, 0], rel=0.05)
+
+
+def test_table_of_a_study_is_that_of_the_episodes_that_it_keeps():
+    of_seeds = {seed: made_episodes(seed) for seed in (1000, 1001, 1002)}
+    kept = {
+        seed: {
+            "test volumes": {"on_plane": [[5, 10], [2, 5]], "episodes": Evaluation(episodes).columns()},
+            "random": {"on_plane": [[5, 10], [2, 5]], "episodes": Evaluation(made_episodes(7)).columns()},
+        }
+        for seed, episodes in of_seeds.items()
+    }
+    trials = [
+        create_trial(
+            value=0.0,
+            user_attrs={FINALIST: 4, FINAL_SEED: seed, METRICS: {"test/mean_steps": 0.0}},
+            # As a storage gives it back.
+            system_attrs={EPISODES: json.loads(json.dumps(each))},
+        )
+        for seed, each in kept.items()
+    ]
+    table = final_table(final_results(trials))
+    assert list(table.results) == ["trial 4", "random"]
+    episodes = [episode for each in of_seeds.values() for episode in each]
+    for name, expected in recomputed(episodes).items():
+        assert table.results["trial 4"].estimates[name].value == pytest.approx(expected), name
+    counts = table.results["trial 4"]
+    assert (counts.n_seeds, counts.n_volumes, counts.n_episodes) == (3, 4, 3 * len(of_seeds[1000]))
+    assert final_results(trials) == final_results(trials)
+
+
+def test_baselines_of_other_rules_are_named_after_their_trials():
+    def trial(number, baseline):
+        episodes = {"test volumes": made_episodes(0), "random": baseline}
+        kept = {
+            name: {"on_plane": [[5, 10]], "episodes": Evaluation(each).columns()} for name, each in episodes.items()
+        }
+        attributes = {FINALIST: number, FINAL_SEED: 1, METRICS: {}}
+        return create_trial(value=0.0, user_attrs=attributes, system_attrs={EPISODES: kept})
+
+    ours = made_episodes(7)
+    others = tuple(replace(episode, n_steps=50) for episode in ours)
+    table = final_table(final_results([trial(0, ours), trial(1, ours), trial(2, others)]))
+    assert list(table.results) == ["trial 0", "trial 1", "trial 2", "random of trial 0, trial 1", "random of trial 2"]

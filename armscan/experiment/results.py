@@ -1,0 +1,153 @@
+"""The result of a run: its agent and the baselines in one table, what to think of it, and the files that keep it."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from operator import methodcaller
+from pathlib import Path
+
+from armscan.experiment.build import Experiment
+from armscan.reports.html import page
+from armscan.training import (
+    TEST,
+    TRAINING,
+    VALIDATION,
+    Evaluation,
+    MetricEstimates,
+    ResultTable,
+    TrainingResult,
+    evaluate,
+    evaluate_baselines,
+)
+from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE, atomic_write
+
+# First seeds of the final evaluations' episodes; those of the baselines do not depend on the seed of the run.
+TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED = 2 * 10**6, 3 * 10**6
+LAST_VALIDATION = "last validation"
+TITLES = {
+    TEST: "agent, test",
+    VALIDATION: "agent, validation",
+    LAST_VALIDATION: f"agent, {LAST_VALIDATION}",
+    TRAINING: "agent, training",
+}
+# Metrics of evaluations have this among them, below the name of their group, which a run shortens.
+EVALUATED = "/success_rate"
+NAMES = {name.replace(" ", "_"): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
+# With fewer volumes intervals are clearly too narrow: docs/evaluation.md.
+FEWEST_VOLUMES = 8
+WHAT_HELPS = "more wrists, data=mixed, or cross-validation (runs with other splits of the wrists) would help"
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run has reached.
+
+    Args:
+        evaluations: final evaluations of the agent, by the names of their volumes.
+        baselines: episodes of the baselines on the test volumes, by their names.
+        validation: validation of the best epoch; None where nothing was learned.
+    """
+
+    evaluations: Mapping[str, Evaluation]
+    baselines: Mapping[str, Evaluation]
+    validation: Evaluation | None = None
+
+    @classmethod
+    def of(cls, setup: Experiment, result: TrainingResult | None) -> RunResult:
+        """Play the final evaluations of a setup's agent, and the baselines on its test volumes.
+
+        Args:
+            setup: the experiment, its agent with the weights that are judged.
+            result: result of the training; None where nothing was to be learned.
+        """
+        agent, seed, n_episodes, on_plane = setup.agent, setup.seed, setup.n_episodes, setup.on_plane
+        first_seeds = {TRAINING: TRAINING_VOLUMES_SEED + seed, TEST: TEST_VOLUMES_SEED + seed}
+        envs = {TRAINING: setup.training_env, TEST: setup.test_env}
+        evaluations = {
+            name: evaluate(agent, envs[name], n_episodes=n_episodes, seed=first, on_plane=on_plane)
+            for name, first in first_seeds.items()
+        }
+        baselines = evaluate_baselines(setup.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED, on_plane=on_plane)
+        return cls(evaluations, baselines, result.best.evaluation if result else None)
+
+    @cached_property
+    def figures(self) -> dict[str, MetricEstimates]:
+        """Figures with their intervals, by the names of the agent's volumes and of the baselines."""
+        played = {**self.baselines, **self.evaluations}
+        played |= {VALIDATION: self.validation} if self.validation else {}
+        return {name: MetricEstimates.of(evaluation) for name, evaluation in played.items()}
+
+    def table(self) -> ResultTable:
+        """Return the agent on the test volumes, the baselines there, then the agent on its other volumes."""
+        return result_table(self.figures)
+
+    def metrics(self) -> dict[str, dict[str, float]]:
+        """Return the numbers of the table, and all means, by the names of the volumes and of the baselines."""
+        shown = [column.metric for column in self.table().quantities]
+        metrics = {name: figures.shown_metrics(shown) for name, figures in self.figures.items()}
+        for name, evaluation in self.evaluations.items():
+            metrics[name] |= evaluation.metrics()
+        return metrics
+
+    def notes(self) -> list[str]:
+        """Return what has to be said of the volumes; see `volume_notes`."""
+        return volume_notes(self.figures[TEST], self.figures.get(VALIDATION))
+
+    def write(self, folder: Path, *, title: str) -> None:
+        """Write all episodes, and a page with the table, into the folder of the run."""
+        for file, evaluations in ((EVALUATION_FILE, self.evaluations), (BASELINES_FILE, self.baselines)):
+            contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
+            atomic_write(folder / file, methodcaller("write", json.dumps(contents, indent=1).encode()))
+        notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes())
+        text = page(title, f"{self.table().html()}{notes}")
+        atomic_write(folder / RESULTS_PAGE, methodcaller("write", text.encode()))
+
+
+def result_table(figures: Mapping[str, MetricEstimates]) -> ResultTable:
+    """Return the table of figures by the names of the agent's volumes and of the baselines, the test volumes first."""
+    of_agent = [name for name in TITLES if name in figures and name != TEST]
+    baselines = [name for name in figures if name not in TITLES]
+    ordered = [*([TEST] if TEST in figures else []), *baselines, *of_agent]
+    return ResultTable({TITLES.get(name, f"{name}, test"): figures[name] for name in ordered})
+
+
+def figures_of(metrics: Mapping[str, float]) -> dict[str, MetricEstimates]:
+    """Return the figures that a run has tracked, by the names of the agent's volumes and of the baselines.
+
+    Args:
+        metrics: metrics of the run; of evaluated groups, those of single volumes are left out.
+    """
+    evaluated = (name.removesuffix(EVALUATED) for name in metrics if name.endswith(EVALUATED))
+    return {
+        NAMES.get(group, group.replace("_", " ")): MetricEstimates.of_metrics(
+            {name.removeprefix(f"{group}/"): each for name, each in metrics.items() if name.startswith(f"{group}/")}
+        )
+        for group in evaluated
+        if "/" not in group and group != "train"
+    }
+
+
+def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = None) -> list[str]:
+    """Return what has to be said of a result's volumes: intervals that do not overlap, or too few volumes.
+
+    Args:
+        test: figures on the test volumes.
+        validation: those on the validation volumes. Default: None, nothing was validated.
+    """
+    if validation is not None:
+        leading = test.on_plane[0]
+        here, there = (each.estimate(leading.metric) for each in (test, validation))
+        if here.low > there.high or there.low > here.high:
+            return [
+                f"{leading.title}: {there.value:.0%} on the validation and {here.value:.0%} on the test volumes, and "
+                "the intervals do not overlap: volumes differ more than episodes do, and other wrists may lie anywhere "
+                f"between or outside; {WHAT_HELPS}"
+            ]
+    if test.n_volumes >= FEWEST_VOLUMES:
+        return []
+    few = f"{test.n_volumes} test volume{'s are' if test.n_volumes > 1 else ' is'} fewer than {FEWEST_VOLUMES}"
+    return [f"{few}: the intervals are too narrow for other wrists; {WHAT_HELPS}"]

@@ -1,0 +1,100 @@
+"""What an agent is compared with: random planes, and a sweep from the middle outward, on the same volumes and rules.
+
+Their episodes are kept in the machine's cache, because many runs have the same volumes and rules.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+
+import armscan
+from armscan.agents.baselines import ROTATIONS, Exhaustive, ExhaustiveAgent, RandomAgent
+from armscan.agents.protocols import Agent
+from armscan.envs.actions import COMPONENTS
+from armscan.envs.rules import Rules
+from armscan.training.episodes import evaluate
+from armscan.training.fingerprints import fingerprint
+from armscan.training.on_plane import ON_PLANE, OnPlane
+from armscan.training.rollout import Env, Evaluation
+from armscan.utils.files import atomic_write, cache_folder
+
+FOLDER = "baselines"
+# What decides how an episode goes, beside the agent.
+SOURCES = ("agents/baselines.py", "training/episodes.py", "volumes/**/*.py", "anatomy/**/*.py", "envs/**/*.py")
+RANDOM = "random"
+
+
+def evaluate_baselines(
+    env: Env, *, n_episodes: int, seed: int, on_plane: tuple[OnPlane, ...] = ON_PLANE
+) -> dict[str, Evaluation]:
+    """Return the episodes of the baselines, by their names: `random` and, where one component is free, a sweep.
+
+    Args:
+        env: environment of the volumes.
+        n_episodes: number of episodes, in turn on the volumes.
+        seed: seed of the first episode; the others follow from it.
+        on_plane: limits within which a plane counts as the labelled one. Default: those of `Evaluation`.
+    """
+    names = tuple(env.get_wrapper_attr("action_names"))
+    agents: dict[str, Agent] = {RANDOM: RandomAgent(len(names))}
+    free = [name for name in names if name in COMPONENTS]
+    if len(free) == 1:
+        steps = Exhaustive()
+        step = f"{steps.step_deg:g}°" if free[0] in ROTATIONS else f"{steps.step_mm:g} mm"
+        agents[f"sweep {step}"] = ExhaustiveAgent(names, free, step_mm=steps.step_mm, step_deg=steps.step_deg)
+    rules = _rules_of(env.get_wrapper_attr("rules"))
+    evaluations = {}
+    for name, agent in agents.items():
+        file = _file(name, rules, n_episodes, seed) if rules else None
+        evaluation = _kept(file) if file else None
+        if evaluation is None:
+            evaluation = evaluate(agent, env, n_episodes=n_episodes, seed=seed)
+            if file:
+                _keep(evaluation, file)
+        evaluations[name] = Evaluation(evaluation.episodes, on_plane)
+    return evaluations
+
+
+def _rules_of(rules: Rules) -> str | None:
+    """Return all that episodes depend on beside the agent; None where classes of others have a part in it."""
+    parts = (rules.reward, *rules.tissues, *([rules.transform] if rules.transform else []))
+    if not all(type(part).__module__.startswith("armscan.") for part in parts):
+        return None
+    prints = [(name, fingerprint(volume)) for name, volume in rules.volumes.items()]
+    shared = (rules.action_names, rules.success_threshold, rules.ends, rules.max_steps, rules.start, rules.bounds)
+    return repr((prints, shared, rules.tissues, rules.transform, type(rules.reward), vars(rules.reward), _sources()))
+
+
+@cache
+def _sources() -> str:
+    """Return the fingerprint of the code that plays episodes: changed code never meets old episodes."""
+    folder, digest = Path(armscan.__file__).parent, hashlib.sha256()
+    for file in sorted(file for pattern in SOURCES for file in folder.glob(pattern)):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _file(name: str, rules: str, n_episodes: int, seed: int) -> Path:
+    digest = hashlib.sha256(repr((name, rules, n_episodes, seed)).encode()).hexdigest()
+    return cache_folder() / FOLDER / f"{digest[:32]}.json"
+
+
+def _kept(file: Path) -> Evaluation | None:
+    try:
+        return Evaluation.of_plain(json.loads(file.read_bytes()))
+    except (OSError, ValueError):
+        # Not there, or damaged: the episodes can always be played again.
+        return None
+
+
+def _keep(evaluation: Evaluation, file: Path) -> None:
+    text = json.dumps([asdict(episode) for episode in evaluation.episodes]).encode()
+    # A cache that cannot be written costs seconds, and no result.
+    with contextlib.suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(file, lambda opened: opened.write(text))

@@ -1,0 +1,67 @@
+"""When a plane counts as the labelled one: limits of distance and angle, and the share of episodes within them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from armscan.errors import InvalidValueError
+from armscan.utils.validation import check_numbers
+
+WANTED = "a list of different pairs [mm, degrees], each above 0, such as [[5, 10], [2, 5]]"
+PREFIX = "on_plane_"
+
+
+class OnPlane(NamedTuple):
+    """Limits within which a plane counts as the labelled one, both ends included.
+
+    Args:
+        mm: largest distance of the slice's centre along the labelled normal, in mm, above 0.
+        deg: largest angle between the normals, in degrees, above 0.
+    """
+
+    mm: float
+    deg: float
+
+    @property
+    def metric(self) -> str:
+        """Name of the rate as a metric, such as `on_plane_5mm_10deg`."""
+        return f"{PREFIX}{self.mm:g}mm_{self.deg:g}deg"
+
+    @property
+    def title(self) -> str:
+        """Name of the rate for people, such as `on plane, 5 mm 10°`."""
+        return f"on plane, {self.mm:g} mm {self.deg:g}°"
+
+    def holds(self, distance_mm: float, distance_deg: float) -> bool:
+        """Return whether a plane at this distance and angle from the labelled one is within the limits."""
+        return distance_mm <= self.mm and distance_deg <= self.deg
+
+
+# The first leads, the second is the strict one.
+ON_PLANE = (OnPlane(5.0, 10.0), OnPlane(2.0, 5.0))
+
+
+def limits_among(names: Iterable[str]) -> tuple[OnPlane, ...]:
+    """Return the limits whose rates are among metrics, in their order."""
+    found = (re.fullmatch(rf"{PREFIX}([\d.e+-]+)mm_([\d.e+-]+)deg", name) for name in names)
+    return tuple(OnPlane(float(match[1]), float(match[2])) for match in found if match)
+
+
+def check_on_plane(name: str, limits: object) -> tuple[OnPlane, ...]:
+    """Return limits that were given as pairs, the first of which leads.
+
+    Args:
+        name: what an error calls them, such as `evaluation.on_plane`.
+        limits: pairs of mm and degrees.
+
+    Raises:
+        InvalidValueError: if they are no list, empty, or a pair is none, not above 0, or there twice.
+    """
+    if not isinstance(limits, Sequence) or isinstance(limits, str) or not limits:
+        raise InvalidValueError(f"{name} is {limits!r}, but it must be {WANTED}")
+    pairs = [OnPlane(*check_numbers(name, pair, 2, "(mm, degrees) each")) for pair in limits]
+    if min(min(pair) for pair in pairs) <= 0.0 or len({pair.metric for pair in pairs}) < len(pairs):
+        raise InvalidValueError(f"{name} is {limits!r}, but it must be {WANTED}")
+    return tuple(pairs)

@@ -1,0 +1,248 @@
+"""The table of results: the same figures, with the same names, wherever a result is shown.
+
+Every figure is over all episodes, failed ones included, with its 95 % interval, and its name says which statistic it
+is. The share of episodes that end on the labelled plane leads: the reward also accepts planes far from it.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from rich.text import Text
+
+from armscan.stats.bootstrap import Estimate
+from armscan.training.metrics import MetricEstimates
+
+# The most results that stand side by side; more of them are lines of their own.
+MOST_ABREAST = 6
+# Between two cells.
+PADDING_CHARS = 2
+MISSING = "–"
+HOW = (
+    "95 % intervals draw seeds, volumes and episodes; where all episodes of a rate are alike it is Wilson's, which "
+    "takes them as independent. Means are over all episodes, failed ones included; IQM is the mean of the middle half "
+    "of them. On plane: the last plane is this close to the labelled one. Success: the reward accepts the last plane, "
+    "which may be another."
+)
+
+
+# A heading, and a cell for each line.
+Column = tuple[str, Sequence[str]]
+
+
+class Quantity(NamedTuple):
+    """A column of the table.
+
+    Args:
+        metric: name of the metric.
+        title: what people call it, its statistic last.
+        form: format of its value.
+    """
+
+    metric: str
+    title: str
+    form: str
+
+    @property
+    def heading(self) -> str:
+        """The title in two lines, as the cells are."""
+        return self.title.replace(", ", ",\n", 1)
+
+
+QUANTITIES = (
+    Quantity("median_distance_mm", "distance mm, median", "{:.1f}"),
+    Quantity("p90_distance_mm", "distance mm, 90th percentile", "{:.1f}"),
+    Quantity("median_distance_deg", "angle °, median", "{:.1f}"),
+    Quantity("p90_distance_deg", "angle °, 90th percentile", "{:.1f}"),
+    Quantity("success_rate", "success, by reward", "{:.1%}"),
+    Quantity("mean_steps", "steps, mean", "{:.2f}"),
+    Quantity("iqm_steps", "steps, IQM", "{:.2f}"),
+    *(Quantity(f"mean_dice_{name}", f"Dice {name}, mean", "{:.2f}") for name in ("bones", "tendons", "artery")),
+)
+# Of runs by older versions, which have kept nothing better.
+OLDER = {
+    Quantity("mean_distance_mm", "distance mm, mean", "{:.1f}"): "median_distance_mm",
+    Quantity("mean_distance_deg", "angle °, mean", "{:.1f}"): "median_distance_deg",
+    Quantity("mean_dice", "Dice, mean", "{:.2f}"): "mean_dice_bones",
+}
+# What a line has place for first, after the leading rate.
+MOST_WANTED = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
+COUNTS = {"episodes": "n_episodes", "started solved": "n_started_solved", "seeds": "n_seeds", "volumes": "n_volumes"}
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """Results side by side.
+
+    Args:
+        results: figures of each result, by its name, such as `random, test`; the on-plane limits are those of the
+            first.
+        facts: further columns of the results, by heading, each with a text for each result; they come first.
+    """
+
+    results: Mapping[str, MetricEstimates]
+    facts: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @property
+    def quantities(self) -> list[Quantity]:
+        """The columns of which any result has a figure; of results that have none of them, all metrics."""
+        known = {
+            name for each in self.results.values() for name, estimate in each.estimates.items() if is_known(estimate)
+        }
+        limits = next((each.on_plane for each in self.results.values()), ())
+        older = [column for column, better in OLDER.items() if better not in known]
+        columns = [*(Quantity(each.metric, each.title, "{:.1%}") for each in limits), *QUANTITIES, *older]
+        shown = [column for column in columns if column.metric in known]
+        return shown or [Quantity(name, name.replace("_", " ") + ", mean", "{:.3g}") for name in sorted(known)]
+
+    def show(self, width: int) -> list[Table | Text]:
+        """Return what to print on a terminal: a few results side by side, many as lines.
+
+        Args:
+            width: width of the terminal, in characters; what does not fit is left out, and named.
+        """
+        if not self.facts and len(self.results) <= MOST_ABREAST:
+            return [*self._abreast(width)]
+        return self.lines(width)
+
+    def html(self) -> str:
+        """Return the table as HTML, a line for each result."""
+        headings = ["", *self.facts, *(column.title for column in self.quantities), *COUNTS]
+        lines = [f"<tr>{''.join(f'<th>{html.escape(heading)}</th>' for heading in headings)}</tr>"]
+        for number, (name, result) in enumerate(self.results.items()):
+            facts = [html.escape(values[number]) for values in self.facts.values()]
+            cells = [_html_cell(result, column) for column in self.quantities]
+            counts = [_count(result, count) for count in COUNTS.values()]
+            line = "".join(f"<td>{cell}</td>" for cell in (html.escape(name), *facts, *cells, *counts))
+            lines.append(f"<tr>{line}</tr>")
+        return f'<div class="results"><table>{"".join(lines)}</table><p><small>{HOW}</small></p></div>'
+
+    def markdown(self) -> str:
+        """Return the table in Markdown, a column for each result."""
+        rows = [["with 95 % intervals", *self.results], ["---", *("---:" for _ in self.results)]]
+        for column in self.quantities:
+            cells = (" ".join(_cell(each, column, "({})")) for each in self.results.values())
+            rows.append([column.title, *cells])
+        for title, count in COUNTS.items():
+            rows.append([title, *(_count(each, count) for each in self.results.values())])
+        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+    def _abreast(self, width: int) -> list[Table]:
+        """Return tables with a column for each result, as many beside each other as fit."""
+        first = [column.heading for column in self.quantities] + list(COUNTS)
+        columns = []
+        for name, result in self.results.items():
+            cells = ["\n".join(_cell(result, column)) for column in self.quantities]
+            cells += [_count(result, count) for count in COUNTS.values()]
+            columns.append((name.replace(", ", ",\n"), cells))
+        tables, left = [], columns
+        while left:
+            fitting = _fitting(width, [("", first)], left)
+            tables.append(_table([("", first)], left[:fitting]))
+            left = left[fitting:]
+        return tables
+
+    def lines(self, width: int) -> list[Table | Text]:
+        """Return a table with a line for each result and the columns that fit, and the names of the others."""
+        names = [("", list(self.results)), *((heading, list(values)) for heading, values in self.facts.items())]
+        columns: dict[str, Column] = {}
+        for column in self.quantities:
+            cells = ["\n".join(_cell(each, column)) for each in self.results.values()]
+            columns[column.metric] = column.heading, cells
+        for title, count in COUNTS.items():
+            columns[count] = title.replace(" ", "\n"), [_count(each, count) for each in self.results.values()]
+        # Those that matter most first; sorting leaves the others in their order.
+        leading = (next(iter(columns)), *MOST_WANTED)
+        by_need = sorted(columns, key=lambda name: leading.index(name) if name in leading else len(leading))
+        fitting = by_need[: _fitting(width, names, [columns[name] for name in by_need])]
+        tables: list[Table | Text] = [_table(names, [columns[name] for name in columns if name in fitting])]
+        if left := [columns[name][0].replace("\n", " ") for name in columns if name not in fitting]:
+            tables.append(Text(f"not shown at {width} characters: {'; '.join(left)}"))
+        return tables
+
+
+def with_baselines(
+    results: Mapping[str, MetricEstimates], baselines: Mapping[str, Mapping[str, MetricEstimates]]
+) -> dict[str, MetricEstimates]:
+    """Return results with the baselines below them.
+
+    Args:
+        results: figures of each result, by its name.
+        baselines: those that belong to a result, by its name and theirs. Results with the same volumes and rules have
+            the same ones, which are shown once; others are named after their results.
+    """
+    of_figures: dict[tuple[str, str], list[str]] = {}
+    for result, ours in baselines.items():
+        for name, figures in ours.items():
+            # Times, which are never the same twice, are not shown.
+            shown = [figures.estimate(column.metric) for column in ResultTable({name: figures}).quantities]
+            of_figures.setdefault((name, repr(shown)), []).append(result)
+    below = {}
+    for (name, _), which in of_figures.items():
+        of_which = f" of {', '.join(which)}" if len(which) < len(results) else ""
+        below[f"{name}{of_which}"] = baselines[which[0]][name]
+    return {**results, **below}
+
+
+def is_known(estimate: Estimate) -> bool:
+    """Return whether a figure was measured."""
+    return not math.isnan(estimate.value)
+
+
+def interval_text(estimate: Estimate, form: str) -> str:
+    """Return an interval such as `1.5–2.0`; empty where there is none."""
+    if math.isnan(estimate.low):
+        return ""
+    low, high = (form.format(end).removesuffix("%") for end in estimate[1:])
+    # A dash between numbers below zero would be read as another minus.
+    return f"{low}{' to ' if estimate.low < 0 else '–'}{high}"
+
+
+def _cell(result: MetricEstimates, column: Quantity, around: str = "{}") -> tuple[str, str]:
+    """Return a value and its interval as texts."""
+    estimate = result.estimate(column.metric)
+    if not is_known(estimate):
+        return MISSING, ""
+    interval = interval_text(estimate, column.form)
+    return column.form.format(estimate.value), interval and around.format(interval)
+
+
+def _count(result: MetricEstimates, name: str) -> str:
+    return str(getattr(result, name)) if result.n_episodes else MISSING
+
+
+def _html_cell(result: MetricEstimates, column: Quantity) -> str:
+    value, interval = _cell(result, column)
+    return f"{value}<br><small>{interval}</small>"
+
+
+def _width(column: Column) -> int:
+    heading, cells = column
+    return max(len(line) for text in (heading, *cells) for line in text.split("\n")) + PADDING_CHARS
+
+
+def _fitting(width: int, names: Sequence[Column], columns: Sequence[Column]) -> int:
+    """Return how many of the columns fit beside the names, at least one."""
+    taken = sum(map(_width, names))
+    for number, column in enumerate(columns):
+        taken += _width(column)
+        if taken > width:
+            return max(1, number)
+    return len(columns)
+
+
+def _table(names: Sequence[Column], columns: Sequence[Column]) -> Table:
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    for heading, _ in names:
+        table.add_column(Text(heading), overflow="fold")
+    for heading, _ in columns:
+        table.add_column(Text(heading, justify="right"), justify="right", no_wrap=True)
+    for line in zip(*(cells for _, cells in (*names, *columns)), strict=True):
+        table.add_row(*map(Text, line))
+    return table
