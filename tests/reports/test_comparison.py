@@ -30,7 +30,7 @@ def test_twenty_groups_have_a_report(written, make_training):
         *(make_training(seed, params={"agent.lr": str(lr)}, mean_steps=lr) for lr in range(1, 21) for seed in range(2))
     )
     assert "40 runs in 20 groups" in page
-    assert len(rows("improvement")) == 3 * 20 * 19 / 2
+    assert len(rows("improvement")) == 4 * 20 * 19 / 2
     assert page.count("data-video") == 20
     steps = {row["group"]: float(row["value"]) for row in rows("final") if row["figure"] == "mean_steps"}
     assert steps == {f"agent.lr={lr}": lr for lr in range(1, 21)}
