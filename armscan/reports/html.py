@@ -24,7 +24,7 @@ table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
 .chart {{ overflow-x: auto; }}
 td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; }}
 td small {{ color: #555; white-space: nowrap; }}
-.results td, .results th {{ padding: .2rem .4rem; font-size: 13px; vertical-align: top; }}
+.results td, .results th {{ padding: .15rem .25rem; font-size: 12px; vertical-align: top; }}
 .results td {{ text-align: right; white-space: nowrap; }}
 .results td:first-child {{ text-align: left; white-space: normal; min-width: 7rem; }}
 summary {{ cursor: pointer; font-weight: bold; margin: 1.5rem 0; }}
