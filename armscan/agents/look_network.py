@@ -16,6 +16,8 @@ IMAGE, ACTION = "shares", "action"
 UNITS = (0.1, 0.05, 3.0, 8.0)
 # What the places of earlier looks are divided by, and how large they may become.
 PLACES, MOST_PLACE = (0.2, 0.2, 10.0, 20.0), 6.0
+# No error is expected to be less, in mm and degrees: far below what is reached, and its logarithm is a number.
+LEAST_DOUBT = 0.01
 # Kernel of each convolution; all have stride 2.
 KERNELS = (5, 3, 3)
 
@@ -81,7 +83,7 @@ class LookNetwork(nn.Module):
             place = geometry.seen_from(planes[:, -1], planes[:, -i]) / self.places
             features.append(place.clamp(-MOST_PLACE, MOST_PLACE))
         hidden = self.linear(torch.cat(features, dim=1))
-        return self.place(hidden) * self.units, self.doubt(hidden.detach()).clamp(-6.0, 5.0).exp()
+        return self.place(hidden) * self.units, nn.functional.softplus(self.doubt(hidden.detach())) + LEAST_DOUBT
 
 
 class FinderModule(nn.Module):
@@ -113,8 +115,8 @@ class FinderModule(nn.Module):
         super().__init__()
         self.network, self.geometry = network, geometry
         self._is_ever_sure, self._has_stop = sure is not None, has_stop
-        self.register_buffer("offsets", torch.tensor(offsets_mm))
-        self.register_buffer("sure", torch.tensor(sure or (0.0, 0.0)))
+        self.register_buffer("offsets", torch.tensor(offsets_mm), persistent=False)
+        self.register_buffer("sure", torch.tensor(sure or (0.0, 0.0)), persistent=False)
         self.register_buffer("calibration", torch.ones(2))
 
     def estimate(self, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

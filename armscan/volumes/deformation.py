@@ -35,7 +35,8 @@ class DeformingTransform(RigidTransform):
     def __post_init__(self) -> None:
         super().__post_init__()
         matrix = self.deformation
-        if matrix.shape != (3, 3) or matrix[1, [0, 2]].any() or not abs(np.linalg.det(matrix)) > 0.0:
+        is_map = matrix.shape == (3, 3) and bool(np.isfinite(matrix).all())
+        if not is_map or matrix[1, [0, 2]].any() or np.linalg.det(matrix) == 0.0:
             raise InvalidValueError(
                 f"deformation is {matrix.tolist()}, but it must be 3 x 3, not flat, with zeros beside the middle of "
                 "its second row"
