@@ -103,8 +103,8 @@ def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) ->
     dice = {}
     for label in LANDMARK_LABELS:
         mask, reference = slice_xz == label, reference_xz == label
-        total = int(mask.sum() + reference.sum())
-        dice[LABEL_NAMES[label]] = 2.0 * int((mask & reference).sum()) / total if total else 1.0
+        total = int(np.count_nonzero(mask) + np.count_nonzero(reference))
+        dice[LABEL_NAMES[label]] = 2.0 * int(np.count_nonzero(mask & reference)) / total if total else 1.0
     return dice
 
 

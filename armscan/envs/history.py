@@ -102,6 +102,8 @@ class FrameHistory:
         # A ring for each environment, because not all of them take every step.
         self._frames = {name: np.empty((n_envs, size, *box.shape), box.dtype) for name, box in stacked.items()}
         self._latest = np.full(n_envs, size - 1)
+        # For each place of the latest one, the places from the oldest, which is overwritten next, to the latest.
+        self._places = (np.arange(size)[:, None] + np.arange(1, size + 1)) % size
         self.boxes = {**boxes, **{name: self._stacked_box(name, box) for name, box in stacked.items()}}
 
     def refill(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
@@ -111,20 +113,19 @@ class FrameHistory:
 
     def push(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
         """See `Remembered.push`."""
-        self._latest[env_ids] = latest = (self._latest[env_ids] + 1) % self._size
+        self._latest[env_ids] = latest = self._places[self._latest[env_ids], 0]
         for name, frames in self._frames.items():
             frames[env_ids, latest] = parts[name]
 
     def added_to(self, parts: Parts, env_ids: EnvIds) -> Parts:
         """Return the latest observations, what is stacked of them as (n_envs, size, ...)."""
-        # From the oldest on, which the latest one's next place holds.
-        order = (self._latest[env_ids, None] + np.arange(1, self._size + 1)) % self._size
+        places = self._places[self._latest[env_ids]]
         return {
-            name: self._stack(name, env_ids, order) if name in self._frames else part for name, part in parts.items()
+            name: self._stack(name, env_ids, places) if name in self._frames else part for name, part in parts.items()
         }
 
-    def _stack(self, name: str, env_ids: EnvIds, order: NDArray[np.int64]) -> NDArray[Any]:
-        stack = self._frames[name][env_ids[:, None], order]
+    def _stack(self, name: str, env_ids: EnvIds, places: NDArray[np.int64]) -> NDArray[Any]:
+        stack = self._frames[name][env_ids[:, None], places]
         return stack.reshape(len(stack), -1) if name == FLAT else stack
 
     def _stacked_box(self, name: str, box: spaces.Box) -> spaces.Box:
