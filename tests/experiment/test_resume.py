@@ -157,17 +157,17 @@ def test_run_killed_again_and_again_ends_as_if_it_had_not_been(tmp_path, argumen
 
 def moments(drawn):
     """Twenty moments of one training, in the order in which it meets them, each in a process of its own."""
-    collecting, validating = "armscan.envs.vector_env:ArmscanVectorEnv.step", "armscan.envs.env:ArmscanEnv.step"
-    updating = "torch.optim:Adam.step"
+    collecting, validating = "armscan.envs.vector_env:ArmscanVectorEnv.step", "armscan.training.episodes:step_each"
+    updating = "armscan.agents.compiled_sac:CompiledSAC.update_repeatedly"
     soon = partial(drawn.uniform, 0.0, 0.01)
     return [
         # Before there is a checkpoint.
         Moment(collecting, drawn.randrange(1, 7)),
         Moment(collecting, drawn.randrange(7, 20), soon()),
-        Moment(updating, drawn.randrange(1, 50)),
-        Moment(updating, drawn.randrange(50, 200), soon()),
-        Moment(validating, drawn.randrange(1, 5)),
-        Moment(validating, drawn.randrange(5, 9), soon()),
+        Moment(updating, drawn.randrange(1, 6)),
+        Moment(updating, drawn.randrange(6, 12), soon()),
+        Moment(validating),
+        Moment("armscan.training.episodes:_result", drawn.randrange(1, 3), soon()),
         # While the first is written: before its contents, in the middle, behind them, before and after its name.
         Moment("torch:save"),
         Moment("torch:save", 1, drawn.uniform(0.0, 0.003)),
@@ -182,7 +182,7 @@ def moments(drawn):
         Moment("armscan.tracking.run:TrackedRun.on_epoch"),
         Moment("armscan.tracking.run:TrackedRun.on_epoch", 1, 900.0),
         Moment("mlflow:MlflowClient.log_batch", drawn.randrange(1, 4), 900.0),
-        Moment(updating, drawn.randrange(1, 200)),
+        Moment(updating, drawn.randrange(1, 12)),
         # When all is learned.
         Moment("armscan.training.video:VideoRecorder.capture", 1, drawn.uniform(0.0, 0.05)),
         Moment("armscan.experiment.runner:keep_results", 1, drawn.uniform(0.0, 0.1)),
