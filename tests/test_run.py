@@ -64,7 +64,7 @@ def test_run_trains_evaluates_and_tracks(tmp_path, monkeypatch):
     ended = armscan_run(*words, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
-    for word in ("400/400 steps", "return", "success", "left", "test volumes", "armscan ui", "episode.gif"):
+    for word in ("400/400 steps", "on plane", "success", "left", "test volumes", "armscan ui", "episode.gif"):
         assert word in ended.stdout
     client, (tracked,) = runs_in(tmp_path)
     assert f"run {tracked.info.run_id}: sac-cluster-y-phantom-seed3" in ended.stdout
