@@ -115,8 +115,8 @@ class FinderModule(nn.Module):
         super().__init__()
         self.network, self.geometry = network, geometry
         self._is_ever_sure, self._has_stop = sure is not None, has_stop
-        self.register_buffer("offsets", torch.tensor(offsets_mm), persistent=False)
-        self.register_buffer("sure", torch.tensor(sure or (0.0, 0.0)), persistent=False)
+        self.register_buffer("offsets", torch.tensor(offsets_mm, dtype=torch.float32), persistent=False)
+        self.register_buffer("sure", torch.tensor(sure or (0.0, 0.0), dtype=torch.float32), persistent=False)
         self.register_buffer("calibration", torch.ones(2))
 
     def estimate(self, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

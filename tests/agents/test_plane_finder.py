@@ -155,7 +155,7 @@ def test_phantoms_have_their_share_beside_other_volumes(phantom, share):
 
 
 def test_learner_learns_two_looks_and_five(phantom):
-    for offsets in ((9.0, 0.0), (9.0, -9.0, 9.0, -9.0, 0.0)):
+    for offsets in ((9.0, 0.0), (9, -9, 9, -9, 0)):
         n = len(offsets)
         learner, env = made(phantom, {"stack": n, "max_steps": n}, offsets_mm=offsets, n_seen=min(n, 3))
         learner.learn(n * 4)
