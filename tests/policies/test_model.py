@@ -22,14 +22,16 @@ from armscan.policies.build import FIRST_SEED, make_model, onnx_answers, save_po
 from armscan.policies.model import FILES, arrays_of, is_model, model_sha256, others_in
 from armscan.tracking import TrackedRun, open_store
 from tests.agents.conftest import ALGORITHMS, ENV_FACTORIES, setup_for
+from tests.agents.test_plane_finder import made as made_finder
 from tests.agents.test_policy import observed, taught
 from tests.support.waiting import HANG_S, wait_until
 
-# They export six policies and serve them.
+# They export seven policies and serve them.
 pytestmark = pytest.mark.full
 
 LOOPBACK = "127.0.0.1"
-VARIANTS = [(algorithm, made_of) for algorithm in ALGORITHMS for made_of in ENV_FACTORIES]
+FINDER = ("plane_finder", "looks")
+VARIANTS = [*((algorithm, made_of) for algorithm in ALGORITHMS for made_of in ENV_FACTORIES), FINDER]
 # Loads each model that it is given and asks it, for a batch of one and for all; what it has loaded is said at its end.
 ASK = """
 import sys, mlflow.pyfunc, numpy
@@ -45,6 +47,10 @@ print([name for name in ("armscan", "tianshou", "gymnasium") if name in sys.modu
 
 
 def learner_of(algorithm, made_of, phantom):
+    if (algorithm, made_of) == FINDER:
+        learner, env = made_finder(phantom, {"max_steps": 50}, sure_mm=1e9, sure_deg=10.0)
+        learner.learn(24)
+        return learner, env
     kind, small = ALGORITHMS[algorithm]
     env_factory, network = ENV_FACTORIES[made_of]
     return taught(kind(network=network, **small).agent(setup_for(env_factory, phantom))), env_factory.make_env(
