@@ -12,14 +12,14 @@ from torch import Tensor, nn
 
 from armscan.agents.finder_parameters import FinderParameters
 from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork
-from armscan.agents.plane_geometry import PlaneGeometry
+from armscan.agents.plane_geometry import common_geometry
 from armscan.agents.policy import Policy, batch_of, clip_action
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.tianshou_learner import diverged, is_finite, load_into
 from armscan.envs.actions import ActionBounds
-from armscan.envs.rules import ON_REWARD, Observed
+from armscan.envs.rules import Observed
 from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
-from armscan.errors import InvalidValueError, listed
+from armscan.errors import InvalidValueError
 from armscan.volumes.plane import FloatArray
 
 # What the names of phantoms begin with.
@@ -60,9 +60,9 @@ class PlaneFinderLearner:
             hidden_sizes=finder.hidden_sizes,
         )
         sure = None if finder.sure_mm is None or finder.sure_deg is None else (finder.sure_mm, finder.sure_deg)
-        self._module = FinderModule(
-            network, _geometry(_teacher(self._envs), finder), finder.offsets_mm, sure, has_stop=self._has_stop
-        ).to(self._device)
+        geometry = common_geometry(_teacher(self._envs).rules, finder.n_looks)
+        module = FinderModule(network, geometry, finder.offsets_mm, sure, has_stop=self._has_stop)
+        self._module = module.to(self._device)
         self._optimiser = torch.optim.Adam(network.parameters(), lr=finder.lr)
         self._n_env_steps = self._n_epochs = 0
         self.expected_error: tuple[float, float] | None = None
@@ -259,27 +259,3 @@ class PlaneFinderLearner:
 def _teacher(envs: Any) -> ArmscanVectorEnv:
     assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
     return envs.unwrapped
-
-
-def _geometry(teacher: ArmscanVectorEnv, finder: FinderParameters) -> PlaneGeometry:
-    """Return what planes are in these environments.
-
-    Raises:
-        InvalidValueError: if that differs between volumes, or an episode may end before all looks are taken.
-    """
-    rules = teacher.rules
-    if rules.ends == ON_REWARD or rules.max_steps < finder.n_looks:
-        raise InvalidValueError(
-            f"env.ends is {rules.ends!r} and env.max_steps is {rules.max_steps}, but agent=plane_finder looks beside "
-            f"the plane, {finder.n_looks} times: take env.ends=on_budget or on_stop, and at least "
-            f"env.max_steps={finder.n_looks}"
-        )
-    bounds = set(rules.bounds.values())
-    if len(bounds) > 1:
-        sizes = listed(" x ".join(f"{mm:g}" for mm in each.translation_mm) for each in bounds)
-        raise InvalidValueError(
-            f"the bounds of translations are {sizes} mm, but agent=plane_finder needs the same on all volumes: give "
-            "env.translation_bounds_mm"
-        )
-    middles = np.array([[volume.centre_mm[0], volume.centre_mm[2]] for volume in rules.volumes.values()])
-    return PlaneGeometry(bounds.pop(), middles.mean(axis=0).tolist())

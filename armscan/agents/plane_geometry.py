@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from armscan.envs.actions import ActionBounds
+from armscan.envs.rules import ON_REWARD, Rules
+from armscan.errors import InvalidValueError, listed
 
 # No plane is tilted further out of the frame of another than this sine, nor lies further across.
 MOST_TILT, MOST_ACROSS_MM = 0.98, 60.0
@@ -115,6 +118,31 @@ class PlaneGeometry(nn.Module):
         way = ((self.middles(planes) - self.middles(optima)) * normals).sum(1).abs()
         cross = torch.linalg.cross(self.normals(planes), normals).norm(dim=1)
         return torch.stack([way, torch.rad2deg(torch.asin(cross.clamp(max=1.0)))], dim=1)
+
+
+def common_geometry(rules: Rules, n_looks: int) -> PlaneGeometry:
+    """Return what planes are on all volumes of environments in which an agent takes `n_looks` looks.
+
+    Slices of other sizes are seen about their own middle, so that the mean of the middles serves all of them.
+
+    Raises:
+        InvalidValueError: if that differs between volumes, or an episode may end before all looks are taken.
+    """
+    if rules.ends == ON_REWARD or rules.max_steps < n_looks:
+        raise InvalidValueError(
+            f"env.ends is {rules.ends!r} and env.max_steps is {rules.max_steps}, but agent=plane_finder looks beside "
+            f"the plane, {n_looks} times: take env.ends=on_budget or on_stop, and at least "
+            f"env.max_steps={n_looks}"
+        )
+    bounds = set(rules.bounds.values())
+    if len(bounds) > 1:
+        sizes = listed(" x ".join(f"{mm:g}" for mm in each.translation_mm) for each in bounds)
+        raise InvalidValueError(
+            f"the bounds of translations are {sizes} mm, but agent=plane_finder needs the same on all volumes: give "
+            "env.translation_bounds_mm"
+        )
+    middles = np.array([[volume.centre_mm[0], volume.centre_mm[2]] for volume in rules.volumes.values()])
+    return PlaneGeometry(bounds.pop(), middles.mean(axis=0).tolist())
 
 
 def _matrices(planes: Tensor) -> Tensor:
