@@ -5,7 +5,7 @@ from dataclasses import fields
 import pytest
 from hypothesis import given
 
-from armscan.agents import MLP, SAC, Exhaustive, OptunaSearch, Regression
+from armscan.agents import MLP, SAC, Exhaustive, OptunaSearch, PlaneFinder, Regression
 from tests.support.junk import SETTINGS, junk, refuses
 
 
@@ -19,7 +19,7 @@ def test_sac_with_junk(changed, value):
 
 @pytest.mark.parametrize(
     ("kind", "changed"),
-    [(kind, field.name) for kind in (Exhaustive, OptunaSearch, Regression) for field in fields(kind)],
+    [(kind, field.name) for kind in (Exhaustive, OptunaSearch, PlaneFinder, Regression) for field in fields(kind)],
     ids=lambda value: getattr(value, "__name__", value),
 )
 @SETTINGS

@@ -2,6 +2,7 @@
 
 import pickle
 from contextlib import suppress
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from armscan.envs import (
     FrameStack,
     ManipulatorAction,
     MergedObservation,
+    MetricSliceObservation,
     MultiBoxSpace,
     RandomTransform,
     SliceChannelsObservation,
@@ -41,6 +43,7 @@ RULES = [
     "targets",
     "clustering",
     "success_threshold",
+    "ends",
     "max_steps",
     "start",
     "rotation_bounds_deg",
@@ -96,7 +99,7 @@ def test_env_with_several_kinds_of_junk(wrist, rules):
     try_out(refuses(lambda: make_armscan_env(**{"volumes": [wrist]} | rules)))
 
 
-@pytest.mark.parametrize("argument", ["rz_deg", "rx_deg", "tx_mm", "ty_mm", "centre"])
+@pytest.mark.parametrize("argument", [field.name for field in fields(RandomTransform)])
 @SETTINGS
 @given(value=junk)
 def test_random_transform_with_junk(wrist, argument, value):
@@ -127,6 +130,8 @@ def test_observations_with_junk(wrist, value):
     ]
     for kind in (SliceObservation, SliceChannelsObservation):
         made += [refuses(lambda kind=kind: kind(crop=value)), refuses(lambda kind=kind: kind(shape=value))]
+    for argument in ("field_of_view_mm", "pixel_mm"):
+        made.append(refuses(lambda argument=argument: MetricSliceObservation(**{argument: value})))
     for observation in made:
         if observation is not None:
             try_out(refuses(lambda observation=observation: ArmscanEnv([wrist], observation=observation)))
@@ -216,6 +221,7 @@ OBSERVATIONS = {
     "slice": "slice",
     "slice_channels": "slice_channels",
     "slice_reduced": SliceObservation(shape=(5, 4)),
+    "slice_metric": "slice_metric",
 }
 
 
