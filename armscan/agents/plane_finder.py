@@ -42,7 +42,8 @@ class PlaneFinder(FinderParameters):
         if setup.action_names[: len(COMPONENTS)] != COMPONENTS:
             raise InvalidValueError(
                 f"agent is plane_finder, which moves all of {', '.join(COMPONENTS)}, but projection leaves "
-                f"{', '.join(setup.action_names)} free: take projection=full"
+                f"{', '.join(setup.action_names)} free: take projection=full, or experiment=plane_finder, which sets "
+                "all that it needs"
             )
         check_observed(setup.observation_space, self.n_looks)
         n_at_once = self.num_envs * self.n_looks
