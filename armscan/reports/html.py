@@ -7,12 +7,12 @@ import csv
 import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-from plotly import graph_objects
-from plotly.offline import get_plotlyjs
+from typing import TYPE_CHECKING, Any
 
 from armscan.errors import InvalidValueError
+
+if TYPE_CHECKING:
+    from plotly import graph_objects
 
 REPORT_FILE = "report.html"
 PAGE = """<!doctype html>
@@ -67,6 +67,8 @@ def write_page(folder: Path, title: str, parts: Sequence[str], tables: Mapping[s
     Raises:
         InvalidValueError: if it would replace what is no report's.
     """
+    from plotly.offline import get_plotlyjs
+
     for name in () if _is_report(folder / REPORT_FILE) else (REPORT_FILE, *(f"{name}.csv" for name in tables)):
         if (folder / name).exists():
             raise InvalidValueError(

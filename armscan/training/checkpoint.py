@@ -83,8 +83,6 @@ def load_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     import torch
 
     weights, facts = load_checkpoint(path)
-    if not isinstance(weights, dict) or not isinstance(facts, dict):
-        raise CheckpointError(f"{path}: holds no weights")
     if "reports" in facts:
         raise CheckpointError(f"{path}: holds all of a training, as last.pt does, not the weights of its best epoch")
     for name, weight in weights.items():
