@@ -82,7 +82,9 @@ def pip_sources(config: Path) -> list[str]:
     pairs = (line.partition("=") for line in listed.stdout.splitlines())
     values = {key.rpartition(".")[2]: ast.literal_eval(value) for key, _, value in pairs}
     config.write_text("\n".join(["[global]", *(f"{key} = {' '.join(each.split())}" for key, each in values.items())]))
-    named = {each.removeprefix("file://") for value in values.values() for each in value.split()}
+    words = {word for value in values.values() for word in value.split()}
+    # The files of an index may lie beside its pages.
+    named = {str(Path(word.removeprefix("file://")).parent) if word.startswith("file://") else word for word in words}
     paths = sorted(path for path in named if path.startswith("/") and Path(path).exists())
     return [f"--volume={config}:/etc/pip.conf:ro", *(f"--volume={path}:{path}:ro" for path in paths)]
 
