@@ -154,6 +154,8 @@ def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Ma
         The runs of those that got as far as that, in the order of the jobs.
     """
     from armscan.tracking import note_end, open_store, sync
+    from armscan.tracking.run import FAILURE_TAG
+    from armscan.tracking.sync import PROCESS_DIED
 
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
     note_end(folder, word["run_id"], word["tracking"]["uri"], status, tags)
@@ -162,9 +164,10 @@ def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Ma
     sync(folder, lambda _: store)
     children = store.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
     for child in children:
-        if child.info.status == "RUNNING":
+        # `sync` has ended those whose processes had no time to do so.
+        if child.info.status == "RUNNING" or child.data.tags.get(FAILURE_TAG) == PROCESS_DIED:
             is_killed = status == "KILLED"
-            store.set_tag(child.info.run_id, "failure", INTERRUPTED if is_killed else NO_OUTCOME)
+            store.set_tag(child.info.run_id, FAILURE_TAG, INTERRUPTED if is_killed else NO_OUTCOME)
             store.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
     if not children:
         store.delete_run(word["run_id"])

@@ -12,4 +12,4 @@ def test_study_outlives_a_killed_worker_and_judges_its_best(start):
     assert [trial.state.name for trial in study.trials() if trial.state.name == "FAIL"] == ["FAIL"]
     judged = study.trials("sac_y-judged")
     assert {trial.state.name for trial in judged} == {"COMPLETE"}
-    assert f"result, with {len(judged)} other seed(s) each" in study.printed.read_text()
+    assert f"result on the test volumes, with {len(judged)} other seed(s) each" in study.printed.read_text()
