@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sqlite3
 import threading
 from collections.abc import Callable
 from functools import partial, wraps
@@ -20,6 +21,7 @@ from armscan.errors import StorageAwayError
 from armscan.utils.retry import RetryPolicy
 
 T = TypeVar("T")
+NO_SAVEPOINT = "no such savepoint"
 # Of a SQLite file that another process has locked, that cannot be read for now, or whose disk is full.
 AWAY_IN_SQLITE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_IOERR", "SQLITE_FULL")
 # One of a PostgreSQL database's advisory locks.
@@ -44,9 +46,10 @@ def why_away(error: BaseException) -> str | None:
     """Return why a database cannot be reached for now; None if the error says that the request is wrong."""
     is_away = isinstance(error, ConnectionLostError)
     # Optuna wraps errors, and may have asked again on a connection that was lost: the first one says why.
-    while isinstance(error, ConnectionLostError | StorageInternalError | SQLAlchemyError):
+    while isinstance(error, ConnectionLostError | StorageInternalError | SQLAlchemyError | sqlite3.Error):
         cause = error.__cause__ or error.__context__
-        if isinstance(error, DBAPIError) or cause is None:
+        # SQLite itself rolls a transaction back for some errors, and then no savepoint of it is there any more.
+        if cause is None or (isinstance(error, DBAPIError) and NO_SAVEPOINT not in str(error.orig)):
             break
         error = cause
     if isinstance(error, DBAPIError):
