@@ -14,8 +14,8 @@ from armscan.agents.sac_kernels import Adam, Floats, Weights
 class AdamVectors:
     """The weights that an optimiser moves, and its state, as vectors of which torch's tensors are views.
 
-    So whoever looks at the network or at the optimiser sees what compiled code has made of them, and the other way
-    round; both may take gradient steps in turn.
+    Network, optimiser and compiled code share this memory: each sees the changes of the others, and torch and compiled
+    code may take gradient steps in turn.
 
     Args:
         optimiser: Adam, with one group of parameters.

@@ -18,7 +18,7 @@ from armscan.volumes.plane import FloatArray
 
 @runtime_checkable
 class BatchAgent(Protocol):
-    """Chooses planes in many episodes at once; in each those that it chooses where it plays it alone, bit for bit."""
+    """Chooses planes in many episodes at once: bit for bit those that it chooses when it plays each episode alone."""
 
     def begin_all(self, *, seeds: Sequence[int], bounds: Sequence[ActionBounds]) -> None:
         """Begin an episode for each seed; see `Agent.begin`."""
@@ -28,7 +28,7 @@ class BatchAgent(Protocol):
 
         Args:
             observations: observation of the current plane of each, shape (n, ...).
-            rewards: of these planes, shape (n,).
+            rewards: reward of each plane, shape (n,), from -1 to 0.
             episodes: number of each episode, its place among the seeds, shape (n,).
         """
 

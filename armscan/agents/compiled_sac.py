@@ -46,7 +46,7 @@ class CompiledSAC(sac.SAC[Any]):
     Args:
         compute: device and precision of the tensors.
         replay: replay buffer that it learns from.
-        arguments: those of Tianshou's SAC.
+        arguments: keyword arguments of Tianshou's SAC.
 
     Attributes:
         why_tianshou: why updates are left to Tianshou; None where they are compiled.

@@ -1,7 +1,7 @@
 """Actions of a Gaussian actor: many observations at once, each answered to the last bit as if it were alone.
 
 torch adds up a batch of one in another order than a larger batch. Here a network of linear layers and ReLU goes row by
-row through the same compiled loop, whatever the size of the batch; every other network is asked row by row.
+row through the same compiled loop for every batch size; any other network computes one row at a time.
 """
 
 from __future__ import annotations

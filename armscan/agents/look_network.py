@@ -74,7 +74,7 @@ class LookNetwork(nn.Module):
             images: the looks of an episode from the oldest on, shape (n, n_looks, tissues, across, depth), bytes.
             actions: their planes, normalised, shape (n, n_looks, 4).
             step: which of the looks the latest is, one-hot, shape (n, n_looks).
-            geometry: what the planes are.
+            geometry: free components and bounds of the planes, in degrees and mm.
         """
         looks = images[:, -self._n_seen :].flatten(1, 2).float() / 255.0
         planes = geometry.planes(actions)
@@ -87,16 +87,16 @@ class LookNetwork(nn.Module):
 
 
 class FinderModule(nn.Module):
-    """What a plane finder computes: observations of several looks in, the next plane out.
+    """Network of a plane finder: maps observations of several looks to the next plane.
 
     Which look of the episode the latest is follows from the stack of observations: it is filled with the first one.
 
     Args:
         network: network for the looks.
-        geometry: what the planes are.
+        geometry: free components and bounds of the planes, in degrees and mm.
         offsets_mm: how far beside the plane that is found so far the next look is, after each look; the last is 0.
         sure: expected errors, in mm and degrees, below which it looks no further; None: it always takes all looks.
-        has_stop: whether an action has the component `stop`.
+        has_stop: whether actions end with the component `stop`, as with `env.ends=on_stop`.
     """
 
     offsets: Tensor

@@ -80,7 +80,7 @@ def label(
         idle = "--volumes" if volumes else "--overwrite"
         raise click.UsageError(f"{idle} is for a search, but --markup and --volume say which plane and for what")
     if pictures is None and Path(folder, PICTURES).is_symlink():
-        # Whoever has made the folder of the data would choose where pictures are written.
+        # Otherwise the author of the data folder would choose where pictures are written.
         raise InvalidValueError(f"{Path(folder, PICTURES)}: is a link: name the folder of the pictures with --pictures")
     from armscan.anatomy import check_tissues
     from armscan.annotation.labelling import LabellingOptions

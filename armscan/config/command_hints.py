@@ -1,4 +1,4 @@
-"""The commands that messages suggest, as they can be typed here: with `uv run` or a path where nothing is activated."""
+"""Commands that messages suggest, ready to paste: with `uv run` or a path unless the environment is activated."""
 
 from __future__ import annotations
 

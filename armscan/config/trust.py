@@ -47,7 +47,7 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
     Args:
         config: configuration as it was stored, resolved.
         where: owner of the configuration, such as `run 3bf2`, for the error.
-        trust: whether the configuration may name any class.
+        trust: whether the configuration may name classes that armscan does not offer, as `--trust` says.
 
     Raises:
         UntrustedError: if it names a class that armscan does not offer, or holds an interpolation.

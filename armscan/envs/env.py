@@ -61,7 +61,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     ## Episode end
     | `ends` | terminated |
     | --- | --- |
-    | `on_reward` | when the reward is above -success_threshold, on whatever plane |
+    | `on_reward` | on the first plane whose reward is above -success_threshold |
     | `on_budget` | never: the agent may look beside the plane that it wants, and is judged by its last one |
     | `on_stop` | with the plane at which the agent says `stop`, rewarded or not |
 

@@ -41,7 +41,7 @@ class RandomTransform:
         stretch: its size across, along the labelled normal and in depth, each for itself, likewise.
         shear: shift for each mm along another axis within +- this, from 0 to 0.3: across and in depth with the way
             along the normal, and with each other.
-        mirror: whether half of the episodes show the other hand.
+        mirror: whether each episode is mirrored, so that it shows the other hand, with probability 0.5.
     """
 
     rz_deg: float = 10.0

@@ -44,12 +44,12 @@ WHAT_HELPS = "more wrists, data=mixed, or cross-validation (runs with other spli
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run has reached.
+    """Results of a run.
 
     Args:
         evaluations: final evaluations of the agent, by the names of their volumes.
         baselines: episodes of the baselines on the test volumes, by their names.
-        validation: validation of the best epoch; None where nothing was learned.
+        validation: validation of the best epoch; None for an agent that does not learn.
     """
 
     evaluations: Mapping[str, Evaluation]
@@ -62,7 +62,7 @@ class RunResult:
 
         Args:
             setup: the experiment, its agent with the weights that are judged.
-            result: result of the training; None where nothing was to be learned.
+            result: result of the training; None for an agent that does not learn.
         """
         agent, seed, n_episodes, on_plane = setup.agent, setup.seed, setup.n_episodes, setup.on_plane
         first_seeds = {TRAINING: TRAINING_VOLUMES_SEED + seed, TEST: TEST_VOLUMES_SEED + seed}

@@ -1,4 +1,4 @@
-"""What an agent is compared with: random planes, and a sweep from the middle outward, on the same volumes and rules.
+"""Baselines of an agent: random planes, and a sweep from the middle outward, on the same volumes and rules.
 
 Their episodes are kept in the machine's cache, because many runs have the same volumes and rules.
 """

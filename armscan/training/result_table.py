@@ -41,7 +41,7 @@ class Quantity(NamedTuple):
 
     Args:
         metric: name of the metric.
-        title: what people call it, its statistic last.
+        title: heading of the column, the statistic last, such as `steps, mean`.
         form: format of its value.
     """
 

@@ -17,7 +17,7 @@ class Disk:
     """A small disk in memory.
 
     Args:
-        folder: where it is mounted.
+        folder: folder that the disk is mounted on.
     """
 
     def __init__(self, folder: Path) -> None:

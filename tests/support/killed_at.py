@@ -27,7 +27,7 @@ class Moment:
 
     Args:
         place: a function or method, such as `torch.optim:Adam.step`.
-        number: of the call of it, from 1.
+        number: number of the call that ends the process, from 1.
         delay_s: after the beginning of that call, in seconds; the call is followed by the end in any case. Default:
             None, before the call.
     """

@@ -168,8 +168,8 @@ class TrialOutcome:
     Args:
         trial: the trial that has ended.
         state: COMPLETE, PRUNED or FAIL.
-        writes: those about the trial that are still pending.
-        values: of the objectives, if it is complete.
+        writes: pending writes of the trial's attributes.
+        values: values of the objectives; used for a complete trial only.
         attributes: user attributes of the trial.
     """
 

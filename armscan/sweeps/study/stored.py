@@ -1,4 +1,4 @@
-"""What a storage holds of a study, checked when it is opened: a stranger may have written it."""
+"""Check the attributes and values of a stored study when it is opened: a stranger may have written them."""
 
 from __future__ import annotations
 
