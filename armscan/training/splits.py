@@ -11,9 +11,10 @@ import numpy as np
 
 from armscan.errors import InvalidValueError, listed
 from armscan.training.fingerprints import Fingerprints, fingerprint
-from armscan.utils.validation import LARGEST_SEED, check_float, check_int, check_path, check_seed
+from armscan.utils.validation import LARGEST_SEED, check_choice, check_float, check_int, check_path, check_seed
 from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
+from armscan.volumes.phantom import VERSIONS
 
 # No phantom of one purpose has the seed of another.
 VALIDATION_FIRST_SEED, TEST_FIRST_SEED = 1_000_000, 2_000_000
@@ -69,7 +70,12 @@ class Split:
 
 
 def phantom_data(
-    n_training: int = 16, n_validation: int = 4, n_test: int = 8, first_seed: int = 0, cache_dir: str | None = None
+    n_training: int = 16,
+    n_validation: int = 4,
+    n_test: int = 8,
+    first_seed: int = 0,
+    cache_dir: str | None = None,
+    version: int = 1,
 ) -> Split:
     """Phantom wrists; those for validation and test come from seeds that no training phantom has.
 
@@ -79,6 +85,7 @@ def phantom_data(
         n_test: number of phantoms to judge on.
         first_seed: seed of the first of the training phantoms, which have consecutive seeds.
         cache_dir: folder where phantoms are kept; the user's cache folder where it is None.
+        version: version of the phantoms, 1 or 2, as in `make_phantom`. Default: 1, as runs have had it that name none.
 
     Raises:
         InvalidValueError: if a number is out of range.
@@ -92,11 +99,12 @@ def phantom_data(
             f"data.first_seed + data.n_training is {first_seed + n_training}, but it must be at most "
             f"{VALIDATION_FIRST_SEED}, where the validation phantoms begin"
         )
+    check_choice("data.version", version, tuple(VERSIONS))
     folder = None if cache_dir is None else check_path("data.cache_dir", cache_dir)
     return Split(
-        training=load_phantoms(range(first_seed, first_seed + n_training), folder),
-        validation=load_phantoms(range(VALIDATION_FIRST_SEED, VALIDATION_FIRST_SEED + n_validation), folder),
-        test=load_phantoms(range(TEST_FIRST_SEED, TEST_FIRST_SEED + n_test), folder),
+        training=load_phantoms(range(first_seed, first_seed + n_training), folder, version),
+        validation=load_phantoms(range(VALIDATION_FIRST_SEED, VALIDATION_FIRST_SEED + n_validation), folder, version),
+        test=load_phantoms(range(TEST_FIRST_SEED, TEST_FIRST_SEED + n_test), folder, version),
     )
 
 
@@ -134,6 +142,7 @@ def mixed_data(
     n_test: int = 8,
     first_seed: int = 0,
     cache_dir: str | None = None,
+    version: int = 1,
 ) -> Split:
     """Volumes of a folder to train on, and phantom wrists beside them; validation and test are on phantoms alone.
 
@@ -145,12 +154,13 @@ def mixed_data(
         n_test: number of phantoms to judge on.
         first_seed: seed of the first of the training phantoms.
         cache_dir: folder where phantoms are kept; the user's cache folder where it is None.
+        version: version of the phantoms, as in `phantom_data`. Default: 1.
 
     Raises:
         InvalidValueError: if a number is out of range.
     """
     n_beside = check_int("data.n_training", n_training, at_least=0)
-    phantoms = phantom_data(max(n_beside, 1), n_validation, n_test, first_seed, cache_dir)
+    phantoms = phantom_data(max(n_beside, 1), n_validation, n_test, first_seed, cache_dir, version)
     volumes = open_dataset(check_path("data.path", path)).volumes
     if n_volumes is not None:
         check_int("data.n_volumes", n_volumes, at_least=1, at_most=len(volumes))

@@ -25,14 +25,15 @@ def test_solved_criterion_with_junk(changed, value):
     assert criterion is None or criterion.holds([]) is False
 
 
-@pytest.mark.parametrize("changed", ["n_training", "n_validation", "n_test", "first_seed", "cache_dir"])
+@pytest.mark.parametrize("changed", ["n_training", "n_validation", "n_test", "first_seed", "cache_dir", "version"])
 @SETTINGS
 @given(value=junk)
 def test_phantom_data_with_junk(changed, value, phantom, monkeypatch):
     """The phantoms themselves are left out: thousands of them may have been asked for."""
 
-    def load(seeds, folder):
+    def load(seeds, folder, version):
         assert seeds[-1] < 2**31
+        assert version in (1, 2)
         return {f"phantom-{seeds[0]}": phantom}
 
     monkeypatch.setattr(data, "load_phantoms", load)

@@ -18,10 +18,18 @@ def test_phantom_data_has_phantoms_of_other_seeds_for_each_purpose():
     assert list(split.test) == ["phantom-2000000"]
 
 
+def test_phantoms_are_of_the_version_that_the_data_names():
+    split = phantom_data(n_training=1, n_validation=1, n_test=1, version=2)
+    assert [name for part in split.parts.values() for name in part] == [
+        *("phantom-v2-0", "phantom-v2-1000000", "phantom-v2-2000000")
+    ]
+
+
 @pytest.mark.parametrize(
     "changes",
     [
         {"n_training": 0},
+        {"version": 3},
         {"n_validation": 1.5},
         {"n_validation": 10**7},
         {"n_test": 0},

@@ -7,15 +7,31 @@ from armscan.anatomy import TissueClusters, landmark_reward
 from armscan.errors import InvalidValueError
 from armscan.volumes import ManipulatorAction, load_phantom, make_phantom
 from armscan.volumes.phantom import cache
-from armscan.volumes.phantom.generate import Pose
+from armscan.volumes.phantom.generate import VERSIONS, Pose
+from armscan.volumes.phantom.tube import RADIUS_X, Tube, Y
+from armscan.volumes.phantom.varied import draw_varied_wrist
 from armscan.volumes.phantom.wrist import draw_wrist
 
 SEEDS = (0, 1, 2, 3, 50, 51)
+# Voxels of each label of the phantom with seed 7, version 1.
+KNOWN_COUNTS = [20787918, 1620651, 564261, 42511, 24659]
 
 
 @pytest.fixture(scope="module", params=SEEDS)
 def wrist(request):
     return load_phantom(request.param)
+
+
+@pytest.fixture(scope="module", params=VERSIONS)
+def version(request):
+    return request.param
+
+
+def ends_of_rows(draw, seed):
+    """Where the distal row ends and the next bone begins, in mm along the arm from the labelled plane."""
+    bones = [tube for tube in draw(np.random.default_rng(seed)) if tube.label == 1]
+    spans = [(tube.nodes[0, Y], tube.nodes[-1, Y]) for tube in bones]
+    return max(high for low, high in spans if low < 0 < high), min(low for low, _ in spans if low > 0)
 
 
 def rewards_along_the_arm(volume, step_mm=1.0):
@@ -28,6 +44,44 @@ def rewards_along_the_arm(volume, step_mm=1.0):
 def test_phantom_optimal_plane_is_rewarded(wrist):
     clusters = TissueClusters.from_slice(wrist.slice(wrist.optimal_action))
     assert landmark_reward(clusters) > -0.05
+
+
+def test_phantom_of_version_2_is_rewarded_and_of_both_hands():
+    for seed in range(12):
+        volume = load_phantom(seed, version=2)
+        clusters = TissueClusters.from_slice(volume.slice(volume.optimal_action))
+        assert landmark_reward(clusters) > -0.05
+        assert set(np.unique(volume.labels)) == {0, 1, 2, 3, 4}
+
+
+def test_phantoms_of_version_2_differ_in_where_the_labelled_plane_cuts_the_carpus():
+    usual = np.array([ends_of_rows(draw_wrist, seed) for seed in range(60)])
+    varied = np.array([ends_of_rows(draw_varied_wrist, seed) for seed in range(60)])
+    assert (np.ptp(usual, axis=0) < 4.0).all()
+    assert (np.ptp(varied, axis=0) > 8.0).all()
+    # Rows end nearer to the plane than in version 1 and about where they do there; in some wrists they overlap.
+    assert varied[:, 0].min() < usual[:, 0].min() - 4.0
+    assert varied[:, 0].max() > usual[:, 0].min()
+    assert (varied[:, 1] < varied[:, 0]).any()
+
+
+def test_tendons_of_version_2_are_in_three_groups_on_both_sides_of_the_plane():
+    n_pieces = set()
+    for seed in range(20):
+        tendons = [tube for tube in draw_varied_wrist(np.random.default_rng(seed)) if tube.label == 2]
+        inside = [tube for tube in tendons if tube.nodes[0, Y] < 0 < tube.nodes[-1, Y]]
+        assert len(inside) == 5
+        ends = np.array([(tube.nodes[0, Y], tube.nodes[-1, Y]) for tube in inside])
+        assert (np.abs(ends) > 7.0).all()
+        np.testing.assert_allclose(ends.sum(axis=1), 0.0, atol=1e-9)
+        # Where a piece is missing, nothing reaches the ends of the groups from beyond.
+        n_pieces.add(min(tube.nodes[0, Y] for tube in tendons if tube.nodes[0, Y] > 0) - ends[0, 1] > 0.3)
+    assert n_pieces == {True, False}
+
+
+def test_phantoms_of_version_1_are_what_they_always_were():
+    counts = np.bincount(make_phantom(7).labels.ravel(), minlength=5)
+    np.testing.assert_allclose(counts, KNOWN_COUNTS, atol=20)
 
 
 def test_phantom_is_rewarded_in_a_narrow_band_about_its_plane(wrist):
@@ -70,11 +124,41 @@ def test_wrist_has_the_bones_of_a_hand():
     assert labels.count(3) == labels.count(4) == 1
 
 
-def test_phantom_of_a_seed_is_always_the_same():
-    first, second = make_phantom(7), make_phantom(7)
+def test_phantom_of_a_seed_is_always_the_same(version):
+    first, second = make_phantom(7, version), make_phantom(7, version)
     np.testing.assert_array_equal(first.labels, second.labels)
     assert first.optimal_action == second.optimal_action
-    assert (make_phantom(8).labels != first.labels).any()
+    assert (make_phantom(8, version).labels != first.labels).any()
+
+
+def test_versions_have_names_and_files_of_their_own(tmp_path):
+    made = [load_phantom(7, tmp_path, each) for each in VERSIONS]
+    assert [volume.name for volume in made] == ["phantom-7", "phantom-v2-7"]
+    assert len(list(tmp_path.iterdir())) == 2
+    cache._IN_MEMORY.clear()
+    for volume, each in zip(made, VERSIONS, strict=True):
+        again = load_phantom(7, tmp_path, each)
+        np.testing.assert_array_equal(again.labels, volume.labels)
+        assert again.name == volume.name
+
+
+def test_phantom_refuses_a_version_that_there_is_not():
+    with pytest.raises(InvalidValueError, match="version is 3, but it must be 1 or 2"):
+        make_phantom(7, 3)
+
+
+def test_part_of_a_tube_is_cut_where_it_is_told_to():
+    tube = Tube(1, np.array([[0.0, 1.0, 2.0, 3.0, 4.0], [10.0, 2.0, 2.0, 5.0, 4.0], [20.0, 2.0, 2.0, 1.0, 4.0]]))
+    part = tube.between(5.0, 15.0)
+    np.testing.assert_allclose(part.nodes[:, Y], [5.0, 10.0, 15.0])
+    np.testing.assert_allclose(part.nodes[:, RADIUS_X], [4.0, 5.0, 3.0])
+    np.testing.assert_array_equal(tube.between(-9.0, 99.0).nodes, tube.nodes)
+
+
+def test_arranged_tube_is_stretched_then_moved_and_grows_thicker():
+    tube = Tube(1, np.array([[10.0, 1.0, 2.0, 3.0, 4.0]]))
+    arranged = tube.arrange(shift_mm=(0.5, -2.0, 1.0), stretch=(2.0, 0.5, 1.0), thickness=(1.5, 2.0))
+    np.testing.assert_allclose(arranged.nodes, [[3.0, 2.5, 3.0, 4.5, 8.0]])
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "a", None, True])

@@ -13,8 +13,7 @@ import numpy as np
 
 from armscan.errors import InvalidValueError
 from armscan.utils.files import atomic_write, cache_folder
-from armscan.utils.validation import check_seed
-from armscan.volumes.phantom import generate, tube, wrist
+from armscan.volumes.phantom import generate, tube, varied, wrist
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.volume import LabelVolume
 
@@ -22,38 +21,39 @@ from armscan.volumes.volume import LabelVolume
 _IN_MEMORY: WeakValueDictionary[Path, LabelVolume] = WeakValueDictionary()
 
 
-def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None) -> dict[str, LabelVolume]:
+def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None, version: int = 1) -> dict[str, LabelVolume]:
     """Return the phantoms of the given seeds by name; see `load_phantom`."""
-    return {volume.name: volume for volume in (load_phantom(seed, cache_dir) for seed in seeds)}
+    return {volume.name: volume for volume in (load_phantom(seed, cache_dir, version) for seed in seeds)}
 
 
-def load_phantom(seed: int, cache_dir: Path | None = None) -> LabelVolume:
+def load_phantom(seed: int, cache_dir: Path | None = None, version: int = 1) -> LabelVolume:
     """Return the phantom of a seed, from the cache where it is there, made and kept otherwise.
 
     Args:
         seed: as in `make_phantom`.
         cache_dir: where phantoms are kept; `$ARMSCAN_CACHE`, or else the user's cache folder, where it is None.
+        version: as in `make_phantom`. Default: 1.
 
     Returns:
-        The same volume as `make_phantom(seed)`.
+        The same volume as `make_phantom(seed, version)`.
     """
-    check_seed("seed", seed)
-    path = (cache_dir or cache_folder()) / f"phantom-{_generator_version()}-{seed}.npz"
+    name = generate.phantom_name(seed, version)
+    path = (cache_dir or cache_folder()) / f"{name.removesuffix(str(seed))}{_generator_version()}-{seed}.npz"
     volume = _IN_MEMORY.get(path)
     if volume is None:
-        _IN_MEMORY[path] = volume = _read_or_made(path, seed)
+        _IN_MEMORY[path] = volume = _read_or_made(path, seed, version)
     return volume
 
 
-def _read_or_made(path: Path, seed: int) -> LabelVolume:
+def _read_or_made(path: Path, seed: int, version: int) -> LabelVolume:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             action = ManipulatorAction.from_array(arrays["optimal_action"])
             spacing = tuple(arrays["spacing"].tolist())
-            return LabelVolume(arrays["labels"], spacing, f"phantom-{seed}", optimal_action=action)
+            return LabelVolume(arrays["labels"], spacing, generate.phantom_name(seed, version), optimal_action=action)
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
         # Not there, or damaged: a cached phantom can always be made again.
-        volume = generate.make_phantom(seed)
+        volume = generate.make_phantom(seed, version)
     assert volume.optimal_action is not None
     arrays = {"labels": volume.labels, "spacing": volume.spacing, "optimal_action": volume.optimal_action.to_array()}
     try:
@@ -71,6 +71,6 @@ def _read_or_made(path: Path, seed: int) -> LabelVolume:
 def _generator_version() -> str:
     """Fingerprint of the generator's sources, so that a changed generator never meets its old phantoms."""
     digest = hashlib.sha256()
-    for module in (generate, tube, wrist):
+    for module in (generate, tube, varied, wrist):
         digest.update(Path(str(module.__file__)).read_bytes())
     return digest.hexdigest()[:12]

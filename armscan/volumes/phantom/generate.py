@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from armscan.utils.validation import check_seed
+from armscan.utils.validation import check_choice, check_seed
 from armscan.volumes.phantom.tube import Tube, fill_tube
+from armscan.volumes.phantom.varied import draw_varied_wrist
 from armscan.volumes.phantom.wrist import draw_wrist
 from armscan.volumes.plane import FloatArray, ManipulatorAction, shift_into
 from armscan.volumes.volume import LabelVolume
@@ -15,6 +16,9 @@ from armscan.volumes.volume import LabelVolume
 SHAPE = (360, 800, 80)
 SPACING_MM = (0.27, 0.27, 0.55)
 N_STRAY_VOXELS = (150, 450)
+
+# What draws the anatomy, by version; what a version draws from a seed never changes.
+VERSIONS = {1: draw_wrist, 2: draw_varied_wrist}
 
 
 class Pose(NamedTuple):
@@ -59,27 +63,41 @@ class Pose(NamedTuple):
         return slid
 
 
-def make_phantom(seed: int) -> LabelVolume:
+def make_phantom(seed: int, version: int = 1) -> LabelVolume:
     """Make the phantom wrist of a seed, 360 x 800 x 80 voxels of 0.27 x 0.27 x 0.55 mm.
 
     Args:
         seed: of everything drawn: anatomy, size, pose, left or right, stray voxels.
+        version: version of the anatomy, one of `VERSIONS`: 1, where the labelled plane lies at one place among bones
+            and tendons, or 2, where its place varies. Default: 1.
 
     Returns:
-        The volume, named `phantom-SEED`, with its optimal plane.
+        The volume, named `phantom-SEED`, or `phantom-v2-SEED` in version 2, with its optimal plane.
 
     Raises:
-        InvalidValueError: if the seed is not a whole number from 0 to 2^31 - 1.
+        InvalidValueError: if the seed is not a whole number from 0 to 2^31 - 1, or there is no such version.
     """
-    rng = np.random.default_rng(check_seed("seed", seed))
+    name = phantom_name(seed, version)
+    rng = np.random.default_rng(seed)
     pose = Pose.draw(rng)
     action = pose.optimal_action()
     plane = ManipulatorAction(pose.rotation, (0.0, 0.0))
     labels = np.zeros(SHAPE, dtype=np.uint8)
-    for tube in draw_wrist(rng):
+    for tube in VERSIONS[version](rng):
         fill_tube(labels, SPACING_MM, plane.matrix, pose.origin_mm, pose.place(tube).nodes, tube.label)
     _scatter_strays(labels, rng)
-    return LabelVolume(labels, SPACING_MM, f"phantom-{seed}", optimal_action=action)
+    return LabelVolume(labels, SPACING_MM, name, optimal_action=action)
+
+
+def phantom_name(seed: int, version: int) -> str:
+    """Return the name of a phantom.
+
+    Raises:
+        InvalidValueError: if the seed is not a whole number from 0 to 2^31 - 1, or there is no such version.
+    """
+    check_choice("version", version, tuple(VERSIONS))
+    check_seed("seed", seed)
+    return f"phantom-{seed}" if version == 1 else f"phantom-v{version}-{seed}"
 
 
 def _scatter_strays(labels: np.ndarray, rng: np.random.Generator) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -54,6 +55,26 @@ class Tube:
     def cord(cls, label: int, nodes: list[tuple[float, float, float, float, float]]) -> Self:
         """Return a tendon, vessel or nerve through nodes (y, x, z, radius_x, radius_z), in any order along y."""
         return cls(label, np.array(sorted(nodes)))
+
+    def arrange(
+        self,
+        *,
+        shift_mm: Sequence[float] | FloatArray = (0.0, 0.0, 0.0),
+        stretch: Sequence[float] = (1.0, 1.0, 1.0),
+        thickness: Sequence[float] | FloatArray = (1.0, 1.0),
+    ) -> Tube:
+        """Return the same tube elsewhere: its places times `stretch` (x, y, z), then moved; radii times `thickness`."""
+        nodes = self.nodes.copy()
+        nodes[:, [X, Y, Z]] = nodes[:, [X, Y, Z]] * stretch + shift_mm
+        nodes[:, [RADIUS_X, RADIUS_Z]] *= thickness
+        return Tube(self.label, nodes)
+
+    def between(self, low_mm: float, high_mm: float) -> Tube:
+        """Return the part of it from `low_mm` to `high_mm` along the arm; at least one node must lie between."""
+        y = self.nodes[:, Y]
+        ends = np.clip([low_mm, high_mm], y[0], y[-1])
+        places = np.concatenate([ends[:1], y[(y > ends[0]) & (y < ends[1])], ends[1:]])
+        return Tube(self.label, np.stack([np.interp(places, y, column) for column in self.nodes.T], axis=1))
 
     def mirror(self) -> Tube:
         """Return the same tube of the other hand."""

@@ -28,16 +28,21 @@ JOINT_Y = (-78.0, -113.0, -117.0, -109.0, -93.0)
 
 def draw_wrist(rng: np.random.Generator) -> list[Tube]:
     """Draw the anatomy of one right wrist, of usual size; bones come first, so that they stay whole."""
+    return [tube for tubes in draw_parts(rng).values() for tube in tubes]
+
+
+def draw_parts(rng: np.random.Generator) -> dict[str, list[Tube]]:
+    """Draw the same by name, in the same order."""
     spread = rng.uniform(0.92, 1.08)
-    return [
-        *_forearm_bones(rng),
-        *_proximal_row(rng),
-        *_distal_row(rng),
-        *_finger_bones(rng, spread),
-        *_accessory_bones(rng),
-        *_tendons(rng, spread),
-        *_vessel_and_nerve(rng),
-    ]
+    return {
+        "forearm": list(_forearm_bones(rng)),
+        "proximal row": list(_proximal_row(rng)),
+        "distal row": list(_distal_row(rng)),
+        "fingers": list(_finger_bones(rng, spread)),
+        "accessory": list(_accessory_bones(rng)),
+        "tendons": list(_tendons(rng, spread)),
+        "vessel and nerve": list(_vessel_and_nerve(rng)),
+    }
 
 
 def _ovoid(rng: np.random.Generator, centre: tuple[float, float, float], radii: tuple[float, float, float]) -> Tube:

@@ -1,0 +1,132 @@
+"""Where bones, tendons, artery and nerve lie along the arm, seen from the labelled plane: labelmaps beside phantoms.
+
+    python -m benchmarks.learning.profiles FOLDER [--phantoms N]
+
+Every wrist is cut once a millimetre, parallel to its labelled plane, from 40 mm towards the fingers (negative) to 45 mm
+towards the elbow. For each landmark: its range in the folder, in N phantoms of each version (default: 64), and how
+many of the folder's wrists lie inside. Across, positive is ulnar, where the artery is; in depth, palmar.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from armscan.anatomy import TissueClusters
+from armscan.training.splits import TEST_FIRST_SEED
+from armscan.volumes import LabelVolume, make_phantom, read_dataset
+from armscan.volumes.phantom import VERSIONS
+
+PLACES_MM = np.arange(-40, 46)
+BONE, TENDON, ARTERY, NERVE = 1, 2, 3, 4
+# Fewer pixels of a vessel or nerve are strays.
+LEAST_PIXELS = 12
+
+
+def profile(volume: LabelVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return area (mm2) and mean place (across, depth, in mm) of each tissue, and numbers of tendons, along the arm.
+
+    Shapes: (n, 4), (n, 4, 2), (n,), for each of `PLACES_MM`; places are NaN where a tissue is absent.
+    """
+    labelled = volume.optimal_action
+    tx_mm, ty_mm = labelled.translation
+    areas, places, n_tendons = [], [], []
+    for along_mm in PLACES_MM:
+        plane = replace(labelled, translation=(tx_mm, ty_mm + along_mm / labelled.normal[1]))
+        slice_xz = volume.slice(plane)
+        aside_mm = plane.offset_mm @ plane.matrix[:, 0]
+        where = [np.argwhere(slice_xz == tissue) for tissue in (BONE, TENDON, ARTERY, NERVE)]
+        areas.append([len(pixels) for pixels in where])
+        places.append([_mean_mm(pixels, volume.pixel_mm, aside_mm) for pixels in where])
+        n_tendons.append(len(TissueClusters.from_slice(slice_xz, pixel_mm=volume.pixel_mm).tendons))
+    return np.array(areas) * np.prod(volume.pixel_mm), np.array(places), np.array(n_tendons)
+
+
+def _mean_mm(pixels: np.ndarray, pixel_mm: tuple[float, float], aside_mm: float) -> np.ndarray:
+    if len(pixels) < LEAST_PIXELS:
+        return np.full(2, np.nan)
+    return pixels.mean(axis=0) * pixel_mm + (aside_mm, 0.0)
+
+
+def landmarks(volume: LabelVolume) -> dict[str, float]:
+    """Return where the landmarks of a wrist lie, by name."""
+    areas, places, n_tendons = profile(volume)
+    here = PLACES_MM.tolist().index(0)
+    bones = areas[:, 0]
+    from_tendons = places - places[here, 1]
+    ulnar = np.sign(from_tendons[here, 2, 0])
+
+    def least(low_mm: float, high_mm: float) -> int:
+        within = np.flatnonzero((low_mm <= PLACES_MM) & (high_mm >= PLACES_MM))
+        return int(within[bones[within].argmin()])
+
+    def first(tissue: int) -> float:
+        return float(PLACES_MM[np.flatnonzero(np.isfinite(places[:, tissue - 1, 0]))[0]])
+
+    is_grouped = n_tendons == 3
+    joined = here + int(np.argmin(is_grouped[here:]))
+    parted = here - int(np.argmin(is_grouped[here::-1]))
+    to_hand, to_proximal = least(-20, -6), least(2, 16)
+    to_forearm = least(PLACES_MM[to_proximal] + 9, 33)
+    beyond, row, arm = (PLACES_MM.tolist().index(mm) for mm in (-30, 0, 40))
+    found = {
+        "tendons: three groups from, mm": PLACES_MM[parted] + 1,
+        "tendons: three groups to, mm": PLACES_MM[joined] - 1,
+        "tendons: middle of the groups, mm": (PLACES_MM[parted] + PLACES_MM[joined]) / 2,
+        "tendons: bundle aside at 20 mm, mm": ulnar * from_tendons[here + 20, 1, 0],
+        "bones: gap to the metacarpals, mm": PLACES_MM[to_hand],
+        "bones: gap between the rows, mm": PLACES_MM[to_proximal],
+        "bones: gap to the forearm, mm": PLACES_MM[to_forearm],
+        "bones: area in the gap between the rows, mm2": bones[to_proximal],
+        "bones: middle of the distal row, mm": np.average(
+            PLACES_MM[to_hand:to_proximal], weights=bones[to_hand:to_proximal]
+        ),
+        "bones: area of the metacarpals at -30 mm, mm2": bones[beyond],
+        "bones: area at the labelled plane, mm2": bones[row],
+        "bones: area of the forearm at 40 mm, mm2": bones[arm],
+        "bones: depth from the tendons at the labelled plane, mm": from_tendons[row, 0, 1],
+        "bones: depth of the forearm from the tendons, mm": from_tendons[arm, 0, 1],
+        "artery: begins, mm": first(ARTERY),
+        "artery: across from the tendons, mm": abs(from_tendons[here, 2, 0]),
+        "artery: depth from the tendons, mm": from_tendons[here, 2, 1],
+    }
+    if areas[:, 3].any():
+        found |= {
+            "nerve: begins, mm": first(NERVE),
+            "nerve: across from the tendons, mm": ulnar * from_tendons[here, 3, 0],
+            "nerve: depth from the tendons, mm": from_tendons[here, 3, 1],
+        }
+    return {name: float(value) for name, value in found.items()}
+
+
+def ranges(volumes: Iterable[LabelVolume]) -> dict[str, np.ndarray]:
+    """Return the landmarks of all wrists by name, NaN where a wrist has none."""
+    found = [landmarks(volume) for volume in volumes]
+    return {name: np.array([each.get(name, np.nan) for each in found]) for each in found for name in each}
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data")
+    parser.add_argument("--phantoms", type=int, default=64)
+    given = parser.parse_args()
+    ours = ranges(read_dataset(given.data).values())
+    seeds = range(TEST_FIRST_SEED, TEST_FIRST_SEED + given.phantoms)
+    theirs = [ranges(make_phantom(seed, version) for seed in seeds) for version in VERSIONS]
+    columns = "".join(f" version {version} | inside |" for version in VERSIONS)
+    print(f"| | {given.data} |{columns}\n| --- | --- |{' --- | --- |' * len(VERSIONS)}")
+    for name, values in ours.items():
+        cells = [f"{np.nanmin(values):.1f} to {np.nanmax(values):.1f}"]
+        for each in theirs:
+            low, high = np.nanmin(each[name]), np.nanmax(each[name])
+            n_inside = int(((low <= values) & (values <= high)).sum())
+            cells += [f"{low:.1f} to {high:.1f}", f"{n_inside} of {np.isfinite(values).sum()}"]
+        print(f"| {name} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()
