@@ -14,16 +14,15 @@ from plotly.subplots import make_subplots
 
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
+from armscan.reports.look import is_rate, mode, title_of
 from armscan.training import MetricEstimates
-from armscan.training.on_plane import PREFIX
-from armscan.volumes.plane import FloatArray
 
 # By figure, axis and number of the group.
 Curves = Mapping[tuple[str, str, int], Curve]
 
 # More groups than that would hide each other behind their bands and seeds.
 MANY = 6
-ROW_PX, LEGEND_ROW_PX, GROUP_PX, AROUND_PX, SWITCHES_PX = 250, 22, 34, 110, 45
+ROW_PX, LEGEND_ROW_PX, GROUP_PX, AROUND_PX, SWITCHES_PX = 250, 22, 34, 110, 84
 # Of the legend, all of it and one letter; and the line beside a name.
 LEGEND_PX, LETTER_PX, SAMPLE_PX = 950, 7, 50
 # No success rate is above 100 %.
@@ -33,7 +32,7 @@ BANDS, SEEDS = "band", "seed"
 SHOWN = {"bands and seeds": (BANDS, SEEDS), "bands": (BANDS,), "neither": ()}
 LABEL_CHARS = 38
 # Beside the leading rate.
-FINAL = {"median_distance_mm": "distance (mm), median", "mean_steps": "steps, mean"}
+FINAL = ("median_distance_mm", "mean_steps")
 Points = dict[str, list[Any]]
 
 
@@ -56,11 +55,6 @@ def colours(n: int) -> list[str]:
     """Return a colour for each of some groups."""
     palette = qualitative.D3 if n <= len(qualitative.D3) else qualitative.Dark24
     return [str(palette[number % len(palette)]) for number in range(n)]
-
-
-def is_rate(name: str) -> bool:
-    """Return whether a metric is a share of episodes."""
-    return "success_rate" in name or PREFIX in name
 
 
 def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str, str]) -> Figure:
@@ -90,7 +84,6 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
     figure.update_layout(
         height=SWITCHES_PX + ROW_PX * len(titles) + AROUND_PX + legend_px,
         margin={"t": SWITCHES_PX, "b": AROUND_PX + legend_px, "l": 70, "r": 20, "autoexpand": False},
-        template="plotly_white",
         legend={
             "orientation": "h",
             "entrywidth": entry_px,
@@ -106,7 +99,7 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
 def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Figure:
     """Return what each group has reached at the end, with its interval, and beside it what single seeds have."""
     limits = next(figures.on_plane[0] for figures in reached if figures is not None)
-    titles = {limits.metric: limits.title, **FINAL}
+    titles = {limits.metric: limits.title} | {name: title_of(name) for name in FINAL}
     figure = make_subplots(rows=1, cols=len(titles), shared_yaxes=True, horizontal_spacing=0.04)
     for column, (name, title) in enumerate(titles.items(), start=1):
         here = {"mode": "markers", "showlegend": False, "row": 1, "col": column}
@@ -135,7 +128,7 @@ def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
         figure.update_xaxes(title=title, row=1, col=column, **(RATE_AXIS if is_rate(name) else {}))
     figure.update_yaxes(autorange="reversed", automargin=True)
     height = AROUND_PX + GROUP_PX * len(groups)
-    return figure.update_layout(height=height, margin={"t": 20, "b": 50, "l": 10, "r": 20}, template="plotly_white")
+    return figure.update_layout(height=height, margin={"t": 20, "b": 50, "l": 10, "r": 20})
 
 
 def _traces(of_axes: Sequence[Curve], colour: str) -> Iterator[Trace]:
@@ -149,16 +142,16 @@ def _traces(of_axes: Sequence[Curve], colour: str) -> Iterator[Trace]:
         yield Trace(BANDS, filled, [_points(each.places, each.band.highs) for each in of_axes])
         thin = {"line": {"color": colour, "width": 1}, "opacity": 0.5}
         for label, (places, _) in curve.lines.items():
-            said = {"mode": _mode(places), "hovertemplate": f"%{{y:.3g}} ({label})"}
+            said = {"mode": "lines" if len(places) > 1 else "lines+markers", "hovertemplate": f"%{{y:.3g}} ({label})"}
             yield Trace(SEEDS, thin | said, [_points(*each.lines.get(label, ((), ()))) for each in of_axes])
     if curve.n_seeds:
-        thick = {"mode": _mode(curve.places), "line": {"color": colour, "width": 2.5}, "hovertemplate": "%{text}"}
+        thick = {
+            "mode": mode(len(curve.places)),
+            "marker": {"size": 5},
+            "line": {"color": colour, "width": 2.5},
+            "hovertemplate": "%{text}",
+        }
         yield Trace("", thick, [_points(each.places, each.band.values) | {"text": _said(each)} for each in of_axes])
-
-
-def _mode(places: FloatArray) -> str:
-    """Return how a curve is drawn: a line through a single point would be nowhere to be seen."""
-    return "lines" if len(places) > 1 else "lines+markers"
 
 
 def _points(places: Iterable[float], values: Iterable[float]) -> Points:
@@ -185,7 +178,7 @@ def _axis_switch(traces: Sequence[Trace], n_rows: int) -> dict[str, Any]:
         scale = {f"xaxis{row if row > 1 else ''}.autorange": True for row in range(1, n_rows + 1)}
         changes: list[Any] = [points, scale | {f"{last}.title.text": axis}]
         buttons.append({"label": f"by {axis}", "method": "update", "args": changes})
-    return _switch(buttons, active=0, x=0.0)
+    return _switch(buttons, active=0, below_px=44)
 
 
 def _kind_switch(traces: Sequence[Trace], shown: str) -> dict[str, Any]:
@@ -195,9 +188,9 @@ def _kind_switch(traces: Sequence[Trace], shown: str) -> dict[str, Any]:
     for label, kinds in SHOWN.items():
         visible = [traces[number].kind in kinds for number in numbers]
         buttons.append({"label": label, "method": "restyle", "args": [{"visible": visible}, numbers]})
-    return _switch(buttons, active=list(SHOWN).index(shown), x=0.4) | {"visible": bool(numbers)}
+    return _switch(buttons, active=list(SHOWN).index(shown), below_px=6) | {"visible": bool(numbers)}
 
 
-def _switch(buttons: Sequence[dict[str, Any]], *, active: int, x: float) -> dict[str, Any]:
-    where = {"x": x, "xanchor": "left", "y": 1.0, "yanchor": "bottom", "pad": {"b": 8}}
+def _switch(buttons: Sequence[dict[str, Any]], *, active: int, below_px: int) -> dict[str, Any]:
+    where = {"x": 0, "xanchor": "left", "y": 1.0, "yanchor": "bottom", "pad": {"b": below_px}, "font": {"size": 11}}
     return {"type": "buttons", "direction": "right", "active": active, "buttons": list(buttons), **where}

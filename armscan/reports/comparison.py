@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from armscan.reports.charts import MANY, Curves, final_chart, learning_curves
+from armscan.reports.charts import MANY, Curves, colours, final_chart, learning_curves
 from armscan.reports.csv_tables import all_numbers, run_rows
 from armscan.reports.curves import AXES, curve_of
 from armscan.reports.groups import Group
-from armscan.reports.html import Markup, chart, table, write_page
+from armscan.reports.html import Markup, chart, folded, table, write_page
 from armscan.reports.load import VALIDATION, TrackedTraining
+from armscan.reports.look import title_of
 from armscan.reports.notes import notes_on
 from armscan.reports.significance import (
     COMPARED_BY,
@@ -28,8 +30,6 @@ from armscan.stats.bootstrap import Estimate
 from armscan.training import MetricEstimates, ResultTable
 from armscan.training.result_table import with_baselines
 
-# A chart drawn while hidden has no width.
-FITTED = "this.querySelectorAll('.js-plotly-plot').forEach((chart) => Plotly.Plots.resize(chart))"
 HOW_CURVES = (
     "On the validation volumes, after each epoch. Thick: the mean of the seeds of a group. Band: its 95 % interval by "
     "a bootstrap of the seeds; a group of one seed has none. Thin: each seed. A training that ran to its end before "
@@ -48,6 +48,11 @@ HOW_BETTER = (
     "seeds of both groups (of many groups shown under the pointer). 0.5 is no difference; in bold where the interval "
     "leaves it out and both groups have four seeds or more. Columns are numbered as the rows."
 )
+
+
+# More groups are compared in a table that is folded.
+MANY_PAIRS = 12
+LEADING = "on-plane rate"
 
 
 def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining], title: str, folder: Path) -> Path:
@@ -81,7 +86,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
         videos(groups),
         *_of_the_training(groups, curves, [figure for figure in figures if figure not in VALIDATION]),
         "<h2>Runs</h2>",
-        table(run_rows(groups)),
+        table(run_rows(groups), what="runs"),
     ]
     return write_page(folder, title, parts, all_numbers(groups, curves, reached, pairs))
 
@@ -95,11 +100,20 @@ def _figures(groups: Sequence[Group]) -> list[str]:
 def _summary(groups: Sequence[Group]) -> str:
     n_trainings = sum(len(group.trainings) for group in groups)
     rows = [
-        {"group": group.title, "seeds": ", ".join(each.seed or each.label for each in group.trainings)}
-        for group in groups
+        {
+            "group": Markup(f'<span style="color: {colour}">●</span> {html.escape(group.title)}'),
+            "runs, with their seeds": ", ".join(f"{each.id} ({each.seed or '–'})" for each in group.trainings),
+            "environment steps": _span([training.env_steps for training in group.trainings]),
+            "training, s": _span([training.wall_s for training in group.trainings]),
+        }
+        for group, colour in zip(groups, colours(len(groups)), strict=True)
     ]
-    counted = f"{n_trainings} runs in {len(groups)} group{'s' if len(groups) > 1 else ''}"
-    return f"<p>{counted}: those of a group differ by nothing but the seed.</p>{table(rows)}"
+    counted = f"{_counted(n_trainings, 'run')} in {_counted(len(groups), 'group')}"
+    return f"<p>{counted}: those of a group differ by nothing but the seed.</p>{table(rows, what='groups')}"
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'s' if number > 1 else ''}"
 
 
 def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
@@ -113,9 +127,12 @@ def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
 
 def _of_the_training(groups: Sequence[Group], curves: Curves, figures: Sequence[str]) -> Iterator[str]:
     if figures:
-        drawn = chart(learning_curves(groups, curves, {name: name.partition("/")[2] for name in figures}))
-        summary = "<summary>Metrics of the training itself: losses, returns, speed</summary>"
-        yield f'<details ontoggle="{FITTED}">{summary}{drawn}</details>'
+        drawn = chart(learning_curves(groups, curves, {name: _title_of_training(name) for name in figures}))
+        yield folded("Metrics of the training itself: losses, returns, speed", drawn)
+
+
+def _title_of_training(metric: str) -> str:
+    return metric.partition("/")[2].replace("_per_s", ", 1/s").replace("_", " ").replace("env ", "environment ")
 
 
 def _final(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Iterator[str]:
@@ -123,21 +140,16 @@ def _final(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -
     if not any(reached):
         yield "<p>None of these runs has kept a final evaluation.</p>"
         return
-    yield f"<p>{HOW_FINAL}</p>{final_table(groups, reached).html()}{chart(final_chart(groups, reached))}"
+    drawn = chart(final_chart(groups, reached), is_wide=True)
+    yield f"<p>{HOW_FINAL}</p>{final_table(groups, reached).html()}{drawn}"
 
 
 def final_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> ResultTable:
-    """Return the table of what groups have reached, with what it took, and of the baselines."""
+    """Return the table of what groups have reached, and of the baselines."""
     nothing = MetricEstimates.of_metrics({})
-    figures = {group.title: each or nothing for group, each in zip(groups, reached, strict=True)}
-    baselines = {group.title: baseline_metrics(group) for group in groups if evaluated_trainings(group)}
-    results = with_baselines(figures, baselines)
-    costs = {
-        "training, s": [_span([training.wall_s for training in group.trainings]) for group in groups],
-        "environment steps": [_span([training.env_steps for training in group.trainings]) for group in groups],
-    }
-    n_baselines = len(results) - len(groups)
-    return ResultTable(results, {heading: [*texts, *[""] * n_baselines] for heading, texts in costs.items()})
+    figures = {group.label: each or nothing for group, each in zip(groups, reached, strict=True)}
+    baselines = {group.label: baseline_metrics(group) for group in groups if evaluated_trainings(group)}
+    return ResultTable(with_baselines(figures, baselines))
 
 
 def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[str]:
@@ -147,11 +159,13 @@ def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Ite
     if not any(pairs.values()):
         yield "<p>Fewer than two groups have a final evaluation.</p>"
         return
-    yield f'<p>{HOW_BETTER}</p><div class="matrices">'
+    matrices = []
     for figure, of_figure in pairs.items():
-        wanted, name = "higher" if COMPARED_BY[figure] else "lower", figure.replace("_", " ").replace(" mm", " (mm)")
-        yield f"<div><h3>By {name}, {wanted} is better</h3>{_matrix(groups, of_figure)}</div>"
-    yield "</div>"
+        heading = f"By {LEADING if figure == 'on_plane_rate' else title_of(figure)}: "
+        heading += f"{'higher' if COMPARED_BY[figure] else 'lower'} is better"
+        matrices.append(f"<div><h3>{heading}</h3>{_matrix(groups, of_figure)}</div>")
+    drawn = f'<p>{HOW_BETTER}</p><div class="matrices">{"".join(matrices)}</div>'
+    yield drawn if len(groups) <= MANY_PAIRS else folded(f"Each of {len(groups)} groups against each other", drawn)
 
 
 def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
@@ -173,7 +187,7 @@ def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
         }
         for row in numbers
     ]
-    return f'<div class="matrix">{table(rows)}</div>'
+    return table(rows, what="groups", kind="matrix")
 
 
 def _cell(probability: Estimate | None, *, is_few: bool, is_sure: bool) -> Markup:

@@ -43,7 +43,7 @@ def _run_row(group: Group, training: TrackedTraining) -> Row:
         "seed": training.seed if training.seed is not None else "",
         "status": training.status,
         "environment steps": "" if math.isnan(training.env_steps) else int(training.env_steps),
-        "training, s": "" if math.isnan(training.wall_s) else round(training.wall_s, 1),
+        "training, s": "" if math.isnan(training.wall_s) else round(training.wall_s),
         "not kept": ", ".join(training.missing),
     }
 

@@ -19,22 +19,43 @@ PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="generator" content="armscan">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>
 <style>
-body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1160px; margin: 2rem auto; padding: 0 1rem; }}
-table {{ border-collapse: collapse; display: block; overflow-x: auto; }}
-.chart {{ overflow-x: auto; }}
-td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; }}
-td small {{ color: #555; white-space: nowrap; }}
-.results td, .results th {{ padding: .15rem .25rem; font-size: 12px; vertical-align: top; }}
-.results td {{ text-align: right; white-space: nowrap; }}
-.results td:first-child {{ text-align: left; white-space: normal; min-width: 7rem; }}
-summary {{ cursor: pointer; font-weight: bold; margin: 1.5rem 0; }}
+body {{ font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1160px; margin: 1.5rem auto; padding: 0 1rem; }}
+h1, p, li, summary, figcaption, code, td {{ overflow-wrap: anywhere; }}
+h2 {{ margin: 2.2rem 0 .4rem; }}
+.table, .chart {{ max-width: 100%; overflow-x: auto; }}
+table {{ border-collapse: collapse; margin: .5rem 0; }}
+td, th {{ border-bottom: 1px solid #ddd; padding: .25rem .6rem; text-align: left; vertical-align: top; }}
+th {{ border-bottom: 2px solid #999; vertical-align: bottom; overflow-wrap: normal; }}
+td.number {{ text-align: right; white-space: nowrap; }}
+small {{ color: #555; }}
+.results td, .results th {{ padding: .2rem; font-size: 12px; text-align: right; }}
+.results td {{ white-space: nowrap; }}
+.results td:first-child {{ text-align: left; white-space: normal; min-width: 8rem; overflow-wrap: break-word; }}
+summary {{ cursor: pointer; font-weight: bold; margin: 1rem 0; }}
 .matrices {{ display: flex; flex-wrap: wrap; gap: 0 2rem; }}
 .matrices > div {{ max-width: 100%; }}
 .matrix td {{ padding: 0; }}
-.matrix td:first-child, .matrix td > div {{ padding: .2rem .35rem; }}
-.videos {{ display: flex; flex-wrap: wrap; gap: 1rem; }}
-.videos figure {{ margin: 0; flex: 1 1 20rem; max-width: 34rem; }}
+.matrix td:first-child, .matrix td > div {{ padding: .2rem .35rem; overflow-wrap: normal; }}
+.charts {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr)); gap: 0 1rem; }}
+.charts > .chart {{ min-width: 0; }}
+.charts .modebar {{ display: none; }}
+.wide > div {{ min-width: 36rem; }}
+.videos {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: 1rem; }}
+.videos figure {{ margin: 0; max-width: 20rem; }}
 .videos img {{ width: 100%; }}
+@media (max-width: 640px) {{
+  body {{ margin: .5rem auto; padding: 0 .7rem; }}
+  .rows thead {{ display: none; }}
+  .rows, .rows tbody, .rows tr {{ display: block; }}
+  .rows tr {{ border: 1px solid #ccc; border-radius: .4rem; margin: .6rem 0; padding: .3rem .6rem; }}
+  .rows tr td, .results .rows td:first-child {{
+    display: flex; justify-content: space-between; gap: 1rem; border: 0; padding: .1rem 0; font-size: 14px;
+    text-align: right; white-space: normal;
+  }}
+  .rows td::before {{ content: attr(data-label); color: #555; text-align: left; flex: none; max-width: 60%; }}
+  .rows td:first-child {{ font-weight: bold; }}
+  .rows td:empty, .rows br, .modebar {{ display: none; }}
+}}
 </style><script>{script}</script></head><body><h1>{title}</h1>
 {body}
 </body></html>
@@ -42,7 +63,10 @@ summary {{ cursor: pointer; font-weight: bold; margin: 1.5rem 0; }}
 # By which a report is known.
 MARK, N_MARK_CHARS = '<meta name="generator" content="armscan">', 200
 # Without what leads elsewhere: a button would offer to upload a chart.
-CHART_CONFIG = {"displaylogo": False, "showSendToCloud": False, "plotlyServerURL": ""}
+CHART_CONFIG = {"displaylogo": False, "showSendToCloud": False, "plotlyServerURL": "", "responsive": True}
+FITTED = "this.querySelectorAll('.js-plotly-plot').forEach((chart) => Plotly.Plots.resize(chart))"
+# A longer table is folded.
+MOST_ROWS = 25
 Row = Mapping[str, Any]
 
 
@@ -103,18 +127,42 @@ def _is_report(file: Path) -> bool:
         return False
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Return rows as a table, with the columns that any of them has."""
+def table(rows: Sequence[Row], *, what: str = "rows", kind: str = "rows") -> str:
+    """Return rows as a table, with the columns that any of them has; a long one is folded.
+
+    Args:
+        rows: the rows, each its values by column; floats are shown with four digits.
+        what: what a folded table has so many of. Default: rows.
+        kind: `rows`, where a phone shows each row as a card, or `matrix`, which stays a table. Default: rows.
+    """
     keys = _columns(rows)
     head = "".join(f"<th>{html.escape(key)}</th>" for key in keys)
-    lines = ("".join(f"<td>{_cell(row.get(key, ''))}</td>" for key in keys) for row in rows)
-    return f"<table><tr>{head}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+    lines = ("".join(_cell(key, row.get(key, "")) for key in keys) for row in rows)
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    drawn = (
+        f'<div class="table"><table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    )
+    return drawn if len(rows) <= MOST_ROWS else folded(f"All {len(rows)} {what}", drawn)
 
 
-def chart(figure: graph_objects.Figure) -> str:
-    """Return a chart; the page's heading says what its title would."""
-    drawn = figure.update_layout(title=None).to_html(full_html=False, include_plotlyjs=False, config=CHART_CONFIG)
-    return f'<div class="chart">{drawn}</div>'
+def folded(summary: str, contents: str) -> str:
+    """Return pieces of HTML below a line that opens them."""
+    # A chart drawn while hidden has no width.
+    return f'<details ontoggle="{FITTED}"><summary>{html.escape(summary)}</summary>{contents}</details>'
+
+
+def chart(figure: graph_objects.Figure, *, is_wide: bool = False) -> str:
+    """Return a chart in the look of all; the page's heading says what its title would.
+
+    Args:
+        figure: the chart.
+        is_wide: whether a phone scrolls it, because it cannot be narrow. Default: false.
+    """
+    from armscan.reports.look import look
+
+    figure.update_layout(title=None, template=look())
+    drawn = figure.to_html(full_html=False, include_plotlyjs=False, config=CHART_CONFIG)
+    return f'<div class="chart{" wide" if is_wide else ""}">{drawn}</div>'
 
 
 def video_address(contents: bytes) -> str:
@@ -122,8 +170,13 @@ def video_address(contents: bytes) -> str:
     return f"data:image/gif;base64,{base64.b64encode(contents).decode()}"
 
 
-def _cell(value: Any) -> str:
-    return value if isinstance(value, Markup) else html.escape(str(value))
+def _cell(key: str, value: Any) -> str:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+    contents = value if isinstance(value, Markup) else html.escape(shown)
+    label = f' data-label="{html.escape(key)}"'
+    # A cell of nothing is not shown on a phone.
+    return f"<td{' class=number' if is_number else ''}{label}>{f'<div>{contents}</div>' if contents else ''}</td>"
 
 
 def _write_csv(file: Path, rows: Sequence[Row]) -> None:

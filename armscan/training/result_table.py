@@ -114,14 +114,19 @@ class ResultTable:
     def html(self) -> str:
         """Return the table as HTML, a line for each result."""
         headings = ["", *self.facts, *(column.title for column in self.quantities), *COUNTS]
-        lines = [f"<tr>{''.join(f'<th>{html.escape(heading)}</th>' for heading in headings)}</tr>"]
+        head = "".join(f"<th>{html.escape(heading)}</th>" for heading in headings)
+        lines = []
         for number, (name, result) in enumerate(self.results.items()):
             facts = [html.escape(values[number]) for values in self.facts.values()]
             cells = [_html_cell(result, column) for column in self.quantities]
             counts = [_count(result, count) for count in COUNTS.values()]
-            line = "".join(f"<td>{cell}</td>" for cell in (html.escape(name), *facts, *cells, *counts))
-            lines.append(f"<tr>{line}</tr>")
-        return f'<div class="results"><table>{"".join(lines)}</table><p><small>{HOW}</small></p></div>'
+            labelled = zip(headings, (html.escape(name), *facts, *cells, *counts), strict=True)
+            lines.append(
+                "".join(f'<td data-label="{html.escape(label)}"><div>{cell}</div></td>' for label, cell in labelled)
+            )
+        body = "".join(f"<tr>{line}</tr>" for line in lines)
+        drawn = f'<table class="rows"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
+        return f'<div class="results"><div class="table">{drawn}</div><p><small>{HOW}</small></p></div>'
 
     def markdown(self) -> str:
         """Return the table in Markdown, a column for each result."""
@@ -219,7 +224,7 @@ def _count(result: MetricEstimates, name: str) -> str:
 
 def _html_cell(result: MetricEstimates, column: Quantity) -> str:
     value, interval = _cell(result, column)
-    return f"{value}<br><small>{interval}</small>"
+    return f"{value}<br> <small>{interval}</small>"
 
 
 def _width(column: Column) -> int:

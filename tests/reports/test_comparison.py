@@ -1,6 +1,7 @@
 """What a comparison says of groups that nobody has trained: how many, of what, judged on which volumes."""
 
 import csv
+from dataclasses import replace
 
 import pytest
 
@@ -71,7 +72,7 @@ def test_final_figures_are_of_all_seeds_volumes_and_episodes(make_training):
 
 def test_success_without_a_failure_has_the_interval_of_wilson(written, make_training):
     page, _ = written(make_training(0), make_training(1))
-    assert "100.0%<br><small>67.6–100.0</small>" in page
+    assert "100.0%<br> <small>67.6–100.0</small>" in page
 
 
 def test_the_film_is_of_the_median_training(written, make_training):
@@ -94,3 +95,31 @@ def test_runs_that_were_left_out_and_rules_that_differ_are_said(written, make_tr
     )
     assert "another run has the same configuration and seed: aaaaaaaa (seed 0)." in page
     assert "have other rules (env.success_threshold)" in page
+
+
+def test_groups_have_the_ids_of_their_runs_and_rounded_times(written, make_training):
+    series = make_training().series
+    long = {name: replace(each, wall_s=each.wall_s + 1 / 3) for name, each in series.items()}
+    page, _ = written(make_training(0, series=long, run_id="abcdef01" * 4), make_training(1, run_id="12345678" * 4))
+    summary = page.partition("<h2>")[0]
+    assert "abcdef01 (0), 12345678 (1)" in summary
+    assert '<td data-label="training, s"><div>4 (4–4)</div></td>' in summary
+    assert '<td data-label="environment steps"><div>200</div></td>' in summary
+
+
+def test_curves_have_markers_and_films_come_after_charts(written, make_training):
+    page, _ = written(*(make_training(0, params={"agent.lr": str(lr)}) for lr in (1, 2)))
+    assert page.count('"mode":"lines+markers"') == 2 * 2
+    assert page.rindex("<h2>Which") < page.index("<h2>Episodes") < page.index("<h2>Runs")
+
+
+def test_long_tables_are_folded_and_name_their_cells_for_a_phone(written, make_training):
+    page, _ = written(*(make_training(seed) for seed in range(30)))
+    assert "<summary>All 30 runs</summary>" in page
+    assert '<td data-label="on plane, 5 mm 10°">' in page
+    assert '<td data-label="status"><div>finished</div></td>' in page
+
+
+def test_many_groups_are_compared_below_a_line_that_opens_them(written, make_training):
+    page, _ = written(*(make_training(0, params={"agent.lr": str(lr)}) for lr in range(13)))
+    assert "<summary>Each of 13 groups against each other</summary>" in page

@@ -93,7 +93,7 @@ def test_the_same_runs_give_the_same_report_however_they_are_named(answer, runs,
 def test_one_training_has_a_report_without_bands(answer, runs, tmp_path):
     assert answer(f"--runs={runs.ids('sac')[1]}", "--out=one")[0] == 0
     shown = page(tmp_path / "one")
-    assert "1 runs in 1 group:" in shown
+    assert "1 run in 1 group:" in shown
     assert "sac-cluster-y-phantom<" in shown
     assert "one seed says nothing of how others would go" in shown
     assert "<h2>Which is likely" not in shown
@@ -228,8 +228,10 @@ def test_report_needs_no_server_and_no_network(answer, runs, tmp_path, browser):
     browser.keep(pictures / "report.png")
     browser.click("#start")
     assert browser.picture(".videos figure:last-of-type img") > 0
-    browser.click("summary")
+    browser.click("summary", text="Metrics of the training itself: losses, returns, speed")
     assert browser.find("details .main-svg").size["width"] > 500
+    for width in (1600, 1160, 390):
+        assert browser.wider_than_page(width) == []
     requests = "return performance.getEntriesByType('resource').map((each) => each.name)"
     addresses = browser.driver.execute_script(requests)
     assert not [address for address in addresses if not address.startswith(("blob:", "data:"))]

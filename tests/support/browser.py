@@ -34,6 +34,13 @@ FIND = """
     const seen = [...document.querySelectorAll(arguments[0])].filter((each) => each.getClientRects().length > 0);
     return seen.findLast((each) => arguments[1] === null || isRead(each, arguments[1])) ?? null;
 """
+# Once the charts have followed a change of the page's width.
+WIDER = """
+    const done = arguments[0];
+    setTimeout(() => done([...document.querySelectorAll("html, body *:not(.wide):not(.wide *)")].filter((each) =>
+        each.clientWidth > 0 && !(each instanceof SVGElement) && each.scrollWidth > each.clientWidth + 1
+    ).map((each) => `${each.tagName} ${each.className}`)), 1000);
+"""
 
 
 def programs() -> tuple[str, str] | None:
@@ -147,6 +154,14 @@ class Browser:
             return int(image.get_property("naturalWidth") or 0)
 
         return int(self._wait.until(read, f"no picture {css}"))
+
+    def wider_than_page(self, width: int) -> list[str]:
+        """Returns what does not fit a page that is as wide as said, by its tag and class; charts may be scrolled."""
+        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        found = self.driver.execute_async_script(WIDER)
+        assert isinstance(found, list)
+        return found
 
     def keep(self, file: Path) -> None:
         """Keeps what is seen."""

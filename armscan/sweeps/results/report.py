@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,23 +12,31 @@ import optuna
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
-from optuna.visualization import (
-    plot_intermediate_values,
-    plot_optimization_history,
-    plot_parallel_coordinate,
-    plot_pareto_front,
-    plot_slice,
-)
-from plotly import graph_objects
 
-from armscan.reports.html import chart, table, video_address, write_page
-from armscan.sweeps.results.summary import ConfigResult, final_results, final_table, values_of
-from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINALIST, METRICS, RETRIED, RETRY_OF, StudyState
+from armscan.reports.html import folded, table, video_address, write_page
+from armscan.reports.look import title_of, value_text
+from armscan.sweeps.results.charts import charts_of
+from armscan.sweeps.results.summary import ConfigResult, final_results, final_table
+from armscan.sweeps.scheduling.state import (
+    ENV_STEPS,
+    FAILURE,
+    FINALIST,
+    LEASE,
+    METRICS,
+    RETRIED,
+    RETRY_OF,
+    StudyState,
+    env_steps_of,
+)
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import FOLDER, RUN
 
 MIN_TRIALS_FOR_IMPORTANCE = 4
+ID_CHARS = 8
+# How people say the states of trials.
+STATES = {"complete": "finished", "fail": "failed"}
+Row = dict[str, Any]
 
 
 def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folder: Path) -> Path:
@@ -44,6 +52,7 @@ def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folde
     """
     objectives = list(study.user_attrs["objectives"])
     trials, found = study.get_trials(deepcopy=False), final_results(final_trials)
+    shares = _importances(study, objectives)
     tables = {
         "trials": [_trial_row(trial, objectives) for trial in trials],
         "reports": [
@@ -58,18 +67,21 @@ def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folde
             if trial.state == TrialState.FAIL
         ],
         "result": list(_result_rows(found)),
-        "importances": _importances(study, objectives),
+        "importances": shares,
     }
     parts = [
         _summary(study, trials, objectives),
         "<h2>Result</h2><p>The best settings, trained with new seeds, on the test volumes, beside the baselines.</p>",
         _result(found, trials) if found else "<p>No final evaluation yet.</p>",
+        _running(trials),
+        *charts_of(study, trials, objectives, shares),
         _videos(final_trials),
-        *_charts(study, objectives, tables["importances"]),
+        "<h2>Trials</h2>",
+        _trials(trials, objectives) if trials else "<p>No trial has been begun.</p>",
         "<h2>How trials have ended</h2>",
-        table(tables["endings"]) if trials else "<p>No trial has been begun.</p>",
+        table([row | {"ending": _said(row["ending"])} for row in tables["endings"]]),
         "<h2>Failures</h2>",
-        table(tables["failures"]) if tables["failures"] else "<p>No trial has failed.</p>",
+        _failures(trials),
     ]
     return write_page(folder, f"Study {study.study_name}", parts, tables)
 
@@ -78,14 +90,66 @@ def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Seq
     state, best = StudyState.of(trials), best_trials(study, 1)
     n_pruned = sum(trial.state == TrialState.PRUNED for trial in state.finished)
     text = (
-        f"{len(state.finished)} trials finished, {n_pruned} of them pruned; {len(state.failed)} failed, "
-        f"{len(state.retried)} retried after their worker died. {state.env_steps:,} environment steps, "
-        f"{state.busy_hours:.2f} hours."
+        f"{len(state.finished)} trials finished, {n_pruned} of them pruned; {len(state.running)} running, "
+        f"{len(state.failed)} failed, {len(state.retried)} retried after their worker died. "
+        f"{state.env_steps:,} environment steps, {state.busy_hours:.2g} hours."
     )
     if best:
-        found = html.escape(values_of(best[0], objectives))
-        text += f" Best in the search: trial {best[0].number}, {found} (optimistically biased)."
+        values = zip(objectives, best[0].values, strict=True)
+        said = "; ".join(f"{title_of(name)} {value_text(name, value)}" for name, value in values)
+        text += f" Best in the search: trial {best[0].number}, {html.escape(said)} (optimistically biased)."
     return f"<p>{text}</p>"
+
+
+def _running(trials: Sequence[FrozenTrial]) -> str:
+    """Return a table of the trials that run, nothing where none does."""
+    rows = [
+        {
+            "trial": trial.number,
+            "worker": str(trial.user_attrs.get(LEASE, {}).get("worker", "–")),
+            "seed": trial.user_attrs.get(LEASE, {}).get("seed", "–"),
+            "environment steps": f"{env_steps_of(trial):,}",
+            "return, mean": trial.user_attrs.get(LEASE, {}).get("return", "–"),
+            **_settings(trial),
+        }
+        for trial in StudyState.of(trials).running
+    ]
+    return f"<h2>Running now</h2>{table(rows)}" if rows else ""
+
+
+def _settings(trial: FrozenTrial) -> Row:
+    """Return the values of a trial by their keys, rounded by the table."""
+    return {name: value if isinstance(value, int | float) else str(value) for name, value in trial.params.items()}
+
+
+def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
+    """Return a table of all trials, the best by the first objective first."""
+    rows = []
+    for trial in trials:
+        is_complete = trial.state == TrialState.COMPLETE
+        values = zip(objectives, trial.values, strict=True) if is_complete else ()
+        rows.append(
+            {
+                "trial": trial.number,
+                "ended": _said(trial.state.name.lower()),
+                **dict.fromkeys(map(title_of, objectives), ""),
+                **{title_of(name): value_text(name, value) for name, value in values},
+                **_settings(trial),
+                "environment steps": f"{env_steps_of(trial):,}",
+                "run": str(trial.user_attrs.get(RUN, ""))[:ID_CHARS],
+            }
+        )
+    return table(rows, what="trials")
+
+
+def _failures(trials: Sequence[FrozenTrial]) -> str:
+    failed = [trial for trial in trials if trial.state == TrialState.FAIL]
+    rows = [{"trial": trial.number, "cause": _cause(trial), **_settings(trial)} for trial in failed]
+    return table(rows, what="failures") if rows else "<p>No trial has failed.</p>"
+
+
+def _said(state: str) -> str:
+    return STATES.get(state, state)
 
 
 def _videos(final_trials: Sequence[FrozenTrial]) -> str:
@@ -93,10 +157,14 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
     films: dict[int, str] = {}
     for trial in final_trials:
         files = sorted(Path(trial.user_attrs.get(FOLDER, "nowhere")).glob("seed_*/episode.gif"))
-        if files and trial.user_attrs[FINALIST] not in films:
+        number = trial.user_attrs[FINALIST]
+        if files and number not in films:
             address = video_address(files[0].read_bytes())
-            films[trial.user_attrs[FINALIST]] = f'<img alt="an episode" src="{address}">'
-    return "".join(f"<h3>Trial {number}: an episode on a test volume</h3>{film}" for number, film in films.items())
+            caption = f"<figcaption>trial {number}</figcaption>"
+            films[number] = f'<figure><img alt="an episode" src="{address}">{caption}</figure>'
+    if not films:
+        return ""
+    return f'<h2>Episodes on a test volume</h2><div class="videos">{"".join(films.values())}</div>'
 
 
 def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> dict[str, Any]:
@@ -138,9 +206,11 @@ def _cause(trial: FrozenTrial) -> str:
 
 def _result(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> str:
     """Return the table of the result, and the settings of each trial in it."""
-    values = {result.number: html.escape(" ".join(overrides_of(trials[result.number].params))) for result in found}
-    items = "".join(f"<li>trial {number}: <code>{text}</code></li>" for number, text in values.items())
-    return f"{final_table(found).html()}<ul>{items}</ul>"
+    rows = [{"trial": result.number, **_settings(trials[result.number])} for result in found]
+    words = {result.number: html.escape(" ".join(overrides_of(trials[result.number].params))) for result in found}
+    items = "".join(f"<li>trial {number}: <code>{text}</code></li>" for number, text in words.items())
+    typed = folded("As words of the command line, with all digits", f"<ul>{items}</ul>")
+    return f"{final_table(found).html()}<h3>Their settings</h3>{table(rows)}{typed}"
 
 
 def _result_rows(found: Sequence[ConfigResult]) -> Iterator[dict[str, Any]]:
@@ -170,32 +240,5 @@ def _importances(study: optuna.Study, objectives: Sequence[str]) -> list[dict[st
     return rows
 
 
-def _charts(study: optuna.Study, objectives: Sequence[str], shares: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield the charts with their headings, as HTML."""
-    if not study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
-        yield "<p>No trial has run to its end yet.</p>"
-        return
-    if len(objectives) > 1:
-        figure = plot_pareto_front(study, target_names=list(objectives))
-        yield _titled("Trials that no other is better than", figure)
-    for number, objective in enumerate(objectives):
-        several = f": {objective}" if len(objectives) > 1 else ""
-        of_this: dict[str, Any] = {"target": _value(number), "target_name": objective}
-        yield _titled(f"History{several}", plot_optimization_history(study, **of_this))
-        if rows := [row for row in shares if row["objective"] == objective]:
-            bars = graph_objects.Bar(
-                x=[row["importance"] for row in rows], y=[row["key"] for row in rows], orientation="h"
-            )
-            yield _titled(f"Importance of each key{several}", graph_objects.Figure(bars))
-        yield _titled(f"Parallel coordinates{several}", plot_parallel_coordinate(study, **of_this))
-        yield _titled(f"Slices of the space{several}", plot_slice(study, **of_this))
-    if len(objectives) == 1:
-        yield _titled("Reports while training, pruned trials too", plot_intermediate_values(study))
-
-
-def _titled(heading: str, figure: graph_objects.Figure) -> str:
-    return f"<h2>{heading}</h2>{chart(figure)}"
-
-
-def _value(number: int, sign: float = 1.0) -> Callable[[FrozenTrial], float]:
-    return lambda trial: sign * trial.values[number]
+def _value(number: int, sign: float) -> Callable[[FrozenTrial], float]:
+    return lambda trial: sign * float(trial.values[number])

@@ -1,6 +1,8 @@
 """The report of a study: one page without a server, every number as CSV beside it."""
 
 import csv
+import json
+import re
 from functools import partial
 
 import optuna
@@ -71,7 +73,8 @@ def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
         "Importance",
         "Parallel",
         "Slices",
-        "Reports while",
+        "While training",
+        "Trials",
         "Failures",
     ):
         assert f"<h2>{heading}" in page
@@ -102,7 +105,64 @@ def test_report_of_several_objectives_or_of_nothing_yet_can_be_made(answer, tmp_
     page = (tmp_path / "here" / "report.html").read_text()
     assert ("Trials that no other is better than" if n_trials else "No trial has run to its end yet") in page
     of_each = ["History", "Importance of each key", "Parallel coordinates", "Slices of the space"]
-    assert all(f"<h2>{what}: {name}</h2>" in page for what in of_each for name in objectives) == (n_trials > 0)
+    titles = {"mean_steps": "steps, mean", "env_steps": "environment steps"}
+    headings = [f"<h2>{what}: {titles[name]}</h2>" for what in of_each for name in objectives]
+    assert all(heading in page for heading in headings) == (n_trials > 0)
+
+
+def chart_below(page, heading):
+    """Returns the lines of the chart below a heading, as Plotly is given them."""
+    drawn = page.partition(f"<h2>{heading}")[2]
+    lines = drawn.partition("Plotly.newPlot(")[2].partition("[")[2]
+    return json.JSONDecoder().raw_decode(f"[{lines}")[0]
+
+
+def test_history_has_the_best_so_far_and_every_number_is_rounded(answer, tmp_path):
+    storage = searched(tmp_path, ["mean_steps"])
+    judge(storage, tmp_path)
+    assert answer("--study=a")[0] == 0
+    page = (tmp_path / "reports" / "a" / "report.html").read_text()
+    points, best = chart_below(page, "History")
+    assert best["name"] == "best so far"
+    assert best["y"] == [min(points["y"][: end + 1]) for end in range(len(points["y"]))]
+    body = page.partition("<h1>")[2]
+    shown = re.sub(r"<script.*?</script>|<details.*?</details>", "", body, flags=re.DOTALL)
+    assert not re.findall(r"\d\.\d{6,}", shown)
+    (typed,) = re.findall(r"<code>agent.lr=([\d.e-]+)</code>", page)
+    assert float(typed) == points["y"][0]
+
+
+def test_films_are_after_the_charts_and_pruned_trials_look_so(answer, tmp_path):
+    storage = searched(tmp_path, ["mean_steps"])
+    judge(storage, tmp_path)
+    assert answer("--study=a")[0] == 0
+    page = (tmp_path / "reports" / "a" / "report.html").read_text()
+    assert page.index("<h2>Parallel") < page.index("<h2>Episodes on a test volume") < page.index("<h2>Trials")
+    lines = {each["name"]: each["marker"]["symbol"][-1] for each in chart_below(page, "While training")}
+    assert lines == {"finished": "circle", "pruned": "x", "failed": "circle"}
+
+
+def test_running_trials_are_listed_with_how_far_they_are(answer, tmp_path):
+    study = optuna.load_study(study_name="a", storage=searched(tmp_path, ["mean_steps"]).optuna)
+    trial = study.ask()
+    trial.suggest_float("agent.lr", 0.0, 1.0)
+    trial.report(0.5, 100)
+    trial.set_user_attr("lease", {"worker": "<i>me</i>", "seed": 3, "env_steps": 12345, "return": -8.123456})
+    assert answer("--study=a")[0] == 0
+    page = (tmp_path / "reports" / "a" / "report.html").read_text()
+    row = page.partition("<h2>Running now</h2>")[2].partition("</tbody>")[0]
+    for cell in ("&lt;i&gt;me&lt;/i&gt;", "12,345", "-8.123"):
+        assert f"<div>{cell}</div>" in row
+    assert chart_below(page, "While training")[-1]["name"] == "running"
+
+
+def test_report_fits_a_screen_and_a_phone(answer, tmp_path, browser):
+    judge(searched(tmp_path, ["mean_steps"], n_trials=30), tmp_path)
+    assert answer("--study=a")[0] == 0
+    browser.open((tmp_path / "reports" / "a" / "report.html").as_uri())
+    browser.count(".js-plotly-plot .main-svg", at_least=5)
+    for width in (1600, 1160, 390):
+        assert browser.wider_than_page(width) == []
 
 
 def test_report_needs_only_to_read_the_storage(answer, tmp_path):

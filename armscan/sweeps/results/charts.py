@@ -1,0 +1,146 @@
+"""The charts of a study's report."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import accumulate
+from typing import Any
+
+import optuna
+from optuna.distributions import CategoricalDistribution
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, TrialState
+from optuna.visualization import plot_parallel_coordinate, plot_pareto_front
+from plotly.graph_objects import Figure, Scatter
+
+from armscan.reports.html import chart
+from armscan.reports.look import BLUE, GREY, ORANGE, RED, is_rate, mode, title_of
+from armscan.sweeps.space.parameter import overrides_of
+
+HEIGHT_PX, SMALL_PX, BAR_PX = 360, 260, 34
+PERCENT = {"tickformat": ".0%"}
+
+
+def charts_of(
+    study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Sequence[str], shares: Sequence[Mapping[str, Any]]
+) -> Iterator[str]:
+    """Yield the charts of a study with their headings, as HTML.
+
+    Args:
+        study: the study.
+        trials: all of its trials.
+        objectives: names of the metrics that are its values, in order.
+        shares: importance of each key by objective; empty where too few trials have finished.
+    """
+    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    if len(objectives) == 1 and any(trial.intermediate_values for trial in trials):
+        heading = f"While training: {title_of(objectives[0])}"
+        yield _titled(heading, _reports(trials, objectives[0]), "A line for each trial, seeds one after another.")
+    if not complete:
+        yield "<p>No trial has run to its end yet.</p>"
+        return
+    if len(objectives) > 1:
+        figure = plot_pareto_front(study, target_names=list(map(title_of, objectives)))
+        yield _titled("Trials that no other is better than", figure.update_layout(height=HEIGHT_PX))
+    for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):
+        title = html.escape(title_of(objective))
+        better = "Higher" if direction == StudyDirection.MAXIMIZE else "Lower"
+        yield _titled(f"History: {title}", _history(complete, number, objective, direction), f"{better} is better.")
+        if rows := [row for row in shares if row["objective"] == objective]:
+            said = "The share of the differences between trials that each key explains (PED-ANOVA)."
+            yield _titled(f"Importance of each key: {title}", _importance(rows), said)
+        keys = list(dict.fromkeys(key for trial in complete for key in trial.params))
+        drawn = "".join(chart(_slice(complete, key, number, objective)) for key in keys)
+        yield f'<h2>Slices of the space: {title}</h2><div class="charts">{drawn}</div>'
+        figure = plot_parallel_coordinate(study, target=_value(number), target_name=title_of(objective))
+        yield f"<h2>Parallel coordinates: {title}</h2>{chart(figure.update_layout(height=HEIGHT_PX), is_wide=True)}"
+
+
+def _titled(heading: str, figure: Figure, said: str = "") -> str:
+    return f"<h2>{heading}</h2>{f'<p>{said}</p>' if said else ''}{chart(figure)}"
+
+
+def _value(number: int) -> Callable[[FrozenTrial], float]:
+    return lambda trial: float(trial.values[number])
+
+
+def _axis(metric: str) -> dict[str, Any]:
+    """Return how the axis of a metric is drawn."""
+    return {"title": title_of(metric)} | (PERCENT if is_rate(metric) else {})
+
+
+def _said(trial: FrozenTrial) -> str:
+    """Return what is said of a trial under the pointer."""
+    return "<br>".join(map(html.escape, (f"trial {trial.number}", *overrides_of(trial.params))))
+
+
+def _history(trials: Sequence[FrozenTrial], number: int, objective: str, direction: StudyDirection) -> Figure:
+    """Return the values of the trials in their order, and the best so far."""
+    values, numbers = [_value(number)(trial) for trial in trials], [trial.number for trial in trials]
+    best = list(accumulate(values, max if direction == StudyDirection.MAXIMIZE else min))
+    points: dict[str, Any] = {"mode": "markers", "marker": {"color": BLUE, "size": 7, "opacity": 0.7}}
+    hover = {"text": list(map(_said, trials)), "hovertemplate": "%{y:.4g}<br>%{text}<extra></extra>"}
+    figure = Figure(Scatter(x=numbers, y=values, name="trial", **points, **hover))
+    line = {"color": ORANGE, "width": 2, "shape": "hv"}
+    figure.add_scatter(x=numbers, y=best, mode=mode(len(best)), line=line, marker={"size": 4}, name="best so far")
+    legend = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0}
+    return figure.update_layout(height=HEIGHT_PX, xaxis_title="trial", yaxis=_axis(objective), legend=legend)
+
+
+def _importance(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Return the importance of each key as bars, the most important on top."""
+    figure = Figure()
+    bar = {"orientation": "h", "marker": {"color": BLUE}, "texttemplate": "%{x:.0%}", "textposition": "auto"}
+    figure.add_bar(x=[row["importance"] for row in rows], y=[row["key"] for row in rows], **bar)
+    figure.update_yaxes(autorange="reversed").update_xaxes(rangemode="tozero", **PERCENT)
+    return figure.update_layout(height=90 + BAR_PX * len(rows))
+
+
+def _slice(trials: Sequence[FrozenTrial], key: str, number: int, objective: str) -> Figure:
+    """Return the values of the trials by one key."""
+    having = [trial for trial in trials if key in trial.params]
+    found = having[0].distributions[key]
+    is_choice = isinstance(found, CategoricalDistribution)
+    places = [str(trial.params[key]) if is_choice else trial.params[key] for trial in having]
+    hover = {"text": list(map(_said, having)), "hovertemplate": "%{y:.4g}<br>%{text}<extra></extra>"}
+    points = {"mode": "markers", "marker": {"color": BLUE, "size": 7, "opacity": 0.5}}
+    figure = Figure(Scatter(x=places, y=[_value(number)(trial) for trial in having], **points, **hover))
+    axis: dict[str, Any] = {"title": key}
+    if isinstance(found, CategoricalDistribution):
+        axis |= {"type": "category", "categoryorder": "array", "categoryarray": list(map(str, found.choices))}
+    elif getattr(found, "log", False):
+        axis |= {"type": "log", "exponentformat": "power", "dtick": 1}
+    return figure.update_layout(height=SMALL_PX, xaxis=axis, yaxis=_axis(objective))
+
+
+def _reports(trials: Sequence[FrozenTrial], objective: str) -> Figure:
+    """Return what trials have reported while they trained: the finished in grey, the pruned to a cross, the running."""
+    figure, named = Figure(), set()
+    looks: dict[TrialState, tuple[str, dict[str, Any]]] = {
+        TrialState.COMPLETE: ("finished", {"line": {"color": GREY, "width": 1}, "opacity": 0.6}),
+        TrialState.PRUNED: ("pruned", {"line": {"color": RED, "width": 1}, "opacity": 0.6}),
+        TrialState.RUNNING: ("running", {"line": {"color": BLUE, "width": 2.5}}),
+    }
+    for trial in sorted(trials, key=lambda trial: trial.state == TrialState.RUNNING):
+        points = sorted(trial.intermediate_values.items())
+        if not points:
+            continue
+        name, style = looks.get(trial.state, ("failed", {"line": {"color": GREY, "width": 1, "dash": "dot"}}))
+        symbols = ["circle"] * (len(points) - 1) + ["x" if trial.state == TrialState.PRUNED else "circle"]
+        sizes = [3] * (len(points) - 1) + [8 if trial.state == TrialState.PRUNED else 5]
+        figure.add_scatter(
+            x=[step for step, _ in points],
+            y=[value for _, value in points],
+            mode=mode(len(points)),
+            marker={"symbol": symbols, "size": sizes},
+            name=name,
+            legendgroup=name,
+            showlegend=name not in named,
+            hovertemplate=f"trial {trial.number}: %{{y:.4g}}<extra>{name}</extra>",
+            **style,
+        )
+        named.add(name)
+    legend = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0}
+    axes = {"xaxis_title": "environment steps, of all seeds", "yaxis": _axis(objective)}
+    return figure.update_layout(height=HEIGHT_PX, legend=legend, **axes)
