@@ -12,7 +12,7 @@ from tianshou.data import Batch
 
 from armscan.agents.convolutions import images_of
 from armscan.agents.frame_store import FrameStore, Pixels
-from armscan.agents.replay import Replay, Tree
+from armscan.agents.replay import Added, Replay, Tree
 
 OBSERVATIONS = ("obs", "obs_next")
 Seen = list[tuple[bytes, int]]
@@ -47,7 +47,7 @@ class ImageReplay(Replay):
         # What was asked for last, by key and name, with the ids it was: an update asks for one batch twice.
         self._last: dict[tuple[str, str], tuple[NDArray[np.int32], Pixels]] = {}
 
-    def add(self, batch: Any, buffer_ids: Any = None) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    def add(self, batch: Any, buffer_ids: Any = None) -> Added:
         """Add a transition of each of these environments, which are all where none are named."""
         envs = range(self.buffer_num) if buffer_ids is None else [int(i) for i in buffer_ids]
         slots = [self._offset[i] + self.buffers[i]._insertion_idx for i in envs]
@@ -58,11 +58,11 @@ class ImageReplay(Replay):
             overwritten[name] = self._ids(name, slots) if len(self._meta.get_keys()) else []
             taken = [
                 images.take_in(env, obs, obs_next)
-                for env, obs, obs_next in zip(envs, batch.obs[name], batch.obs_next[name], strict=True)
+                for env, obs, obs_next in zip(envs, *(batch[key][name] for key in OBSERVATIONS), strict=True)
             ]
             for k, key in enumerate(OBSERVATIONS):
                 ids[key][name] = np.array([of_transition[k] for of_transition in taken], dtype=np.int32)
-        added = super().add(Batch({**dict(batch.items()), **ids}), buffer_ids)
+        added = super().add({**dict(batch.items()), **ids}, buffer_ids)
         # Only now: what was overwritten may be what has just been referred to anew.
         for name, images in self._images.items():
             images.frames.release(overwritten[name])

@@ -11,6 +11,7 @@ from tianshou.data import Batch, VectorReplayBuffer
 
 Tree = dict[str, Any]
 """Tensors by name, and such dicts."""
+Added = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 
 
 class Replay(VectorReplayBuffer):
@@ -23,6 +24,30 @@ class Replay(VectorReplayBuffer):
         environment's observations are clipped counts and finite by construction.
         """
         return False
+
+    def add(self, batch: Any, buffer_ids: Any = None) -> Added:
+        """Add a transition of each of these environments, which are all where none are named.
+
+        Args:
+            batch: parts of the transitions by name, a `Batch` or a dict, each of shape (n, ...).
+            buffer_ids: environments, shape (n,). Default: None, all of them.
+
+        Returns:
+            Places of the transitions; returns and lengths of episodes that end with them, 0 for others; and where the
+            episodes begin.
+        """
+        if not self._meta.get_keys():
+            first: Added = super().add(Batch(batch), buffer_ids)
+            return first
+        ids = np.arange(self.buffer_num) if buffer_ids is None else np.asarray(buffer_ids)
+        rings = self.buffers[ids]
+        ends = np.logical_or(batch["terminated"], batch["truncated"])
+        added = [ring._update_state_pre_add(*each) for ring, *each in zip(rings, batch["rew"], ends, strict=True)]
+        places, returns, lengths, starts = (np.array(each) for each in zip(*added, strict=True))
+        places += self._offset[ids]
+        self.last_index[ids], self._lengths[ids] = places, [len(ring) for ring in rings]
+        _write(self._meta, batch, places)
+        return places, returns, lengths, starts + self._offset[ids]
 
     def seed(self, seed: int) -> None:
         """Seeds the drawing of samples; every ring has a generator of its own, all with the same seed as they come."""
@@ -66,6 +91,16 @@ class Replay(VectorReplayBuffer):
             ring._insertion_idx, ring._size, ring.last_index = insertion, length, np.array([last])
             ring._ep_start_idx = insertion
             self._lengths[i], self.last_index[i] = length, self._offset[i] + last
+
+
+def _write(kept: Any, parts: Any, places: NDArray[np.int64]) -> None:
+    """Write parts of transitions to their places."""
+    for name, part in parts.items():
+        if isinstance(part, Batch | dict):
+            # Empty parts are in no checkpoint.
+            _write(kept.get(name), part, places)
+        else:
+            kept[name][places] = part
 
 
 def _tensors(batch: Any) -> Tree:

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from tianshou.data import Batch
 from tianshou.env import BaseVectorEnv
 
+from armscan.envs.history import Mask
 from armscan.envs.rules import Observed
-from armscan.envs.vector_env import reset_each
+from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
+from armscan.volumes.plane import FloatArray
 
 Ids = int | list[int] | NDArray[np.int64] | None
 
@@ -35,6 +37,8 @@ class TianshouVectorEnv(BaseVectorEnv):
         self.is_async = False
         self.is_closed = False
         self._envs = envs
+        if isinstance(bare := envs.unwrapped, ArmscanVectorEnv):
+            bare.info_keys = ("action", "reward", "is_success")
         self._seeds: list[int | None] | None = None
         self.n_ended = self.n_successes = 0
         self._action_spaces = [deepcopy(envs.single_action_space) for _ in range(envs.num_envs)]
@@ -48,19 +52,28 @@ class TianshouVectorEnv(BaseVectorEnv):
     def reset(self, env_id: Ids = None, **kwargs: Any) -> tuple[Any, NDArray[Any]]:
         """Start episodes; returns the first observations of those environments, and no information."""
         ids = np.arange(self.env_num) if env_id is None else np.atleast_1d(env_id)
-        mask = np.isin(np.arange(self.env_num), ids)
-        observations, _ = reset_each(self._envs, self._seeds, {"reset_mask": mask})
-        self._seeds = None
-        return _batched(observations)[ids], self._no_info(ids)
+        observations = self.begin(np.isin(np.arange(self.env_num), ids))
+        return batched(observations)[ids], self._no_info(ids)
 
     def step(self, action: Any, id: Ids = None) -> tuple[Any, ...]:  # noqa: A002
         """Take a step in all environments."""
         assert id is None or len(np.atleast_1d(id)) == self.env_num, "the environments are only stepped all at once"
-        observations, rewards, terminated, truncated, infos = self._envs.step(np.asarray(action))
+        observations, *outcome = self.advance(np.asarray(action))
+        return batched(observations), *outcome, self._no_info(np.arange(self.env_num))
+
+    def begin(self, mask: Mask) -> Observed:
+        """Start episodes in the environments of a mask; returns the observations of all of them."""
+        observations, _ = reset_each(self._envs, self._seeds, {"reset_mask": mask})
+        self._seeds = None
+        return observations
+
+    def advance(self, actions: NDArray[Any]) -> tuple[Observed, FloatArray, Mask, Mask]:
+        """Take a step in all environments; returns observations, rewards, and which have terminated or truncated."""
+        observations, rewards, terminated, truncated, infos = self._envs.step(actions)
         has_ended = terminated | truncated
         self.n_ended += int(np.count_nonzero(has_ended))
         self.n_successes += int(np.count_nonzero(has_ended & infos["is_success"]))
-        return _batched(observations), rewards, terminated, truncated, self._no_info(np.arange(self.env_num))
+        return observations, rewards, terminated, truncated
 
     def seed(self, seed: int | list[int] | None = None) -> list[list[int] | None]:
         """Seeds the next reset and the random actions, from a seed for each environment."""
@@ -75,6 +88,6 @@ class TianshouVectorEnv(BaseVectorEnv):
         return np.array([{"env_id": i} for i in ids])
 
 
-def _batched(observations: Observed) -> Any:
-    """Tianshou indexes a `Batch` as it does an array."""
+def batched(observations: Observed) -> Any:
+    """Return observations as Tianshou takes them, which indexes a `Batch` as it does an array."""
     return Batch(observations) if isinstance(observations, dict) else observations

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from tianshou.algorithm import algorithm_base
 from tianshou.algorithm.algorithm_base import Policy as TianshouPolicy
-from tianshou.data import Collector, collector
+from tianshou.data import collector
 from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
 from armscan.agents.compile_cache import cache_compiled
@@ -24,6 +24,7 @@ from armscan.agents.inference import Inference
 from armscan.agents.policy import Policy
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.replay import Replay
+from armscan.agents.step_collector import StepCollector
 from armscan.agents.tianshou_envs import TianshouVectorEnv
 from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
@@ -228,7 +229,7 @@ def prepare_torch(seed: int) -> None:
 def training_parameters(policy: TianshouPolicy, envs: TianshouVectorEnv, replay: Replay) -> dict[str, Any]:
     """Return the parameters that Tianshou's trainers share."""
     return {
-        "training_collector": Collector(policy, envs, replay, exploration_noise=True),
+        "training_collector": StepCollector(policy, envs, replay),
         "logger": EpochMetrics(),
         "verbose": False,
         "show_progress": False,

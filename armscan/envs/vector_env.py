@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, Self, cast
 
 import numpy as np
@@ -35,6 +35,10 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         render_mode: none is supported.
         **rules: the other arguments of `ArmscanEnv`.
 
+    Attributes:
+        info_keys: what `info` gives; all that `ArmscanEnv` describes, unless somebody who needs less says so, because
+            computing it takes a tenth of a step. The wrappers need `action` and `reward`.
+
     Raises:
         InvalidValueError: if an argument is outside what is allowed.
     """
@@ -62,6 +66,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         return envs
 
     def _set_up(self, num_envs: int, autoreset_mode: AutoresetMode, make_rules: Callable[[], Rules]) -> None:
+        self.info_keys: Collection[str] = tuple(INFO)
         self.num_envs = check_int("num_envs", num_envs, at_least=1, at_most=MOST_ENVS)
         self._autoreset_mode = autoreset_mode
         self.metadata = {"autoreset_mode": autoreset_mode}
@@ -95,7 +100,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         self._begin(chosen, names)
         look(self.rules, [self._episode(int(i)) for i in chosen])
         episodes = [self._episode(i) for i in range(self.num_envs)]
-        return self._observed(episodes), _infos_of(episodes, np.isin(np.arange(self.num_envs), chosen))
+        return self._observed(episodes), self._infos(episodes, np.isin(np.arange(self.num_envs), chosen))
 
     def step(self, actions: Any, env_ids: Sequence[int] | EnvIds | None = None) -> VectorStep:
         """Take a step in every environment, or in some of them.
@@ -122,7 +127,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         rewards = np.array([0.0 if over else e.view.reward for e, over in zip(episodes, is_over, strict=True)])
         terminated = np.array([episode.is_terminated for episode in episodes]) & ~is_over
         truncated = np.array([episode.is_truncated for episode in episodes]) & ~is_over
-        infos = _infos_of(episodes, np.ones(len(episodes), dtype=np.bool_))
+        infos = self._infos(episodes, np.ones(len(episodes), dtype=np.bool_))
         return self._observed(episodes), rewards, terminated, truncated, infos
 
     def episodes(self, env_ids: Sequence[int] | EnvIds) -> list[Episode]:
@@ -158,6 +163,20 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _observed(self, episodes: Sequence[Episode]) -> Observed:
         return self.rules.observe_all([episode.view for episode in episodes])
+
+    def _infos(self, episodes: Sequence[Episode], is_given: Mask) -> dict[str, Any]:
+        """Return `info` as arrays, and under `_key` which environments it is given for, as Gymnasium has it."""
+        given = [episode for episode, is_its in zip(episodes, is_given, strict=True) if is_its]
+        infos: dict[str, Any] = {}
+        for key in self.info_keys:
+            of, dtype = INFO[key]
+            values = np.array([of(episode) for episode in given], dtype=dtype)
+            # Of texts Gymnasium makes arrays of objects.
+            values = values.astype(object) if values.dtype.kind == "U" else values
+            infos[key] = np.zeros((len(episodes), *values.shape[1:]), dtype=values.dtype)
+            infos[key][is_given] = values
+            infos[f"_{key}"] = is_given.copy()
+        return infos
 
     def _volume_names(self, options: Any) -> list[str | None]:
         """Return the name of the volume that options choose for each environment, None for one that is drawn."""
@@ -205,20 +224,6 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         if not mask.any():
             raise InvalidValueError("reset option 'reset_mask' marks no environment, but it must mark at least one")
         return mask
-
-
-def _infos_of(episodes: Sequence[Episode], is_given: Mask) -> dict[str, Any]:
-    """Return `info` as arrays, and under `_key` which environments it is given for, as Gymnasium has it."""
-    given = [episode for episode, is_its in zip(episodes, is_given, strict=True) if is_its]
-    infos: dict[str, Any] = {}
-    for key, (of, dtype) in INFO.items():
-        values = np.array([of(episode) for episode in given], dtype=dtype)
-        # Of texts Gymnasium makes arrays of objects.
-        values = values.astype(object) if values.dtype.kind == "U" else values
-        infos[key] = np.zeros((len(episodes), *values.shape[1:]), dtype=values.dtype)
-        infos[key][is_given] = values
-        infos[f"_{key}"] = is_given.copy()
-    return infos
 
 
 def reset_each(

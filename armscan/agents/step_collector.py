@@ -1,0 +1,148 @@
+"""Tianshou's collector, without a `Batch` for every step of the environments."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
+from tianshou.algorithm.modelfree.sac import SACPolicy
+from tianshou.data import Collector, CollectStats
+from tianshou.utils.net.continuous import ContinuousActorProbabilistic
+from torch.distributions import Distribution, Independent, Normal
+
+from armscan.agents.replay import Replay
+from armscan.agents.tianshou_envs import TianshouVectorEnv, batched
+from armscan.envs.rules import Observed
+
+Actions = NDArray[np.float32]
+
+
+class StepCollector(Collector[CollectStats]):
+    """Tianshou's collector; steps of Gaussian policies are collected as arrays, by its rules and to the bit as it does.
+
+    Its own goes through some 7,000 Python calls for a step of all environments, most of them for a `Batch` that is made
+    only to be copied into the replay buffer. `_is_plain` holds the whole rule of when they are spared.
+
+    Args:
+        policy: policy that acts.
+        envs: training environments.
+        replay: replay buffer that transitions are added to.
+    """
+
+    def __init__(self, policy: Any, envs: TianshouVectorEnv, replay: Replay) -> None:
+        super().__init__(policy, envs, replay, exploration_noise=True)
+        self._envs, self._replay = envs, replay
+
+    def _is_plain(self, render: float | None, reset_arguments: dict[str, Any] | None) -> bool:
+        """Whether steps are collected as arrays: of Gaussian policies without hooks, pictures or options of a reset."""
+        hooks = self.get_on_step_hook(), self.get_on_episode_done_hook()
+        is_known = type(self.policy) in (SACPolicy, ProbabilisticActorPolicy)
+        is_gaussian = is_known and type(self.policy.actor) is ContinuousActorProbabilistic
+        is_bare = hooks == (None, None) and not render and not reset_arguments
+        return is_gaussian and is_bare and (self._pre_collect_obs_RO is not None)
+
+    def collect(
+        self,
+        n_step: int | None = None,
+        n_episode: int | None = None,
+        random: bool = False,
+        render: float | None = None,
+        reset_before_collect: bool = False,
+        gym_reset_kwargs: dict[str, Any] | None = None,
+    ) -> CollectStats:
+        """Collect steps or episodes; see Tianshou's."""
+        if n_step is None or reset_before_collect or not self._is_plain(render, gym_reset_kwargs):
+            return super().collect(n_step, n_episode, random, render, reset_before_collect, gym_reset_kwargs)
+        self._validate_n_step_n_episode(n_episode, n_step)
+        start_s = time.perf_counter()
+        if self.policy.training:
+            # Tianshou would go back to it after every collection; its updates see to that themselves.
+            self.policy.eval()
+        stats = self._collect_steps(n_step, random)
+        stats.set_collect_time(time.perf_counter() - start_s)
+        stats.refresh_all_sequence_stats()
+        return stats
+
+    def _collect_steps(self, n_step: int, random: bool) -> CollectStats:
+        observations: Any = self._pre_collect_obs_RO
+        spaces: Any = self.action_space
+        ended: list[NDArray[Any]] = []
+        spreads: list[Actions] = []
+        n_steps = 0
+        while n_steps < n_step:
+            if random:
+                sent = np.array([space.sample() for space in spaces])
+                actions = self.policy.map_action_inverse(sent)
+            else:
+                actions, spread = self._chosen_actions(observations)
+                sent = self.policy.map_action(actions)
+                spreads.append(spread)
+            observations, of_ended = self._step(observations, actions, sent)
+            ended.append(of_ended)
+            n_steps += self.env_num
+        self._pre_collect_obs_RO = batched(observations)
+        returns, lengths = np.concatenate(ended, axis=1)
+        self.collect_step += n_steps
+        self.collect_episode += returns.size
+        return CollectStats(
+            n_collected_steps=n_steps,
+            n_collected_episodes=returns.size,
+            returns=returns,
+            lens=lengths.astype(int),
+            pred_dist_std_array=np.concatenate(spreads) if spreads else None,
+        )
+
+    @torch.no_grad()
+    def _chosen_actions(self, observations: Observed) -> tuple[Actions, Actions]:
+        """Return the policy's actions and their standard deviations, each of shape (n_envs, n_free)."""
+        policy: Any = self.policy
+        is_sac = type(policy) is SACPolicy
+        means_and_spreads, _ = policy.actor(observations)
+        # Checks that they are numbers, as the distributions of Tianshou do.
+        chosen_from: Distribution = (
+            Independent(Normal(*means_and_spreads), 1) if is_sac else policy.dist_fn(means_and_spreads)
+        )
+        if policy.deterministic_eval and not policy.is_within_training_step:
+            actions = chosen_from.mode
+        else:
+            actions = chosen_from.sample()
+        return (torch.tanh(actions) if is_sac else actions).cpu().numpy(), chosen_from.stddev.cpu().numpy()
+
+    def _step(self, observations: Observed, actions: Actions, sent: Actions) -> tuple[Observed, NDArray[Any]]:
+        """Take a step in all environments and keep the transitions.
+
+        Args:
+            observations: observations of the current planes.
+            actions: the policy's actions, which are kept, shape (n_envs, n_free).
+            sent: the same as the environments take them.
+
+        Returns:
+            The observations to go on from, those of new episodes included; and the returns and lengths of the episodes
+            that have ended, shape (2, n_ended).
+        """
+        observations_next, rewards, terminated, truncated = self._envs.advance(sent)
+        done = terminated | truncated
+        places, returns, _, starts = self._replay.add(
+            {
+                "obs": observations,
+                "act": actions,
+                "obs_next": observations_next,
+                "rew": rewards,
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": done,
+                "info": {"env_id": np.arange(self.env_num)},
+            }
+        )
+        if done.any():
+            # Of all environments, those that are left as they are included.
+            observations_next = self._envs.begin(done)
+        # As Tianshou counts: those of its transitions that the buffer holds.
+        kept = [
+            self._replay.get_buffer_indices(*each).size for each in zip(starts[done], places[done] + 1, strict=True)
+        ]
+        return observations_next, np.array([returns[done], kept])
