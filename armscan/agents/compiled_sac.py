@@ -180,7 +180,7 @@ class _CompilationNote(Listener):
 
     def on_start(self, event: Event) -> None:
         if event.data["dispatcher"] is kernels.update:
-            log("compiling SAC's update for this machine, which takes up to a minute; later runs find it in the cache")
+            log("compiling SAC's update for this machine, which takes ten seconds; later runs find it in the cache")
 
     def on_end(self, event: Event) -> None:
         pass

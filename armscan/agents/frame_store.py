@@ -75,7 +75,8 @@ def _decode(joined: Pixels, ends: NDArray[np.uint64], pixels: Pixels) -> None:
     for k in range(len(ends)):
         frame, end = pixels[k], ends[k]
         if end - at == n_pixels:
-            frame[:] = joined[at:end]
+            for pixel in range(n_pixels):
+                frame[pixel] = joined[at + np.uint64(pixel)]
             at = end
             continue
         frame[:] = 0

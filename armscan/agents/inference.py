@@ -38,7 +38,8 @@ def linear_rows(rows: Rows, weights: Rows, bias: Rows) -> Rows:
     answers = np.empty((rows.shape[0], bias.size), dtype=np.float32)
     for row in range(rows.shape[0]):
         sums = answers[row]
-        sums[:] = bias
+        for j in range(sums.size):
+            sums[j] = bias[j]
         for k in range(by_input.shape[0]):
             value, of_input = rows[row, k], by_input[k]
             # Many outputs at a time, which no sum is shared between.

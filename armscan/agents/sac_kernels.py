@@ -22,6 +22,7 @@ F = np.float32
 LOG_STD_MIN, LOG_STD_MAX, EPS = F(-20.0), F(2.0), np.finfo(np.float32).eps
 LOG_SQRT_2PI = F(0.5 * math.log(2.0 * math.pi))
 
+# Arrays are copied by loops: at an assignment to a slice, Numba compiles the text of its shape error, for two seconds.
 # Sums may be reordered, so that loops over them are vectorised. NaN stays NaN: a training that diverges must show it.
 compiled = numba.njit(
     cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"}, boundscheck=False
@@ -165,7 +166,8 @@ def _backward(weights: Weights, layers: Layers, n_rows: int, start: int, of_inpu
 @compiled
 def adam_step(weights: Weights, settings: Adam) -> None:
     """Take a step of Adam, as torch's."""
-    weights.steps[:] += F(1.0)
+    for i in range(weights.steps.size):
+        weights.steps[i] += F(1.0)
     n_steps = weights.steps[0]
     step_size = F(settings.lr / (1.0 - settings.beta1**n_steps))
     root = F(math.sqrt(1.0 - settings.beta2**n_steps))
@@ -204,8 +206,9 @@ def _judge(critic: Floats, layers: Layers, obs: Floats, actions: Floats, values:
     """Fill a critic's values, shape (n, 1); returns where the weights of its head start."""
     n, n_obs = obs.shape
     x = _layer(layers.values, layers.sizes, n, 0)
-    x[:, :n_obs] = obs
-    x[:, n_obs:] = actions
+    for i in range(n):
+        for j in range(x.shape[1]):
+            x[i, j] = obs[i, j] if j < n_obs else actions[i, j - n_obs]
     head: int = _forward(critic, layers, n)
     _linear(_layer(layers.values, layers.sizes, n, layers.sizes.size - 1), critic, head, values, False)
     return head
@@ -249,7 +252,10 @@ def _update_actor(
     for k in range(2):
         head = _judge(agent.critics[k].values, critic_layers, obs, drawn.actions, values[k])
         _critic_gradient(agent.critics[k], critic_layers, head, d_values, True)
-        d_actions[k] = _layer(critic_layers.gradient, critic_layers.sizes, n, 0)[:, obs.shape[1] :]
+        d_x = _layer(critic_layers.gradient, critic_layers.sizes, n, 0)
+        for i in range(n):
+            for j in range(n_free):
+                d_actions[k, i, j] = d_x[i, obs.shape[1] + j]
 
     loss = mean_log_prob = 0.0
     d_mean, d_log_std = np.empty((n, n_free), F), np.empty((n, n_free), F)
@@ -283,7 +289,9 @@ def _actor_gradient(actor: Weights, layers: Layers, d_mean: Floats, d_log_std: F
     _linear_gradient(features, d_log_std, actor.gradient, std_head)
     _input_gradient(d_mean, actor.values, mean_head, d_features)
     _input_gradient(d_log_std, actor.values, std_head, of_std)
-    d_features += of_std
+    for i in range(n):
+        for j in range(features.shape[1]):
+            d_features[i, j] += of_std[i, j]
     _backward(actor, layers, n, mean_head, False)
 
 
@@ -319,6 +327,14 @@ def _returns(
 
 
 @compiled
+def _take(rows: Floats, index: Ints, out: Floats) -> None:
+    """Fill a batch with its rows."""
+    for i in range(index.size):
+        for j in range(out.shape[1]):
+            out[i, j] = rows[index[i], j]
+
+
+@compiled
 def update(
     transitions: Transitions,
     indices: Ints,
@@ -343,13 +359,11 @@ def update(
     obs, actions = _layer(actor_layers.values, actor_layers.sizes, n, 0), np.empty(noise.shape[2:], F)
     for step, index in enumerate(indices):
         alpha = F(np.exp(agent.entropy.log_alpha.values[0]))
-        for i in range(n):
-            obs[i] = transitions.obs_next[index[i]]
+        _take(transitions.obs_next, index, obs)
         drawn = _act(agent.actor, actor_layers, noise[step, 0])
         returns = _returns(transitions, index, obs, drawn, agent, critic_layers, alpha)
-        for i in range(n):
-            obs[i] = transitions.obs[index[i]]
-            actions[i] = transitions.act[index[i]]
+        _take(transitions.obs, index, obs)
+        _take(transitions.act, index, actions)
         for k in range(2):
             losses[step, 1 + k] = _update_critic(
                 agent.critics[k], critic_layers, agent.adams[1 + k], obs, actions, returns

@@ -56,7 +56,9 @@ def _find_core(mask: Pixels, stride: int, margin: int, half_widths: IntArray, mi
     n_pixels = mask.size - 2 * first
     inside = mask[first : first + n_pixels]
     window = np.full(n_pixels, zero)
-    window[:] = inside
+    # By a loop: at an assignment to a slice, Numba compiles the text of its shape error, for two seconds.
+    for i in range(n_pixels):
+        window[i] = inside[i]
     counts = np.full(n_pixels + 2 * reach * stride, zero)
     for width in range(pad + 1):
         if width > 0:
@@ -196,7 +198,8 @@ def _cluster(
     flat = np.zeros((n_rows + 2 * reach) * stride + 2 * margin, dtype=np.uint8)
     mask = flat[reach * stride + margin :][: n_rows * stride].reshape((n_rows, stride))
     for row in range(n_rows):
-        mask[row, :n_cols] = slice_xz[row_first + row, col_first:col_stop] == label
+        for col in range(n_cols):
+            mask[row, col] = slice_xz[row_first + row, col_first + col] == label
     if count_disc_pixels(half_widths) < 2**8:
         flat_core = _find_core(flat, stride, margin, half_widths, min_samples, np.uint8(0))
     else:
@@ -274,5 +277,7 @@ def summarise_label(
     summary[0] = len(sums)
     for of_cluster in sums:
         summary[1] += of_cluster[0]
-        summary[2:] += of_cluster[1:] / of_cluster[0]
-    summary[2:] /= max(1, len(sums))
+        summary[2] += of_cluster[1] / of_cluster[0]
+        summary[3] += of_cluster[2] / of_cluster[0]
+    summary[2] /= max(1, len(sums))
+    summary[3] /= max(1, len(sums))

@@ -24,9 +24,9 @@ def rotation_matrix(rz_deg: float, rx_deg: float) -> FloatArray:
     cos_z, sin_z = math.cos(math.radians(rz_deg)), math.sin(math.radians(rz_deg))
     cos_x, sin_x = math.cos(math.radians(rx_deg)), math.sin(math.radians(rx_deg))
     matrix = np.empty((3, 3))
-    matrix[0] = cos_z, -sin_z * cos_x, sin_z * sin_x
-    matrix[1] = sin_z, cos_z * cos_x, -cos_z * sin_x
-    matrix[2] = 0.0, sin_x, cos_x
+    matrix[0, 0], matrix[0, 1], matrix[0, 2] = cos_z, -sin_z * cos_x, sin_z * sin_x
+    matrix[1, 0], matrix[1, 1], matrix[1, 2] = sin_z, cos_z * cos_x, -cos_z * sin_x
+    matrix[2, 0], matrix[2, 1], matrix[2, 2] = 0.0, sin_x, cos_x
     return matrix
 
 
