@@ -27,6 +27,7 @@ from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
 from armscan.errors import is_interruption
 from armscan.experiment.job import INTERRUPTED, Invocation, remove_if_untracked
+from armscan.launch.folds import with_folds
 from armscan.launch.job_process import start_job
 from armscan.launch.multirun import Multirun, end_multirun
 from armscan.utils.log import silence_library_warnings
@@ -111,7 +112,7 @@ def main() -> int:
 
             resume(sys.argv[1:], repeat_grid)
         else:
-            launch(sys.argv[1:])
+            launch(with_folds(sys.argv[1:]))
     except BrokenPipeError:
         # Whoever reads what --help prints may stop reading; nothing more can be written, not even on the way out.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -177,6 +177,27 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
 
 
 @pytest.mark.full
+def test_folds_are_a_grid_with_one_table_over_all_of_them(tmp_path, data_folder):
+    few = ["agent=random", "evaluation.episodes=2", "tracking.policy=false"]
+    words = ["data=nifti", f"data.path={data_folder}", "data.folds=2", "data.validation=0.25", *few]
+    ended = armscan_run(*words, cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    tracked = runs_in(tmp_path)[1]
+    (parent,) = [each for each in tracked if each.info.run_name.startswith("multirun")]
+    children = [each for each in tracked if each is not parent]
+    assert len(children) == 2
+    table = ended.stdout[ended.stdout.index("all folds (test)") :]
+    assert "agent," in table
+    assert "random," in table
+    # Each of the four wrists is tested on once.
+    assert parent.data.metrics["test_volumes/volumes"] == 4
+    assert parent.data.metrics["test_volumes/episodes"] == 4
+    mean = sum(child.data.metrics["test_volumes/mean_steps"] for child in children) / 2
+    assert parent.data.metrics["test_volumes/mean_steps"] == pytest.approx(mean)
+    assert list((tmp_path / "multirun").glob("*/*/results.html"))
+
+
+@pytest.mark.full
 def test_grid_that_configures_hydra_says_that_resuming_it_needs_trust(tmp_path):
     ended = armscan_run("-m", "seed=0,-1", "agent=random", "hydra.launcher.n_jobs=1", *FEW, cwd=tmp_path)
     assert ended.returncode == 1
@@ -224,7 +245,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["agent=optuna", "agent.sampler=x"], "agent.sampler is 'x', but it must be tpe, cmaes or gp"),
         (["agnet=sac"], "there is no key 'agnet' at the top, but only data, obs, reward, network, agent, "),
         (["+agent.foo=1"], "Error in call to target 'armscan.agents.sac.SAC': TypeError(\"SAC.__init__() got an unex"),
-        (["data=nifti", "data.pth=x"], "there is no key 'pth' in data, but only path, validation, test or split_seed"),
+        (["data=nifti", "data.pth=x"], "there is no key 'pth' in data, but only path, validation, test, split_seed"),
         (["data=nifti"], "data.path is not set"),
         (["data=nifti", "data.path=/nowhere"], "/nowhere: the folder of volumes does not exist"),
         (["seed=["], "'seed=[' cannot be read: what follows the options must be key=value"),

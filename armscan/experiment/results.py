@@ -39,7 +39,7 @@ EVALUATED = "/success_rate"
 NAMES = {name.replace(" ", "_"): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
 # With fewer volumes intervals are clearly too narrow: docs/evaluation.md.
 FEWEST_VOLUMES = 8
-WHAT_HELPS = "more wrists, data=mixed, or cross-validation (runs with other splits of the wrists) would help"
+WHAT_HELPS = "more wrists, data=mixed, or cross-validation (data.folds=leave_one_out) would help"
 
 
 @dataclass(frozen=True)

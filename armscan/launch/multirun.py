@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -129,6 +129,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
 
         print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
         if runs:
+            _pool_folds(Multirun.folder, word, outcomes, runs)
             print_where_to_look(Multirun.folder, word["tracking"]["uri"])
             compare = armscan_command("report", "--runs", word["run_id"], tracking=word["tracking"]["uri"])
             print(f"compare   {compare}")
@@ -145,6 +146,21 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     if is_known and not runs:
         remove_run_folder(Multirun.folder)
     return 1 if failed or not outcomes else 0
+
+
+def _pool_folds(folder: Path, word: Mapping[str, Any], outcomes: Mapping[str, JobOutcome], runs: Sequence[Run]) -> None:
+    """Print one table over all folds of a cross-validation, and keep it with the parent run."""
+    from armscan.experiment.console import print_table
+    from armscan.launch.folds_table import folds_table, keep_table
+    from armscan.tracking import open_store
+
+    finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
+    table = folds_table((Path(run.data.tags["folder"]), outcomes[run.data.tags[JOB_TAG]].varied) for run in finished)
+    if table is not None:
+        left_out = len(outcomes) - len(finished)
+        print_table("all folds (test)", table, [f"{left_out} of {len(outcomes)} jobs are missing"] if left_out else [])
+        store, _ = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
+        keep_table(table, folder, store, word["run_id"])
 
 
 def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Mapping[str, JobOutcome]) -> list[Run]:

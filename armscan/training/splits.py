@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, replace
 
-import numpy as np
-
-from armscan.errors import InvalidValueError, listed
+from armscan.errors import InvalidValueError
 from armscan.training.fingerprints import Fingerprints, fingerprint
-from armscan.utils.validation import LARGEST_SEED, check_choice, check_float, check_int, check_path, check_seed
-from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
+from armscan.training.subject_splits import PHANTOMS, parts_by_subject
+from armscan.utils.validation import LARGEST_SEED, check_choice, check_int, check_path
+from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 from armscan.volumes.phantom import VERSIONS
 
 # No phantom of one purpose has the seed of another.
 VALIDATION_FIRST_SEED, TEST_FIRST_SEED = 1_000_000, 2_000_000
-DEFAULT_SHARE = 0.25
 
 PARTS = ("training", "validation", "test")
 
@@ -113,24 +109,25 @@ def nifti_data(
     validation: float | str | Sequence[str] | None = None,
     test: float | str | Sequence[str] | None = None,
     split_seed: int = 0,
+    folds: int | str | None = None,
+    fold: int | None = None,
 ) -> Split:
     """Return the volumes of a folder, as `open_dataset` reads them, split by subject.
 
     Args:
         path: the folder.
         validation: a share of the subjects, in (0, 1), rounded up; or the names of subjects or volumes. None: as the
-            manifest's splits say; where it has none, or `test` is given, a quarter.
-        test: likewise, with `validation` the other way round.
-        split_seed: draws which subjects make up the shares.
+            manifest's splits say; where it has none, or `test` is given, a quarter; with `folds` the next fold's.
+        test: likewise, with `validation` the other way round; None with `folds`, which say it.
+        split_seed: draws which subjects make up the shares and the folds.
+        folds: cross-validation: `leave_one_out`, each subject is a fold, or the number of folds. Default: None, none.
+        fold: number of the fold that is tested on, from 0. Default: None, no cross-validation.
 
     Raises:
         InvalidValueError: if one of the three splits would have no volume, or a subject would be in two of them.
     """
     dataset = open_dataset(check_path("data.path", path))
-    if validation is None and test is None and dataset.splits is not None:
-        parts = dataset.splits
-    else:
-        parts = _drawn(dataset, {"test": test, "validation": validation}, path, split_seed)
+    parts = parts_by_subject(dataset, {"test": test, "validation": validation}, path, split_seed, folds, fold)
     return Split(*({n: v for n, v in dataset.volumes.items() if parts[n] == part} for part in SPLITS))
 
 
@@ -143,82 +140,57 @@ def mixed_data(
     first_seed: int = 0,
     cache_dir: str | None = None,
     version: int = 1,
+    validation: float | str | Sequence[str] | None = PHANTOMS,
+    test: float | str | Sequence[str] | None = PHANTOMS,
+    split_seed: int = 0,
+    folds: int | str | None = None,
+    fold: int | None = None,
 ) -> Split:
-    """Volumes of a folder to train on, and phantom wrists beside them; validation and test are on phantoms alone.
+    """Volumes of a folder, split by subject, and phantom wrists beside those to train on.
 
     Args:
         path: the folder.
         n_volumes: number of its volumes to use, the first by name; None for all.
         n_training: number of phantoms to train on beside them, which may be 0.
-        n_validation: number of phantoms that choose the checkpoint.
-        n_test: number of phantoms to judge on.
+        n_validation: number of phantoms that choose the checkpoint, where phantoms do.
+        n_test: number of phantoms to judge on, where phantoms are judged on.
         first_seed: seed of the first of the training phantoms.
         cache_dir: folder where phantoms are kept; the user's cache folder where it is None.
         version: version of the phantoms, as in `phantom_data`. Default: 1.
+        validation: as in `nifti_data`, or `phantoms`, so that no subject is spent on it. Default: `phantoms`, as runs
+            have had it that say nothing.
+        test: likewise.
+        split_seed: as in `nifti_data`.
+        folds: as in `nifti_data`.
+        fold: as in `nifti_data`.
 
     Raises:
-        InvalidValueError: if a number is out of range.
+        InvalidValueError: if a number is out of range, or the volumes cannot be split so.
     """
     n_beside = check_int("data.n_training", n_training, at_least=0)
-    phantoms = phantom_data(max(n_beside, 1), n_validation, n_test, first_seed, cache_dir, version)
-    volumes = open_dataset(check_path("data.path", path)).volumes
+    given = {"test": test, "validation": validation}
+    wanted = {part: each for part, each in given.items() if each != PHANTOMS}
+    phantoms = phantom_data(
+        max(n_beside, 1),
+        1 if "validation" in wanted else n_validation,
+        1 if "test" in wanted else n_test,
+        first_seed,
+        cache_dir,
+        version,
+    )
+    dataset = open_dataset(check_path("data.path", path))
     if n_volumes is not None:
-        check_int("data.n_volumes", n_volumes, at_least=1, at_most=len(volumes))
-    chosen = {name: volumes[name] for name in sorted(volumes)[:n_volumes]}
-    return Split({**chosen, **(phantoms.training if n_beside else {})}, phantoms.validation, phantoms.test)
-
-
-def _drawn(
-    dataset: Dataset, wanted: dict[str, float | str | Sequence[str] | None], path: str, split_seed: int
-) -> dict[str, str]:
-    """Return the split of each volume: first what is named, then shares of the subjects that are left."""
-    subjects = dataset.subjects
-    parts: dict[str, str] = {}
-    shares: dict[str, float] = {}
-    for part, given in wanted.items():
-        if isinstance(given, str | list | tuple):
-            for volume in _named(dataset, [given] if isinstance(given, str) else given, part, path):
-                if parts.setdefault(volume, part) != part:
-                    raise InvalidValueError(f"data.{part} and data.{parts[volume]} both name {volume}")
-        else:
-            shares[part] = DEFAULT_SHARE if given is None else _share(f"data.{part}", given)
-    taken = {subjects[volume] for volume in parts}
-    left = [subject for subject in dict.fromkeys(subjects.values()) if subject not in taken]
-    drawn = iter(np.random.default_rng(check_seed("data.split_seed", split_seed)).permutation(len(left)))
-    n_subjects = len(set(subjects.values()))
-    for part, share in shares.items():
-        chosen = {left[index] for index in islice(drawn, math.ceil(share * n_subjects))}
-        parts |= {volume: part for volume, subject in subjects.items() if subject in chosen}
-    parts = {volume: parts.get(volume, "train") for volume in subjects}
-    _check_subjects(parts, subjects)
-    return parts
-
-
-def _named(dataset: Dataset, names: Sequence[str], part: str, path: str) -> list[str]:
-    """Return the volumes that are named, themselves or by their subject."""
-    known = [*dataset.volumes, *dataset.subjects.values()]
-    if not all(isinstance(name, str) for name in names):
-        raise InvalidValueError(f"data.{part} is {names!r}, but it must be a share, or names of subjects or volumes")
-    if unknown := [name for name in names if name not in known]:
-        raise InvalidValueError(f"data.{part} names {listed(unknown)}, but {path} holds {listed(dict.fromkeys(known))}")
-    return [volume for volume, subject in dataset.subjects.items() if volume in names or subject in names]
-
-
-def _share(name: str, given: object) -> float:
-    try:
-        return check_float(name, given, above=0.0, at_most=1.0)
-    except InvalidValueError as error:
-        raise InvalidValueError(
-            f"{name} is {given!r}, but it must be a share above 0 and below 1, or names of subjects or volumes"
-        ) from error
-
-
-def _check_subjects(parts: dict[str, str], subjects: dict[str, str]) -> None:
-    first: dict[str, str] = {}
-    for volume, subject in subjects.items():
-        part = parts[first.setdefault(subject, volume)]
-        if part != parts[volume]:
-            raise InvalidValueError(
-                f"{first[subject]} is for {part} and {volume} for {parts[volume]}, but both are of the subject "
-                f"{subject}, which must be in one split: name all of its volumes, or the subject"
-            )
+        check_int("data.n_volumes", n_volumes, at_least=1, at_most=len(dataset.volumes))
+    names = sorted(dataset.volumes)[:n_volumes]
+    dataset = replace(
+        dataset,
+        volumes={name: dataset.volumes[name] for name in names},
+        subjects={name: dataset.subjects[name] for name in names},
+    )
+    parts = parts_by_subject(dataset, wanted, path, split_seed, folds, fold)
+    ours = {part: {name: dataset.volumes[name] for name in names if parts[name] == part} for part in SPLITS}
+    return Split(
+        {**ours["train"], **(phantoms.training if n_beside else {})},
+        ours["validation"] if "validation" in wanted else phantoms.validation,
+        ours["test"] if "test" in wanted else phantoms.test,
+    )

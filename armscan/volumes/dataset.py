@@ -100,6 +100,27 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
     )
 
 
+def subjects_in(path: str | Path, n_volumes: int | None = None) -> list[str]:
+    """Return whose arm each volume of a folder is, as its manifest says, without reading a volume.
+
+    Args:
+        path: the folder.
+        n_volumes: number of its volumes that count, the first by name. Default: None, all.
+
+    Raises:
+        VolumeError: if the folder cannot be read.
+        ManifestError: if it has no manifest, or a damaged one.
+    """
+    folder = check_path("the folder of volumes", path)
+    found = find_manifest(folder)
+    files = volume_files(folder)
+    if found is None:
+        raise ManifestError(f"{folder}: the folder has no manifest ({listed(MANIFEST_NAMES)})")
+    entries = volume_entries(read_manifest(found), files, found)
+    used = {name: entry.subject or name for name, entry in entries.items() if not entry.exclude}
+    return [used[name] for name in sorted(used)[:n_volumes]]
+
+
 def _split_of(splits: Splits, subjects: Mapping[str, str], used: Mapping[str, object], where: str) -> dict[str, str]:
     """Return the split of each volume; `subjects` also holds those whose volumes are all excluded."""
     split_of = {subject: split for split in SPLITS for subject in getattr(splits, split)}

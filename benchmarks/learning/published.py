@@ -25,7 +25,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from benchmarks.learning.runs import finished_run
+from benchmarks.learning.runs import MIXED, finished_run
 
 HERE = Path(__file__).parent
 PICTURE = HERE.parent / "docs" / "images" / "published.png"
@@ -134,7 +134,7 @@ def curves(name: str, *, is_full: bool, volumes: str | None, folder: Path) -> di
     data = (
         [f"data.n_training={experiment.n_volumes}"]
         if volumes is None
-        else ["data=mixed", f"data.path={volumes}", f"data.n_volumes={experiment.n_volumes}", "data.n_training=0"]
+        else [*MIXED, f"data.path={volumes}", f"data.n_volumes={experiment.n_volumes}", "data.n_training=0"]
     )
     steps = [] if is_full else [f"training.env_steps={experiment.small_env_steps}"]
     size = "full" if is_full else "small"

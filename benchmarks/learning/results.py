@@ -20,7 +20,7 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from benchmarks.learning.runs import Run, finished_run
+from benchmarks.learning.runs import MIXED, Run, finished_run
 
 FIGURES = Path(__file__).with_name("results.json")
 TEST = "test volumes"
@@ -112,7 +112,7 @@ def measure(name: str, seed: int, data: str, folder: Path) -> None:
     overrides = [*ROWS[name].overrides, f"seed={seed}", *JUDGED]
     if not ROWS[name].overrides[0].startswith("experiment="):
         overrides.append("data.n_training=64")
-    run = finished_run(f"{name}-seed{seed}", ["data=mixed", f"data.path={data}", *overrides], folder)
+    run = finished_run(f"{name}-seed{seed}", [*MIXED, f"data.path={data}", *overrides], folder)
     # Several processes may each measure some rows.
     with FileLock(f"{FIGURES}.lock"):
         kept = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}

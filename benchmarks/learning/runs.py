@@ -17,6 +17,8 @@ from mlflow import MlflowClient
 
 from armscan.tracking import open_store
 
+# A folder to train on with phantoms beside it, judged on phantoms alone.
+MIXED = ("data=mixed", "data.validation=phantoms", "data.test=phantoms")
 CURVE = ("train/length", "train/length_max", "train/return", "train/return_min", "wall_s")
 
 

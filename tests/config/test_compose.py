@@ -7,6 +7,7 @@ from hydra.utils import instantiate
 from armscan.config.compose import compose
 from armscan.config.sources import config_folder
 from armscan.experiment.build import build_experiment
+from tests.conftest import DATA
 
 
 def choices(group):
@@ -30,8 +31,11 @@ def test_conf_composes_every_observation_and_reward(phantom, obs, reward):
 WHOLE = [f"agent={agent}" for agent in choices("agent")] + [f"experiment={name}" for name in choices("experiment")]
 
 
-# What an agent needs of the environment, and says so without it.
-BESIDE = {"agent=plane_finder": ["experiment=plane_finder"]}
+# What an agent needs of the environment, and says so without it; and an experiment of its user.
+BESIDE = {
+    "agent=plane_finder": ["experiment=plane_finder"],
+    "experiment=few_wrists": [f"data.path={DATA / 'volumes'}", "data.fold=0"],
+}
 
 
 @pytest.mark.parametrize("override", WHOLE)

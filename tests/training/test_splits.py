@@ -166,3 +166,93 @@ def test_split_refuses_what_are_no_volumes(tiny_volume, volumes):
 def test_split_refuses_a_volume_in_two_parts(tiny_volume):
     with pytest.raises(InvalidValueError, match="a is in training and in test"):
         Split({"a": tiny_volume}, {"b": tiny_volume}, {"a": tiny_volume})
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"folds": "leave_one_out", "fold": 0}, ("ef", "cd", "ab")),
+        ({"folds": "leave_one_out", "fold": 1}, ("abf", "e", "cd")),
+        ({"folds": "leave_one_out", "fold": 3}, ("cde", "ab", "f")),
+        ({"folds": "leave_one_out", "fold": 2, "validation": ["S"]}, ("cdf", "ab", "e")),
+    ],
+)
+def test_a_fold_is_tested_on_and_the_next_one_chooses_the_checkpoint(folder, changes, expected):
+    # The splits of the manifest have no part in it.
+    path = folder(splits={"train": ["S", "V"], "validation": ["T"], "test": ["U"]})
+    assert names(nifti_data(path, **changes)) == expected
+
+
+@pytest.mark.parametrize("folds", [2, 3, 4, "leave_one_out"])
+def test_every_subject_is_tested_on_in_one_fold(folder, folds):
+    n_folds = 4 if folds == "leave_one_out" else folds
+    splits = [nifti_data(folder(), folds=folds, fold=fold, validation=0.25, split_seed=5) for fold in range(n_folds)]
+    assert sorted(name[0] for split in splits for name in split.test) == list("abcdef")
+    if folds == 2:
+        drawn = [names(nifti_data(folder(), folds=2, fold=0, validation=0.25, split_seed=seed))[2] for seed in range(6)]
+        assert len(set(drawn)) > 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"folds": "leave_one_out"}, "data.fold is None: armscan run makes a run of each fold"),
+        ({"folds": 5, "fold": 0}, r"data.folds is 5, but it must be .* at most 4"),
+        ({"folds": 1, "fold": 0}, "data.folds is 1"),
+        ({"folds": "loo", "fold": 0}, "data.folds is 'loo', but it must be 'leave_one_out' or a number"),
+        ({"folds": 2, "fold": 2}, "data.fold is 2, but it must be .* at most 1"),
+        ({"fold": 2}, "data.fold is 2, but data.folds is None"),
+        ({"folds": 2, "fold": 0, "test": 0.5}, "data.folds is 2, which says what is tested on, but data.test is 0.5"),
+        ({"folds": 2, "fold": 0, "validation": ["S", "T", "U"]}, "data.test|both name"),
+    ],
+)
+def test_impossible_folds_are_refused(folder, changes, line):
+    with pytest.raises(InvalidValueError, match=line):
+        nifti_data(folder(), **changes)
+
+
+SMALL_MIX = {"n_training": 1, "n_validation": 1, "n_test": 1}
+
+
+@pytest.mark.parametrize(
+    ("changes", "training", "validation", "test"),
+    [
+        ({"validation": None, "test": None}, ["a.nrrd", "b.nrrd", "f.nrrd", "phantom-0"], ["cd"], ["e"]),
+        (
+            {"validation": "phantoms", "test": None},
+            ["a.nrrd", "b.nrrd", "c.nrrd", "d.nrrd", "f.nrrd", "phantom-0"],
+            ["p"],
+            ["e"],
+        ),
+        (
+            {"validation": "phantoms", "test": None, "folds": "leave_one_out", "fold": 3},
+            ["a.nrrd", "b.nrrd", "c.nrrd", "d.nrrd", "e.nrrd", "phantom-0"],
+            ["p"],
+            ["f"],
+        ),
+        (
+            {"validation": None, "test": None, "folds": "leave_one_out", "fold": 0, "n_training": 0},
+            ["e.nrrd", "f.nrrd"],
+            ["cd"],
+            ["ab"],
+        ),
+        (
+            {"validation": None, "test": ["a.nrrd", "b.nrrd"], "n_volumes": 5, "split_seed": 3},
+            None,
+            None,
+            ["ab"],
+        ),
+    ],
+)
+def test_mixed_data_is_judged_on_ones_own_subjects_with_phantoms_beside_the_training_alone(
+    folder, changes, training, validation, test
+):
+    path = folder(splits={"train": ["S", "V"], "validation": ["T"], "test": ["U"]})
+    split = mixed_data(path, **(SMALL_MIX | changes))
+    first = ["".join(name[0] for name in part) for part in (split.validation, split.test)]
+    assert [first[1]] == test
+    if training is not None:
+        assert list(split.training) == training
+        assert [first[0]] == validation
+    else:
+        assert "f.nrrd" not in split.training

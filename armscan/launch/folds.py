@@ -1,0 +1,48 @@
+"""Cross-validation: `data.folds` on the command line, or in the experiment that it names, makes a grid of the folds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+from armscan.config.compose import compose
+from armscan.config.defaults import MULTIRUN
+
+FOLDS, FOLD = "data.folds", "data.fold"
+# What may set `data.folds`.
+MAY_SET_FOLDS = (f"{FOLDS}=", f"+{FOLDS}=", "experiment=", "+experiment=")
+
+
+def with_folds(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line, as those of a grid over the folds where they ask for folds.
+
+    What else a grid varies, such as `seed=0,1,2`, stays.
+
+    Raises:
+        InvalidValueError: if there are no such folds.
+        ArmscanError: if the folder of the volumes cannot be read.
+    """
+    overrides = [word for word in words if not word.startswith("-")]
+    options = [word for word in words if word.startswith("-")]
+    if set(options) - set(MULTIRUN) or not any(word.startswith(MAY_SET_FOLDS) for word in overrides):
+        return list(words)
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+        # What the grid varies anyway says nothing of its folds.
+        data = compose([each.input_line for each in parsed if each.input_line and not each.is_sweep_override()]).data
+        folds, fold, path = data.get("folds"), data.get("fold"), data.get("path")
+        n_volumes = data.get("n_volumes")
+    # Hydra answers it, or the run.
+    except (HydraException, OmegaConfBaseException):
+        return list(words)
+    if folds is None or fold is not None or any(each.key_or_group == FOLD for each in parsed):
+        return list(words)
+    # Deferred: a mistake on the command line should be answered before they are loaded.
+    from armscan.training.subject_splits import n_folds
+    from armscan.volumes.dataset import subjects_in
+
+    count = n_folds(folds, len(set(subjects_in(path, n_volumes))))
+    return [MULTIRUN[0], *overrides, f"{FOLD}={','.join(map(str, range(count)))}"]

@@ -1,0 +1,86 @@
+"""One table over the runs of all folds of a cross-validation."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from operator import methodcaller
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from armscan.launch.folds import FOLD
+from armscan.reports.html import page
+from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
+from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE, atomic_write
+
+if TYPE_CHECKING:
+    from armscan.tracking import TrackingStore
+
+SEED = "seed"
+ALL_FOLDS = ", all folds"
+AGENT = f"agent{ALL_FOLDS}"
+TEST_GROUP = TEST.replace(" ", "_")
+
+
+def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
+    """Return one table over the folds of a grid, with the baselines; None where it is no grid of folds.
+
+    Every subject is tested on once for each seed, so that intervals draw wrists, as those of one run do.
+
+    Args:
+        runs: folder of each run, and the overrides in which it differs from the others.
+    """
+    tested: dict[str, dict[str, list[Evaluation]]] = {}
+    for folder, varied in runs:
+        words = dict(word.partition("=")[::2] for word in varied.split())
+        if words.pop(FOLD, None) is None:
+            return None
+        training = words.pop(SEED, "")
+        others = " ".join(f"{key}={value}" for key, value in words.items())
+        for name, evaluation in _evaluations(folder).items():
+            title = ", ".join(filter(None, (name, others)))
+            tested.setdefault(title, {}).setdefault(training, []).append(evaluation)
+    figures = {title: MetricEstimates.of_trainings(_joined(each)) for title, each in tested.items()}
+    return ResultTable(figures) if figures else None
+
+
+def _evaluations(folder: Path) -> dict[str, Evaluation]:
+    """Return the agent's and the baselines' episodes on the test volumes of a run, by what they are called."""
+    agent = Evaluation.of_dict(json.loads((folder / EVALUATION_FILE).read_text())[TEST])
+    baselines = json.loads((folder / BASELINES_FILE).read_text())
+    return {AGENT: agent, **{f"{name}{ALL_FOLDS}": Evaluation.of_dict(each) for name, each in baselines.items()}}
+
+
+def _joined(by_training: Mapping[str, Sequence[Evaluation]]) -> dict[str, Evaluation]:
+    """Return the episodes of all folds of each training together."""
+    return {
+        training: Evaluation(tuple(e for each in evaluations for e in each.episodes), evaluations[0].on_plane)
+        for training, evaluations in by_training.items()
+    }
+
+
+def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: str) -> None:
+    """Keep the table of all folds in the grid's folder, and with its figures in the grid's run.
+
+    Raises:
+        TrackingError: if the store is away.
+    """
+    from mlflow.entities import Metric
+
+    file = folder / RESULTS_PAGE
+    text = page("all folds (test)", table.html())
+    atomic_write(file, methodcaller("write", text.encode()))
+    now_ms = int(time.time() * 1000)
+    groups = {title: TEST_GROUP if title == AGENT else title.removesuffix(ALL_FOLDS) for title in table.results}
+    metrics = [
+        Metric(f"{group}/{name}", value, now_ms, 0)
+        for title, group in groups.items()
+        # Of several kinds of runs the page tells.
+        if title.endswith(ALL_FOLDS)
+        for name, value in table.results[title].shown_metrics(column.metric for column in table.quantities).items()
+        if math.isfinite(value)
+    ]
+    store.log_batch(run_id, metrics=metrics)
+    store.log_artifact(run_id, str(file))

@@ -1,0 +1,150 @@
+"""Which subjects of a folder are trained, validated and tested on: named ones, shares, or folds of cross-validation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import islice
+
+import numpy as np
+
+from armscan.errors import InvalidValueError, listed
+from armscan.utils.validation import check_float, check_int, check_seed
+from armscan.volumes import Dataset
+
+DEFAULT_SHARE = 0.25
+# Where phantoms take the place of subjects.
+PHANTOMS = "phantoms"
+LEAVE_ONE_OUT = "leave_one_out"
+# Of each part a share of the subjects, names, or None for what is usual.
+Wanted = dict[str, float | str | Sequence[str] | None]
+
+
+def n_folds(folds: object, n_subjects: int) -> int:
+    """Return the number of folds.
+
+    Args:
+        folds: `leave_one_out`, a fold for each subject, or a number from 2 to that of the subjects.
+        n_subjects: number of the subjects.
+
+    Raises:
+        InvalidValueError: if it is neither, or there are fewer than two subjects.
+    """
+    if n_subjects < 2:
+        raise InvalidValueError(f"data.folds is {folds!r}, but there must be two subjects or more, not {n_subjects}")
+    if folds == LEAVE_ONE_OUT:
+        return n_subjects
+    if isinstance(folds, str):
+        raise InvalidValueError(f"data.folds is {folds!r}, but it must be {LEAVE_ONE_OUT!r} or a number from 2 on")
+    return check_int("data.folds", folds, at_least=2, at_most=n_subjects)
+
+
+def tested(subjects: Sequence[str], folds: object, fold: object, seed: int) -> tuple[list[str], list[str]]:
+    """Return the subjects that a fold tests on, and those of the fold after it.
+
+    Args:
+        subjects: all subjects, each once.
+        folds: as in `n_folds`.
+        fold: number of the fold, from 0.
+        seed: draws which subjects are in which fold where folds have several; not with `leave_one_out`.
+
+    Raises:
+        InvalidValueError: if there is no such fold.
+    """
+    count = n_folds(folds, len(subjects))
+    if fold is None:
+        raise InvalidValueError(
+            f"data.folds is {folds!r}, but data.fold is None: armscan run makes a run of each fold by itself where "
+            f"data.folds is on its command line or in its experiment; one fold alone is data.fold=0 to {count - 1}"
+        )
+    number = check_int("data.fold", fold, at_least=0, at_most=count - 1)
+    order = np.random.default_rng(check_seed("data.split_seed", seed)).permutation(len(subjects))
+    chosen = np.arange(len(subjects)) if folds == LEAVE_ONE_OUT else order
+    groups = [[subjects[index] for index in sorted(group)] for group in np.array_split(chosen, count)]
+    return groups[number], groups[(number + 1) % count]
+
+
+def parts_by_subject(
+    dataset: Dataset, wanted: Wanted, path: str, split_seed: int, folds: int | str | None, fold: int | None
+) -> dict[str, str]:
+    """Return the split of each volume, by name: `train`, `validation` or `test`.
+
+    Args:
+        dataset: the volumes.
+        wanted: what each of `validation` and `test` is to be; a part that is missing gets no volume.
+        path: the folder, for errors.
+        split_seed: draws which subjects make up shares and folds.
+        folds: as in `n_folds`, or None.
+        fold: number of the fold that is tested on; None without folds.
+
+    Raises:
+        InvalidValueError: if the volumes cannot be split so.
+    """
+    if folds is None and fold is not None:
+        raise InvalidValueError(f"data.fold is {fold!r}, but data.folds is None: it must say how many folds there are")
+    if folds is not None:
+        if wanted.get("test", PHANTOMS) is not None:
+            raise InvalidValueError(
+                f"data.folds is {folds!r}, which says what is tested on, but data.test is "
+                f"{wanted.get('test', PHANTOMS)!r}: it must be null"
+            )
+        test, after = tested(list(dict.fromkeys(dataset.subjects.values())), folds, fold, split_seed)
+        of_next = {"validation": after} if "validation" in wanted and wanted["validation"] is None else {}
+        wanted = {**wanted, "test": test, **of_next}
+    elif dataset.splits is not None and all(each is None for each in wanted.values()):
+        return {name: dataset.splits[name] if dataset.splits[name] in wanted else "train" for name in dataset.volumes}
+    return _drawn(dataset, wanted, path, split_seed)
+
+
+def _drawn(dataset: Dataset, wanted: Wanted, path: str, split_seed: int) -> dict[str, str]:
+    """Return the split of each volume: first what is named, then shares of the subjects that are left."""
+    subjects = dataset.subjects
+    parts: dict[str, str] = {}
+    shares: dict[str, float] = {}
+    for part, given in wanted.items():
+        if isinstance(given, str | list | tuple):
+            for volume in _named(dataset, [given] if isinstance(given, str) else given, part, path):
+                if parts.setdefault(volume, part) != part:
+                    raise InvalidValueError(f"data.{part} and data.{parts[volume]} both name {volume}")
+        else:
+            shares[part] = DEFAULT_SHARE if given is None else _share(f"data.{part}", given)
+    taken = {subjects[volume] for volume in parts}
+    left = [subject for subject in dict.fromkeys(subjects.values()) if subject not in taken]
+    drawn = iter(np.random.default_rng(check_seed("data.split_seed", split_seed)).permutation(len(left)))
+    n_subjects = len(set(subjects.values()))
+    for part, share in shares.items():
+        chosen = {left[index] for index in islice(drawn, math.ceil(share * n_subjects))}
+        parts |= {volume: part for volume, subject in subjects.items() if subject in chosen}
+    parts = {volume: parts.get(volume, "train") for volume in subjects}
+    _check_subjects(parts, subjects)
+    return parts
+
+
+def _named(dataset: Dataset, names: Sequence[str], part: str, path: str) -> list[str]:
+    """Return the volumes that are named, themselves or by their subject."""
+    known = [*dataset.volumes, *dataset.subjects.values()]
+    if not all(isinstance(name, str) for name in names):
+        raise InvalidValueError(f"data.{part} is {names!r}, but it must be a share, or names of subjects or volumes")
+    if unknown := [name for name in names if name not in known]:
+        raise InvalidValueError(f"data.{part} names {listed(unknown)}, but {path} holds {listed(dict.fromkeys(known))}")
+    return [volume for volume, subject in dataset.subjects.items() if volume in names or subject in names]
+
+
+def _share(name: str, given: object) -> float:
+    try:
+        return check_float(name, given, above=0.0, at_most=1.0)
+    except InvalidValueError as error:
+        raise InvalidValueError(
+            f"{name} is {given!r}, but it must be a share above 0 and below 1, or names of subjects or volumes"
+        ) from error
+
+
+def _check_subjects(parts: dict[str, str], subjects: dict[str, str]) -> None:
+    first: dict[str, str] = {}
+    for volume, subject in subjects.items():
+        part = parts[first.setdefault(subject, volume)]
+        if part != parts[volume]:
+            raise InvalidValueError(
+                f"{first[subject]} is for {part} and {volume} for {parts[volume]}, but both are of the subject "
+                f"{subject}, which must be in one split: name all of its volumes, or the subject"
+            )

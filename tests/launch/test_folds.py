@@ -1,0 +1,102 @@
+"""Cross-validation: the words of its grid, and the table over all folds."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from armscan.errors import InvalidValueError, VolumeError
+from armscan.launch.folds import with_folds
+from armscan.launch.folds_table import AGENT, folds_table
+from armscan.training import TEST, Evaluation, MetricEstimates
+from tests.training.test_train import evaluation_of
+
+
+@pytest.fixture
+def folder(write_labelmap, tmp_path):
+    """Three volumes of two subjects, and one that is left out."""
+    entries = {name: {"subject": subject} for name, subject in (("a.nrrd", "S"), ("b.nrrd", "S"), ("c.nrrd", "T"))}
+    entries["d.nrrd"] = {"subject": "U", "exclude": True}
+    for name in entries:
+        write_labelmap(name)
+    (tmp_path / "manifest.json").write_text(json.dumps({"volumes": entries}))
+    return tmp_path
+
+
+def test_folds_make_a_grid_of_one_run_for_each_subject(folder):
+    words = ["data=nifti", f"data.path={folder}", "data.folds=leave_one_out"]
+    assert with_folds(words) == ["-m", *words, "data.fold=0,1"]
+    # With what a grid varies anyway.
+    assert with_folds(["-m", *words, "seed=0,1,2"]) == ["-m", *words, "seed=0,1,2", "data.fold=0,1"]
+    assert with_folds([*words, "agent=sac,ppo"]) == ["-m", *words, "agent=sac,ppo", "data.fold=0,1"]
+
+
+def test_experiment_may_ask_for_folds(folder):
+    words = ["experiment=few_wrists", f"data.path={folder}"]
+    assert with_folds(words) == ["-m", *words, "data.fold=0,1"]
+    assert with_folds([*words, "data.folds=null"]) == [*words, "data.folds=null"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["seed=1"],
+        ["experiment=best_y"],
+        ["data=nifti", "data.folds=2", "data.fold=1"],
+        ["-m", "data=nifti", "data.path=x", "data.folds=2", "data.fold=0,1"],
+        # Hydra's own, which only shows something, and what Hydra refuses.
+        ["data=nifti", "data.folds=2", "--cfg=job"],
+        ["data=phantom", "data.folds=2"],
+        ["experiment=nothing"],
+    ],
+)
+def test_other_words_stay_as_they_are(words):
+    assert with_folds(words) == words
+
+
+def test_impossible_folds_are_refused_before_anything_runs(folder):
+    with pytest.raises(InvalidValueError, match=r"data.folds is 3, but it must be .* at most 2"):
+        with_folds(["data=nifti", f"data.path={folder}", "data.folds=3"])
+    with pytest.raises(VolumeError, match="nowhere"):
+        with_folds(["data=nifti", "data.path=nowhere", "data.folds=2"])
+
+
+def left_by_a_run(folder, volume, distances_mm):
+    (usual,) = evaluation_of(1).episodes
+    episodes = [replace(usual, volume=volume, seed=i, distance_mm=mm) for i, mm in enumerate(distances_mm)]
+    folder.mkdir()
+    evaluation = Evaluation(tuple(episodes)).to_dict()
+    (folder / "evaluation.json").write_text(json.dumps({TEST: evaluation, "training volumes": evaluation}))
+    (folder / "baselines.json").write_text(json.dumps({"random": Evaluation(tuple(episodes[:1])).to_dict()}))
+    return folder
+
+
+def test_table_puts_the_wrists_of_all_folds_together(tmp_path):
+    runs = [
+        (left_by_a_run(tmp_path / f"{fold}-{seed}", f"wrist{fold}", distances), f"data.fold={fold} seed={seed}")
+        for seed, of_folds in enumerate([([1.0, 2.0], [5.0, 6.0]), ([3.0, 4.0], [7.0, 8.0])])
+        for fold, distances in enumerate(of_folds)
+    ]
+    table = folds_table(runs)
+    figures = table.results[AGENT]
+    assert (figures.n_seeds, figures.n_volumes, figures.n_episodes) == (2, 2, 8)
+    assert figures.estimate("median_distance_mm").value == 4.5
+    assert table.results["random, all folds"].n_episodes == 4
+    # The interval draws wrists: it is that of the same episodes in one evaluation.
+    first = [json.loads((folder / "evaluation.json").read_text())[TEST] for folder, _ in runs[:2]]
+    alone = Evaluation(tuple(each for one in first for each in Evaluation.of_dict(one).episodes))
+    expected = MetricEstimates.of(alone).estimate("median_distance_mm")
+    found = folds_table([(path, varied.split()[0]) for path, varied in runs[:2]]).results[AGENT]
+    assert found.estimate("median_distance_mm") == pytest.approx(expected)
+
+
+def test_table_keeps_kinds_of_runs_apart_and_a_grid_without_folds_has_none(tmp_path):
+    runs = [
+        (left_by_a_run(tmp_path / f"{fold}-{agent}", f"wrist{fold}", [1.0]), f"agent={agent} data.fold={fold}")
+        for agent in ("sac", "ppo")
+        for fold in range(2)
+    ]
+    titles = ["agent, all folds, agent=sac", "agent, all folds, agent=ppo"]
+    assert [title for title in folds_table(runs).results if title.startswith("agent")] == titles
+    assert folds_table([(path, "seed=1") for path, _ in runs]) is None
+    assert folds_table([]) is None
