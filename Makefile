@@ -3,9 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+SPHINX := $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --builder html
+SITE := docs/_build/html
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup
 
-.PHONY: run test test-rest test-full test-slow lint clean
+.PHONY: run test test-rest test-full test-slow lint docs docs-serve clean
 
 # Trains, evaluates and tracks the default agent on phantom wrists; ARGS="projection=zy" changes what is run.
 run: $(INSTALLED)
@@ -30,6 +32,15 @@ lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/codespell
+	$(SPHINX) docs $(SITE)
+
+# The documentation, in docs/_build/html; a broken link or reference is an error.
+docs: $(INSTALLED)
+	$(SPHINX) docs $(SITE)
+
+docs-serve: docs
+	$(BIN)/python -m http.server --bind 127.0.0.1 --directory $(SITE) 8000
 
 clean:
 	rm -rf $(VENV)

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armscan.cli.options import FILE_PATH, clustering_option, examples, is_given, tracking_option, trust_option
+from armscan.cli.options import (
+    FILE_PATH,
+    clustering_option,
+    examples,
+    import_from_here,
+    is_given,
+    tracking_option,
+    trust_option,
+)
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import LARGEST_SEED, check_int
 
@@ -128,6 +136,7 @@ def evaluate(
     if agent is None:
         subject = evaluation.agent_of_run(tracking, run[0], changes, trust=trust)
     else:
+        import_from_here()
         subject = evaluation.agent_of_overrides(overrides, folder, changes)
     if video:
         applied = apply(subject, data, phantoms, render_mode="rgb_array")

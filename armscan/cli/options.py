@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Collection
 from datetime import datetime, timedelta
 from functools import partial
@@ -126,8 +127,24 @@ storage_option = partial(
     show_default="ARMSCAN_STORAGE or optuna.journal",
     help="Optuna storage of the studies.",
 )
+
+
+def import_from_here() -> None:
+    """Let classes of the user's own be imported from the current folder, as `python -m` does."""
+    sys.path.insert(0, str(Path.cwd()))
+
+
+def _trusting(ctx: click.Context, option: click.Parameter, trust: bool) -> bool:
+    if trust:
+        import_from_here()
+    return trust
+
+
 trust_option = click.option(
-    "--trust", is_flag=True, help="Trust the author of the run: execute code and read files that it names."
+    "--trust",
+    is_flag=True,
+    callback=_trusting,
+    help="Trust the author of the run: execute code and read files that it names.",
 )
 clustering_option = click.option(
     "--clustering",

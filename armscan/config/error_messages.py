@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import traceback
 
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    InstantiationException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from omegaconf import DictConfig, MissingMandatoryValue
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import YAMLError
@@ -29,6 +35,9 @@ def one_line_message(error: BaseException) -> str | None:
             return f"{error.override!r} cannot be read: what follows the options must be key=value"
         case MissingMandatoryValue():
             return f"{error.full_key} is not set, but it must be: give {error.full_key}=VALUE"
+        case InstantiationException(__cause__=ImportError(__cause__=ImportError() as missing)):
+            key = text.rpartition("full_key: ")[2]
+            return f"{key}._target_ cannot be imported: {missing}; it must be in the current folder, or installed"
         case HydraException() | OmegaConfBaseException():
             return text
         # Hydra's answer to an override such as obs=null.

@@ -122,6 +122,27 @@ def test_run_is_passed_on_untouched(monkeypatch):
     assert taken == [words]
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "agent=middle"],
+        ["evaluate", "--agent", "middle", "--data", "phantom", "--phantoms", "1", "--episodes", "2"],
+    ],
+)
+def test_classes_in_the_current_folder_are_found(words, tmp_path):
+    (tmp_path / "conf/agent").mkdir(parents=True)
+    (tmp_path / "conf/agent/middle.yaml").write_text("_target_: own_agent.Middle\n")
+
+    def error():
+        # -P: as the installed program, which knows nothing of the current folder.
+        command = [sys.executable, "-P", "-m", "armscan", *words]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stderr
+
+    assert "agent._target_ cannot be imported: No module named 'own_agent'" in error()
+    (tmp_path / "own_agent.py").write_text("raise ImportError('it was found')")
+    assert "agent._target_ cannot be imported: it was found" in error()
+
+
 def test_evaluate_has_an_option_for_each_rule():
     options = {parameter.name for parameter in evaluate.params}
     assert CHANGES.keys() <= options

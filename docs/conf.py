@@ -1,0 +1,51 @@
+"""Sphinx configuration: `make docs` builds the site from this folder."""
+
+import sys
+from pathlib import Path
+
+import armscan
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+
+project = "armscan"
+author = "The armscan authors"
+version = release = armscan.__version__
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_click",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "configuration_reference",
+    "markdown_docstrings",
+    "mathml",
+]
+exclude_patterns = ["_build", "_ext"]
+
+# Markdown
+myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+# Notebooks are run by tests/test_docs.py and kept with their outputs.
+nb_execution_mode = "off"
+
+# API
+default_role = "code"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+toc_object_entries = False
+autodoc_member_order = "bysource"
+autodoc_default_options = {"members": True, "imported-members": True, "undoc-members": False}
+napoleon_numpy_docstring = False
+napoleon_use_rtype = False
+
+# Pages
+html_theme = "furo"
+html_title = "armscan"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_copyright = False
+html_show_sphinx = False
+copybutton_prompt_text = "$ "
