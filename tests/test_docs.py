@@ -1,25 +1,159 @@
-"""What the pages say to run, runs."""
+"""What the README and the pages say to type, works: code blocks run, commands are good words, journeys are made."""
 
+import os
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
-DOCS = Path(__file__).parent.parent / "docs"
+from armscan.cli.main import armscan as program
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+# In the place of what a user fills in.
+PLACEHOLDERS = {
+    "FOLDER": ".",
+    "RUN_ID": "0123abcd",
+    "ID": "0123abcd",
+    "PRESET": "best_y",
+    "USER": "me",
+    "HOST": "localhost",
+    "SERVER": "localhost",
+    "DATABASE": "armscan",
+    "FILE": "plane",
+}
+# Options of Hydra, which `compose` does not know.
+OF_HYDRA = {"-m", "--multirun", "--plan", "--help"}
+# So that each command of a journey takes seconds.
+SMALL = (
+    *("training.env_steps=2064", "training.eval_every_env_steps=64", "training.validation_episodes=4"),
+    *("evaluation.episodes=8", "data.n_training=2", "data.n_validation=1", "data.n_test=2"),
+)
+OWN_VOLUMES = ("data=nifti", "data=mixed")
 
 
-def blocks(page):
-    return "\n".join(re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL))
+def blocks(page, language):
+    """The code blocks of a page in a language, without the indentation of a list."""
+    found = re.findall(rf"^( *)```{language}\n(.*?)^ *```", page.read_text(), re.DOTALL | re.MULTILINE)
+    return [re.sub(rf"^{indent}", "", block, flags=re.MULTILINE) for indent, block in found]
+
+
+def commands(page):
+    """The words of each armscan command in a page's shell blocks."""
+    for line in "\n".join(blocks(page, "sh")).splitlines():
+        words = shlex.split(line, comments=True)
+        if words[:3] in (["python", "-m", "armscan.run"], [".venv/bin/python", "-m", "armscan.run"]):
+            yield ["run", *words[3:]]
+        elif words[:1] == ["armscan"] and words[1:] != ["--version"]:
+            yield words[1:]
+
+
+def filled_in(word):
+    for placeholder, value in PLACEHOLDERS.items():
+        word = re.sub(rf"\b{placeholder}\b", value, word)
+    return word.replace("=NAME", "=sac_y") if word.startswith("sweep=") else re.sub(r"\bNAME\b", "random", word)
+
+
+def of_each_sweep(words):
+    """The overrides of a command with the first choice of each key that has several."""
+    for override in OverridesParser.create().parse_overrides(words):
+        first = next(override.sweep_string_iterator()) if override.is_sweep_override() else None
+        yield override.input_line if first is None else f"{override.get_key_element()}={first}"
+
+
+COMMANDS = [
+    pytest.param(page, words, id=f"{page.name}-{' '.join(words)}")
+    for page in PAGES
+    for words in commands(page)
+    if words
+]
+
+
+@pytest.fixture
+def in_a_folder(tmp_path, monkeypatch):
+    """A folder with what commands of pages expect to be there."""
+    for folder in ("outputs", "studies/sac_y"):
+        (tmp_path / folder).mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return tmp_path
+
+
+@pytest.mark.parametrize(("page", "words"), COMMANDS)
+def test_commands_of_pages_are_good_words(page, words, in_a_folder):
+    from armscan.config.compose import compose
+
+    write_files(page, in_a_folder)
+    words = [filled_in(word) for word in words]
+    if words[0] != "run":
+        path = words[: 1 + (words[0] in ("runs", "data", "policy"))]
+        command = program
+        for name in path:
+            command = command.commands[name]
+        command.make_context(" ".join(path), words[len(path) :])
+    elif not any(word.startswith("resume=") for word in words):
+        assert compose(list(of_each_sweep([word for word in words[1:] if word not in OF_HYDRA])))
+
+
+def write_files(page, folder):
+    """Write the files that a page shows, which name themselves in their first line."""
+    for block in (*blocks(page, "python"), *blocks(page, "yaml")):
+        if name := re.match(r"# ([\w./]+\.(?:py|yaml))\n", block):
+            file = folder / name[1]
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with file.open("a") as opened:
+                opened.write(block.removeprefix(name[0]))
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "environment.md"], ids=lambda page: page.name)
+def test_code_of_pages_runs(page):
+    exec(compile("\n".join(blocks(page, "python")), str(page), "exec"), {"__name__": page.stem})
 
 
 def test_tutorial_runs_as_it_stands(data_folder, tmp_path, monkeypatch, capsys):
     (tmp_path / "wrists").symlink_to(data_folder)
     monkeypatch.chdir(tmp_path)
-    exec(compile(blocks("tutorial.md"), "docs/tutorial.md", "exec"), {"__name__": "tutorial"})
+    code = "\n".join(blocks(DOCS / "tutorial.md", "python"))
+    exec(compile(code, "docs/tutorial.md", "exec"), {"__name__": "tutorial"})
     assert "00001_labels.nii.gz (360, 800, 80)" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("page", sorted(path.name for path in DOCS.glob("*.md")))
+@pytest.mark.full
+@pytest.mark.parametrize(
+    "page",
+    [
+        ROOT / "README.md",
+        *(DOCS / f"{name}.md" for name in ("first-training", "first-study", "own-volumes", "extending")),
+    ],
+    ids=lambda page: page.stem,
+)
+def test_journeys_of_pages_are_made_with_small_budgets(page, tmp_path, data_folder):
+    write_files(page, tmp_path)
+    done = 0
+    for words in commands(page):
+        line = [word.replace("FOLDER", str(data_folder)) for word in words]
+        if "ui" in line or "label" in line or any("resume=" in word or word == "ID" for word in line):
+            continue
+        if line[0] == "run" and "--help" not in line and not any(word in line for word in OWN_VOLUMES):
+            line += [word for word in SMALL if not any(word.split("=")[0] == given.split("=")[0] for given in line)]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        command = [sys.executable, "-P", "-m", "armscan", *line]
+        ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert ended.returncode == 0, (line, ended.stdout[-3000:], ended.stderr[-3000:])
+        done += 1
+    assert done
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_page_links_to_what_is_there(page):
-    for target in re.findall(r"\]\((?!http)([^)#]+)", (DOCS / page).read_text()):
-        assert (DOCS / target).exists(), target
+    for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text()):
+        assert (page.parent / target).exists(), target
+
+
+def test_readme_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= 800
