@@ -84,6 +84,7 @@ def in_a_folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("page", "words"), COMMANDS)
 def test_commands_of_pages_are_good_words(page, words, in_a_folder):
     from armscan.config.compose import compose
