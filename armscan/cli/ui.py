@@ -18,9 +18,7 @@ PORT = click.IntRange(1, 65_535)
 @click.option(
     "--artifacts", type=FILE_PATH, metavar="FOLDER", default="optuna.artifacts", help="Plots shown in the dashboard."
 )
-@click.option(
-    "--mlflow-port", type=PORT, default=MLFLOW_PORT, help="Port of MLflow's UI; links of trials lead to 5000."
-)
+@click.option("--mlflow-port", type=PORT, default=MLFLOW_PORT, help="Port of MLflow's UI.")
 @click.option("--dashboard-port", type=PORT, default=DASHBOARD_PORT, help="Port of Optuna's dashboard.")
 def ui(storage: str, tracking: str, artifacts: Path, mlflow_port: int, dashboard_port: int) -> None:
     """Serve MLflow's UI and Optuna's dashboard.

@@ -14,8 +14,9 @@ from plotly.subplots import make_subplots
 
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
-from armscan.reports.look import is_rate, mode, title_of
+from armscan.reports.look import mode
 from armscan.training import MetricEstimates
+from armscan.training.titles import is_rate, title_of
 
 # By figure, axis and number of the group.
 Curves = Mapping[tuple[str, str, int], Curve]

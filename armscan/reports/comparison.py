@@ -13,7 +13,6 @@ from armscan.reports.curves import AXES, curve_of
 from armscan.reports.groups import Group
 from armscan.reports.html import Markup, chart, folded, table, write_page
 from armscan.reports.load import VALIDATION, TrackedTraining
-from armscan.reports.look import title_of
 from armscan.reports.notes import notes_on
 from armscan.reports.significance import (
     COMPARED_BY,
@@ -29,6 +28,7 @@ from armscan.stats.aggregation import FEWEST_SEEDS
 from armscan.stats.bootstrap import Estimate
 from armscan.training import MetricEstimates, ResultTable
 from armscan.training.result_table import with_baselines
+from armscan.training.titles import title_of
 
 HOW_CURVES = (
     "On the validation volumes, after each epoch. Thick: the mean of the seeds of a group. Band: its 95 % interval by "

@@ -19,6 +19,7 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from armscan.config.credentials import TRACKING_PASSWORD, database_url, mask_passwords
 from armscan.errors import InvalidValueError, TrackingError
+from armscan.ui.dashboard_view import DashboardView
 from armscan.ui.host_check import HostCheck
 from armscan.utils.processes import child_command, on_parent_exit
 
@@ -50,7 +51,13 @@ def check_port(option: str, port: int) -> None:
 
 
 def start_dashboard(
-    storage: Storage, artifacts: Path, port: int, *, host: str = HOST, allowed_hosts: Sequence[str] = ()
+    storage: Storage,
+    artifacts: Path,
+    port: int,
+    *,
+    host: str = HOST,
+    allowed_hosts: Sequence[str] = (),
+    mlflow: str | None = None,
 ) -> str:
     """Serve Optuna's dashboard for the rest of this process; return its address.
 
@@ -63,12 +70,13 @@ def start_dashboard(
         host: the address to listen on, default: the loopback address.
         allowed_hosts: the names and ports, `NAME:PORT`, by which browsers may ask for it; `*` stands for any port.
             Default: `127.0.0.1` and `localhost` with the port.
+        mlflow: address of MLflow's UI, to which the links of trials lead. Default: None, to the one that they name.
     """
     from optuna.artifacts import FileSystemArtifactStore
     from optuna_dashboard import wsgi
 
     application = wsgi(storage.optuna, artifact_store=FileSystemArtifactStore(artifacts))
-    checked = HostCheck(application, allowed_hosts or (f"{HOST}:{port}", f"localhost:{port}"))
+    checked = HostCheck(DashboardView(application, mlflow), allowed_hosts or (f"{HOST}:{port}", f"localhost:{port}"))
     server = make_server(host, port, checked, server_class=_Threaded, handler_class=_Quiet)
     Thread(target=server.serve_forever, daemon=True).start()
     return f"http://{host}:{port}"

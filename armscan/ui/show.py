@@ -57,7 +57,8 @@ def show(
     if is_server:
         print(f"runs      {tracking}")
     if studies is not None:
-        print(f"studies   {start_dashboard(studies, artifacts, dashboard_port)}", flush=True)
+        runs_at = f"http://{HOST}:{mlflow_port}" if has_runs else None
+        print(f"studies   {start_dashboard(studies, artifacts, dashboard_port, mlflow=runs_at)}", flush=True)
     if has_runs:
         with mlflow_server(tracking, mlflow_port) as process:
             print(f"runs      http://{HOST}:{mlflow_port}   under Model training, at its top left")

@@ -21,7 +21,6 @@ from armscan.cli.main import main
 from armscan.config.credentials import STORAGE_PASSWORD, TRACKING_PASSWORD, database_url
 from armscan.sweeps.storage.database import tables_in
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.open import LOCAL_UI
 from armscan.ui import servers
 from armscan.ui.servers import HOST
 from tests.support.postgres import PASSWORD
@@ -345,10 +344,11 @@ def test_ui_shows_a_study_in_the_browser(small_study, look, browser):
     browser.find("h1, h2, h3, h4, h5, h6", text="Trial 1 (trial_id=1)")
     assert browser.picture("img[alt='learning_curve.png']") > 0
     browser.keep(pictures / "trial.png")
-    # To its run, where `armscan ui` has MLflow by default.
-    link = browser.find("a", text="its run in MLflow").get_attribute("href")
-    assert link.startswith(f"{LOCAL_UI}/#/")
-    browser.open(link.replace(LOCAL_UI, looked.mlflow))
+    # The figures of its seed, and no row of JSON.
+    browser.find("td", text="steps, mean")
+    assert not browser.has("td", text="lease")
+    # To its run, at the port of this MLflow.
+    browser.open(browser.find("a", text="its run in MLflow").get_attribute("href"))
     browser.find("h1, h2, h3", text="small-0001")
     assert browser.address.startswith(f"{looked.mlflow}/#/")
     assert study.trials[1].user_attrs["mlflow_run"] in browser.address

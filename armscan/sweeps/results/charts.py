@@ -15,8 +15,9 @@ from optuna.visualization import plot_parallel_coordinate, plot_pareto_front
 from plotly.graph_objects import Figure, Scatter
 
 from armscan.reports.html import chart
-from armscan.reports.look import BLUE, GREY, ORANGE, RED, is_rate, mode, title_of
+from armscan.reports.look import BLUE, GREY, ORANGE, RED, mode
 from armscan.sweeps.space.parameter import overrides_of
+from armscan.training.titles import is_rate, title_of
 
 HEIGHT_PX, SMALL_PX, BAR_PX = 360, 260, 34
 PERCENT = {"tickformat": ".0%"}

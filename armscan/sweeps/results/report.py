@@ -14,7 +14,6 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.reports.html import folded, table, video_address, write_page
-from armscan.reports.look import title_of, value_text
 from armscan.sweeps.results.charts import charts_of
 from armscan.sweeps.results.summary import ConfigResult, final_results, final_table
 from armscan.sweeps.scheduling.state import (
@@ -31,6 +30,7 @@ from armscan.sweeps.scheduling.state import (
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import FOLDER, RUN
+from armscan.training.titles import title_of, value_text
 
 MIN_TRIALS_FOR_IMPORTANCE = 4
 ID_CHARS = 8

@@ -1,4 +1,4 @@
-"""A study as its workers and its launcher see it, from the same words; what Optuna's dashboard shows of it."""
+"""A study as its workers and its launcher see it, from the same words."""
 
 from __future__ import annotations
 
@@ -11,28 +11,24 @@ from typing import Any
 
 import optuna
 from omegaconf import DictConfig
-from optuna.artifacts import FileSystemArtifactStore, upload_artifact
 from optuna.trial import FrozenTrial, Trial
 
 from armscan.config.defaults import to_plain
-from armscan.config.services import MLFLOW_PORT
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import FINAL_SEED, Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX, StudySettings
 from armscan.sweeps.study.stored import check_trials
-from armscan.sweeps.study.study import STUDY_RUN, make_study
+from armscan.sweeps.study.study import STUDY_RUN, make_study, name_objectives
 from armscan.sweeps.tasks.attempt import Attempt, Task, trial_folder
 from armscan.tracking import TrackingStore, abandon, open_store, source
 from armscan.tracking.run import FAILURE_TAG
-from armscan.utils.log import log
 from armscan.utils.retry import RETRY_S
 
 NO_END = 10**9
 WORKER_DIED = "its worker died"
-# Where `armscan ui` serves the runs of a store that is no server.
-LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,6 +163,7 @@ def _final_phase(search: Phase, settings: StudySettings, task: Task) -> Phase:
     storage, name = search.scheduler.storage, settings.name + FINAL_EVAL_SUFFIX
     study = storage.exclusive(lambda: optuna.create_study(study_name=name, storage=storage.optuna, load_if_exists=True))
     check_trials(study, n_searched=len(search.scheduler.study.get_trials(deepcopy=False)))
+    name_objectives(study, [task.final_metric])
     limits = Limits(n_trials=NO_END, max_failures=settings.max_failures, max_retries=settings.max_retries)
     return dataclasses.replace(
         search,
@@ -178,25 +175,3 @@ def _final_phase(search: Phase, settings: StudySettings, task: Task) -> Phase:
         seeds_of=lambda trial: (int(trial.user_attrs[FINAL_SEED]),),
         folder=search.folder / "judged",
     )
-
-
-def note_run(
-    target: optuna.Study | Trial, client: TrackingStore, experiment_id: str, run_id: str, folder: Path
-) -> None:
-    """Leave a note with the link to the tracked run of a study or a trial, and its folder."""
-    # Deferred: it takes a second, and only who works at a study needs it.
-    from optuna_dashboard import save_note
-
-    address = client.uri.rstrip("/") if client.uri.startswith("http") else LOCAL_UI
-    link = f"[its run in MLflow]({address}/#/experiments/{experiment_id}/runs/{run_id})"
-    save_note(target, f"{link}, {run_id}\n\nits folder: `{folder.resolve()}`")
-
-
-def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:
-    """Copy a picture to where the dashboard finds those of a trial."""
-    try:
-        artifacts.mkdir(parents=True, exist_ok=True)
-        upload_artifact(study_or_trial=trial, file_path=str(picture), artifact_store=FileSystemArtifactStore(artifacts))
-    except OSError as error:
-        # No reason for a trial to fail: it is in its folder, too.
-        log(f"{picture} cannot be shown in Optuna's dashboard: {error}")

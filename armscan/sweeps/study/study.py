@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
 
 import optuna
+from optuna.exceptions import ExperimentalWarning
 from optuna.pruners import BasePruner
 from optuna.trial import FrozenTrial, TrialState
 
@@ -51,7 +53,17 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
 
     study = storage.exclusive(made)
     _check_same(settings, study, wanted)
+    name_objectives(study, list(settings.objectives))
     return study
+
+
+def name_objectives(study: optuna.Study, names: Sequence[str]) -> None:
+    """Name the objectives of a study for Optuna's dashboard, unless they have names; older studies have none."""
+    if study.metric_names is None:
+        with warnings.catch_warnings():
+            # Of a method that may change; optuna's range is pinned.
+            warnings.simplefilter("ignore", ExperimentalWarning)
+            study.set_metric_names(list(names))
 
 
 def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study | None:

@@ -22,7 +22,8 @@ from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.components import make, read_settings
-from armscan.sweeps.study.open import Phase, note_run, open_for_work, show_picture
+from armscan.sweeps.study.dashboard import note_run, show_picture, shown_metrics
+from armscan.sweeps.study.open import Phase, open_for_work
 from armscan.sweeps.study.study import enqueue_final_trials
 from armscan.sweeps.tasks.attempt import (
     CONFIG_SHA256,
@@ -109,7 +110,9 @@ class Worker:
             return TrialOutcome(trial, TrialState.FAIL, writes, attributes={FAILURE: reason})
         else:
             values = [metrics[name] for name in self._phase.objectives]
-            return TrialOutcome(trial, TrialState.COMPLETE, writes, values, {METRICS: metrics})
+            n_seeds = len(self._phase.seeds_of(trial))
+            attributes = {METRICS: metrics, **shown_metrics(metrics, n_seeds)}
+            return TrialOutcome(trial, TrialState.COMPLETE, writes, values, attributes)
         return None
 
     def _run_task(self, trial: Trial) -> dict[str, float]:
@@ -147,6 +150,9 @@ class Worker:
             return phase.run(attempt)
         finally:
             writes.append(partial(trial.set_user_attr, ENV_STEPS, attempt.env_steps))
+            if attempt.seeds_done:
+                where = phase.client, phase.experiment_id, self._tracked.run_id, folder
+                writes.append(partial(note_run, trial, *where, attempt.seeds_done))
 
     def _begun(self, trial: Trial, chosen: dict[str, Any], folder: Path, config_sum: str) -> TrackedRun:
         """Open the tracked run of a trial, or resume that of a requeued one."""

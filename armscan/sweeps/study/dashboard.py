@@ -1,0 +1,91 @@
+"""What Optuna's dashboard shows of a study and its trials: notes, figures, pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import optuna
+from optuna.artifacts import FileSystemArtifactStore, upload_artifact
+from optuna.trial import Trial
+
+from armscan.config.services import MLFLOW_PORT
+from armscan.sweeps.scheduling.state import ENV_STEPS
+from armscan.tracking import TrackingStore
+from armscan.training.on_plane import limits_among
+from armscan.training.titles import LEADING, title_of, value_text
+from armscan.utils.log import log
+
+# Where `armscan ui` serves the runs of a store that is no server, but where it was given another port.
+LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
+# Before the metrics of a final training on the test volumes.
+TEST = "test/"
+
+
+def note_run(
+    target: optuna.Study | Trial,
+    client: TrackingStore,
+    experiment_id: str,
+    run_id: str,
+    folder: Path,
+    of_seeds: Mapping[int, Mapping[str, float]] | None = None,
+) -> None:
+    """Leave a note with the link to the tracked run of a study or a trial, and its folder.
+
+    Args:
+        target: the study or the trial.
+        client: the tracking store.
+        experiment_id: the MLflow experiment of the run.
+        run_id: the ID of the run.
+        folder: the folder of the study or the trial.
+        of_seeds: metrics by the seeds of a trial that has ended. Default: None, nothing is said of them.
+    """
+    # Deferred: it takes a second, and only who works at a study needs it.
+    from optuna_dashboard import save_note
+
+    address = client.uri.rstrip("/") if client.uri.startswith("http") else LOCAL_UI
+    link = f"[its run in MLflow]({address}/#/experiments/{experiment_id}/runs/{run_id})"
+    figures = f"\n\n{table_of_seeds(of_seeds)}" if of_seeds else ""
+    save_note(target, f"{link}, {run_id}\n\nits folder: `{folder.resolve()}`{figures}")
+
+
+def table_of_seeds(of_seeds: Mapping[int, Mapping[str, float]]) -> str:
+    """Return the leading metrics of seeds as a table in Markdown, a column for each seed."""
+    known = next(iter(of_seeds.values()))
+    names = _leading(known)
+    rows = [["validation, best epoch", *(f"seed {seed}" for seed in of_seeds)], ["---", *("---:" for _ in of_seeds)]]
+    for name in names:
+        values = (metrics.get(name, math.nan) for metrics in of_seeds.values())
+        rows.append([title_of(name), *("–" if math.isnan(value) else value_text(name, value) for value in values)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float]:
+    """Return the leading metrics of a trial, rounded and called as people call them: user attributes of their own.
+
+    Args:
+        metrics: metrics by name; of a final training, those of the test are taken.
+        n_seeds: number of seeds that they are the interquartile means of.
+    """
+    tested = {name.removeprefix(TEST): value for name, value in metrics.items() if name.startswith(TEST)}
+    of, statistic = "test volumes: " if tested else "", f" (IQM of {n_seeds} seeds)" if n_seeds > 1 else ""
+    chosen = tested or metrics
+    names = [name for name in _leading(chosen) if name != ENV_STEPS and math.isfinite(chosen[name])]
+    return {f"{of}{title_of(name)}{statistic}": float(f"{chosen[name]:.4g}") for name in names}
+
+
+def _leading(metrics: Iterable[str]) -> list[str]:
+    """Return the names of the leading metrics among some, on-plane rates first."""
+    known = list(metrics)
+    return [*(limits.metric for limits in limits_among(known)), *(name for name in LEADING if name in known)]
+
+
+def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:
+    """Copy a picture to where the dashboard finds those of a trial."""
+    try:
+        artifacts.mkdir(parents=True, exist_ok=True)
+        upload_artifact(study_or_trial=trial, file_path=str(picture), artifact_store=FileSystemArtifactStore(artifacts))
+    except OSError as error:
+        # No reason for a trial to fail: it is in its folder, too.
+        log(f"{picture} cannot be shown in Optuna's dashboard: {error}")

@@ -1,0 +1,94 @@
+"""What Optuna's dashboard shows of armscan's studies: what people look for, not what workers keep for each other."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from armscan.config.services import MLFLOW_PORT
+
+if TYPE_CHECKING:
+    from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
+
+STUDIES = re.compile(r"/api/studies(/\d+)?")
+# Where notes of runs lead that no server keeps.
+LOCAL_RUNS = re.compile(rf"http://127\.0\.0\.1:{MLFLOW_PORT}(?=/#/)")
+# Attributes that are kept of a study and of its trials, by which they are known.
+OF_STUDY, OF_TRIAL = {"space", "fixed_config", "objectives"}, {"lease", "config_sha256", "judged"}
+HIDDEN_OF_STUDY = OF_STUDY | {"mlflow_run", "forgiven"}
+# The note has the run, the folder and the figures of the seeds.
+HIDDEN = {"lease", "figures", "seeds", "config_sha256", "attempt", "retried", "mlflow_run", "folder"}
+NAMES = {
+    "env_steps": "environment steps",
+    "retry_of": "retry of trial",
+    "judged": "final training of trial",
+    "judged_seed": "seed",
+}
+# Of a running trial, from what its worker reports.
+PROGRESS = {"worker": "worker", "seed": "seed", "env_steps": "environment steps", "return": "return, mean"}
+Attributes = Sequence[Mapping[str, Any]]
+
+
+class DashboardView:
+    """A WSGI application that changes the answers of Optuna's dashboard; other people's studies stay as they are.
+
+    Args:
+        application: Optuna's dashboard.
+        mlflow: address of MLflow's UI, to which the links of trials lead. Default: None, they stay as they are.
+    """
+
+    def __init__(self, application: WSGIApplication, mlflow: str | None = None) -> None:
+        self._application, self._mlflow = application, mlflow
+
+    def __call__(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
+        """Answer a request."""
+        if environ["REQUEST_METHOD"] != "GET" or not STUDIES.fullmatch(environ.get("PATH_INFO", "")):
+            return self._application(environ, start_response)
+        answered: list[tuple[str, list[tuple[str, str]]]] = []
+
+        def keep(status: str, headers: list[tuple[str, str]], *_: Any) -> Any:
+            answered.append((status, headers))
+
+        body = b"".join(self._application(environ, keep))
+        status, headers = answered[-1]
+        if status.startswith("200"):
+            body = self._shown(body)
+        kept = [header for header in headers if header[0].lower() != "content-length"]
+        start_response(status, [*kept, ("Content-Length", str(len(body)))])
+        return [body]
+
+    def _shown(self, body: bytes) -> bytes:
+        text = body.decode()
+        if self._mlflow is not None:
+            text = LOCAL_RUNS.sub(lambda _: str(self._mlflow), text)
+        answer = json.loads(text)
+        for study in (answer, *answer.get("study_summaries", ())):
+            if {each["key"] for each in study.get("user_attrs", ())} >= OF_STUDY:
+                study["user_attrs"] = [each for each in study["user_attrs"] if each["key"] not in HIDDEN_OF_STUDY]
+        trials = [*answer.get("trials", ()), *answer.get("best_trials", ())]
+        ours = [trial for trial in trials if OF_TRIAL & {each["key"] for each in trial["user_attrs"]}]
+        for trial in ours:
+            trial["user_attrs"] = _attributes(trial)
+        if ours:
+            columns = [each for each in answer["union_user_attrs"] if each["key"] not in HIDDEN]
+            answer["union_user_attrs"] = [each | {"key": NAMES.get(each["key"], each["key"])} for each in columns]
+        return json.dumps(answer).encode()
+
+
+def _attributes(trial: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the attributes that are shown of a trial; of one that runs, how far it is."""
+    values = {each["key"]: each["value"] for each in trial["user_attrs"]}
+    shown = {NAMES.get(key, key): value for key, value in values.items() if key not in HIDDEN}
+    if trial["state"] == "Running":
+        lease: Any = {}
+        with contextlib.suppress(ValueError):
+            lease = json.loads(values.get("lease", "{}"))
+        if isinstance(lease, dict):
+            progress = {name: lease[key] for key, name in PROGRESS.items() if key in lease}
+            shown |= {
+                name: f"{value:.4g}" if isinstance(value, float) else str(value) for name, value in progress.items()
+            }
+    return [{"key": key, "value": value} for key, value in shown.items()]
