@@ -7,7 +7,6 @@ from functools import partial
 import mlflow.pyfunc
 import numpy as np
 import pytest
-from mlflow import MlflowClient
 
 from armscan.policies.build import SUM_TAG
 from armscan.policies.model import model_sha256
@@ -15,7 +14,7 @@ from armscan.runs.model_card import MAX_CHARS
 from armscan.tracking import EVALUATED_TAG
 from armscan.training import load_checkpoint, save_checkpoint
 from armscan.utils.files import BEST_CHECKPOINT
-from tests.cli.test_evaluate import GUESSER, IMAGES, tracked
+from tests.support.tracked_runs import GUESSER, IMAGES, store_of, tracked
 from tests.test_run import runs_in
 from tests.training.test_train import evaluation_of
 
@@ -23,15 +22,11 @@ EXPORT, REGISTER = ("export", "--out=new"), ("register", "--name=n")
 
 
 @pytest.fixture
-def answer(armscan, tmp_path, monkeypatch):
+def answer(armscan, tmp_path, monkeypatch, database):
     """Runs `armscan policy`; returns its exit code and what it printed."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlruns.db")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", database)
     return partial(armscan, "policy")
-
-
-def store_of(folder):
-    return MlflowClient(f"sqlite:///{folder}/mlruns.db")
 
 
 @pytest.mark.parametrize(

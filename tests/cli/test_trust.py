@@ -15,8 +15,8 @@ from armscan.policies.model import CODE, model_sha256
 from armscan.tracking import open_store
 from armscan.tracking.lookup import DOMAIN_TAG, VERSION_TAG
 from armscan.utils.files import CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
-from tests.cli.test_evaluate import GUESSER, tracked
-from tests.cli.test_policy import registered, store_of
+from tests.cli.test_policy import registered
+from tests.support.tracked_runs import GUESSER, store_of, tracked
 
 # Of libraries that are always there; Hydra builds each without a word.
 DOORS = {
@@ -129,7 +129,7 @@ def test_run_with_a_class_of_ones_own_is_evaluated_with_trust(armscan, tmp_path)
     run_id = tracked(tmp_path, agent=GUESSER)
     code, _, errors = answered(armscan, "evaluate", run_id)
     assert code == 2
-    assert "its configuration builds agent by 'tests.cli.test_evaluate.Guesser'" in errors
+    assert "its configuration builds agent by 'tests.support.tracked_runs.Guesser'" in errors
     assert answered(armscan, "evaluate", run_id, "--trust")[0] == 0
 
 

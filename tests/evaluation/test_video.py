@@ -7,14 +7,13 @@ from functools import partial
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from mlflow import MlflowClient
 from PIL import Image, ImageChops
 
 from armscan.training import load_checkpoint, save_checkpoint
-from tests.cli.test_evaluate import FEW, GUESSER, ON_FILES, tracked
+from tests.support.tracked_runs import GUESSER, ON_FILES, store_of, tracked
 
 EPISODE = re.compile(r"^(.+): (\S+), seed (\d+): (no )?success after (\d+) steps?, ([\d.]+) mm", re.MULTILINE)
-GUESSER_OF_ANYTHING = ["--agent=sac", "~agent.network", "agent._target_=tests.cli.test_evaluate.GuesserOfAnything"]
+GUESSER_OF_ANYTHING = ["--agent=sac", "~agent.network", "agent._target_=tests.support.tracked_runs.GuesserOfAnything"]
 PICTURES_A_FRAME, PICTURES_OF_THE_LAST = 6, 24
 
 
@@ -87,6 +86,7 @@ def test_film_goes_over_every_split_of_a_folder_and_says_what_is_known(answer, t
 
 
 def test_baseline_is_filmed_without_a_store(answer, tmp_path):
+    (tmp_path / "mlruns.db").unlink()
     words = [*GUESSER_OF_ANYTHING, "--data=phantom", "--phantoms=2", "--max-steps=2"]
     code, printed, errors = answer(*words)
     assert (code, errors) == (0, "")
@@ -97,42 +97,10 @@ def test_baseline_is_filmed_without_a_store(answer, tmp_path):
     assert not (tmp_path / "mlruns.db").exists()
 
 
-def test_video_answers_mistakes_in_one_line(answer, tmp_path):
-    run_id = tracked(tmp_path)
-    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
-    experiment_id = client.get_run(run_id).info.experiment_id
-    evaluation = client.create_run(experiment_id, tags={"evaluation.of": run_id}).info.run_id
-    (tmp_path / "file").write_text("mine")
-    run = run_id
-    for words, line in (
-        ([], "give one RUN, or --agent NAME"),
-        (["ffffffff"], "the run is 'ffffffff', but no run of sqlite:///"),
-        ([evaluation], f"run is '{evaluation}', but that is an evaluation, of {run_id}"),
-        ([run, "--episodes=0"], "Invalid value for '--episodes': 0 is not in the range x>=1."),
-        ([run, "--data=/nowhere"], "--data is '/nowhere', but there is no such folder: it must be "),
-        ([run, "--tracking=sqlite:///no.db"], "tracking.uri is 'sqlite:///no.db', but there is no "),
-        ([run, "--tracking-experiment=x"], "--tracking-experiment is for --agent without --video"),
-        (
-            ["--agent=sac", "tracking.experiment=x"],
-            "tracking.experiment is for armscan run, and not read here: give --tracking-experiment NAME",
-        ),
-        (["--agent=sac", *FEW], "sac has to be trained first: give the RUN that has trained one"),
-        ([run, "--out=file"], "--out is 'file', but no video can be written there: "),
-        ([run, "--out=/proc/films"], "--out is '/proc/films', but no video can be written there: "),
-        ([run, "--success-threshold=7"], "Invalid value for '--success-threshold': 7.0 is not in the range 0<x<=1."),
-    ):
-        code, _, errors = answer(*words)
-        assert code == 2, words
-        assert errors.startswith(f"error: {line}"), (words, errors)
-        assert len(errors.splitlines()) == 1, errors
-    assert not (tmp_path / "films").exists()
-    assert (tmp_path / "file").read_text() == "mine"
-
-
 def test_checkpoints_that_are_gone_or_damaged_or_anothers_are_refused(answer, tmp_path):
     run_id = tracked(tmp_path, kept=("config.yaml", "volumes.json"))
     assert answer(run_id)[2].startswith(f"error: run {run_id} has kept no checkpoint, so that there is nothing")
-    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
+    client = store_of(tmp_path)
     weights, facts = load_checkpoint(tmp_path / "best.pt")
     whole = (tmp_path / "best.pt").read_bytes()
     for change, line in (
