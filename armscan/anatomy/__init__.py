@@ -1,6 +1,6 @@
 """Tissues in a slice, their clusters, and the rewards computed from them."""
 
-from armscan.anatomy.landmarks import Clusters, Landmarks, TissueClusters, tissue_dice
+from armscan.anatomy.landmarks import Clusters, Landmarks, TissueClusters, nerve_area_error, tissue_dice
 from armscan.anatomy.plane_search import FoundPlane, PlaneScorer, find_optimal_plane
 from armscan.anatomy.rewards import (
     PUBLISHED_TARGETS,
@@ -44,5 +44,6 @@ __all__ = [
     "check_tissues",
     "find_optimal_plane",
     "landmark_reward",
+    "nerve_area_error",
     "tissue_dice",
 ]

@@ -12,6 +12,7 @@ from armscan.anatomy.clustering import cluster_label
 from armscan.anatomy.tissues import PIXEL_TISSUES, USUAL_PIXEL_MM, Tissues, check_tissues
 from armscan.errors import InvalidValueError
 from armscan.volumes import LABEL_NAMES, LANDMARK_LABELS
+from armscan.volumes.labelmap import TISSUE_LABELS
 
 Landmarks = NDArray[np.float64]
 """Summary of a slice, shape (3, 4): a row for bones, tendons and artery, each with the number of clusters, the number
@@ -106,6 +107,26 @@ def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) ->
         total = int(np.count_nonzero(mask) + np.count_nonzero(reference))
         dice[LABEL_NAMES[label]] = 2.0 * int(np.count_nonzero(mask & reference)) / total if total else 1.0
     return dice
+
+
+def nerve_area_error(
+    slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8], pixel_mm: tuple[float, float]
+) -> tuple[float | None, float | None]:
+    """Return how far the median nerve's area is from that on a reference slice: in mm2, and in per cent of the latter.
+
+    Args:
+        slice_xz: labels, indexed [across, depth].
+        reference_xz: likewise.
+        pixel_mm: size (across, depth) of a pixel of both, in mm.
+
+    Returns:
+        The two, at least 0; None and None where the reference shows no nerve.
+    """
+    shown, wanted = (int(np.count_nonzero(each == TISSUE_LABELS["nerve"])) for each in (slice_xz, reference_xz))
+    if wanted == 0:
+        return None, None
+    off = abs(shown - wanted)
+    return off * pixel_mm[0] * pixel_mm[1], 100.0 * off / wanted
 
 
 def _checked_slice(slice_xz: Any) -> NDArray[Any]:

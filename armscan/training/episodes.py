@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from armscan.agents.batch_agent import BatchAgent, batch_agent
 from armscan.agents.protocols import Agent
-from armscan.anatomy import tissue_dice
+from armscan.anatomy import nerve_area_error, tissue_dice
 from armscan.envs import ArmscanVectorEnv
 from armscan.envs.episode import Episode
 from armscan.envs.factory import side_by_side
@@ -112,6 +112,7 @@ def _result(episode: Episode, seed: int, seconds: float, optimal_xz: NDArray[np.
     _, *rewards = episode.rewards
     distance_mm, distance_deg = episode.distance
     dice = tissue_dice(episode.view.slice_xz, optimal_xz)
+    nerve_mm2, nerve_percent = nerve_area_error(episode.view.slice_xz, optimal_xz, episode.scene.volume.pixel_mm)
     return EpisodeResult(
         volume=episode.scene.volume.name,
         seed=seed,
@@ -124,5 +125,7 @@ def _result(episode: Episode, seed: int, seconds: float, optimal_xz: NDArray[np.
         distance_mm=distance_mm,
         distance_deg=distance_deg,
         seconds_per_plane=seconds / episode.n_steps,
+        nerve_area_error_mm2=nerve_mm2,
+        nerve_area_error_percent=nerve_percent,
         **{f"dice_{tissue}": value for tissue, value in dice.items()},
     )

@@ -29,6 +29,11 @@ METRICS: dict[str, tuple[Statistic, str]] = {
     "p95_steps": (P95, "n_steps"),
     **{f"median_{value}": (MEDIAN, value) for value in ("distance_mm", "distance_deg")},
     **{f"p90_{value}": (P90, value) for value in ("distance_mm", "distance_deg")},
+    **{
+        f"{name}_{value}": (statistic, value)
+        for value in ("nerve_area_error_mm2", "nerve_area_error_percent")
+        for name, statistic in (("median", MEDIAN), ("p90", P90))
+    },
     **{f"mean_{value}": (mean, value) for value in ("dice_bones", "dice_tendons", "dice_artery", "seconds_per_plane")},
 }
 
@@ -70,7 +75,10 @@ class MetricEstimates:
             rates[limits.metric] = [float(limits.holds(each.distance_mm, each.distance_deg)) for each in episodes]
         columns: dict[str, tuple[Statistic, list[float]]] = {name: (mean, values) for name, values in rates.items()}
         for name, (statistic, value) in METRICS.items():
-            columns[name] = statistic, [float(getattr(episode, value)) for episode in episodes]
+            measured = [getattr(episode, value) for episode in episodes]
+            # What was never measured is no figure.
+            if any(each is not None for each in measured) or not measured:
+                columns[name] = statistic, [math.nan if each is None else float(each) for each in measured]
         for name, (statistic, values) in list(columns.items()):
             columns[name + NOT_STARTED_SOLVED] = statistic, np.where(is_other, values, math.nan).tolist()
         wilsons = {}

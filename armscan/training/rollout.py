@@ -58,6 +58,9 @@ class EpisodeResult:
         dice_artery: likewise.
         seconds_per_plane: mean wall time of choosing a plane and looking at it, of planes in episodes side by side an
             equal share each; two episodes that differ in nothing else are equal.
+        nerve_area_error_mm2: how far the median nerve's area on the last slice is from that on the optimal plane's, in
+            mm2. Default: None, the optimal plane's shows no nerve, or nobody has measured it.
+        nerve_area_error_percent: the same in per cent of the area on the optimal plane's. Default: None, likewise.
     """
 
     volume: str
@@ -74,6 +77,8 @@ class EpisodeResult:
     dice_tendons: float
     dice_artery: float
     seconds_per_plane: float = field(compare=False)
+    nerve_area_error_mm2: float | None = None
+    nerve_area_error_percent: float | None = None
 
     @property
     def mean_dice(self) -> float:
@@ -192,10 +197,14 @@ class Evaluation:
 
 def _episode_of(plain: object) -> EpisodeResult:
     kinds = get_type_hints(EpisodeResult)
-    if not isinstance(plain, dict) or plain.keys() != kinds.keys():
+    # Older evaluations have nothing of the nerve.
+    optional = {each.name for each in fields(EpisodeResult) if each.default is None}
+    if not isinstance(plain, dict) or not kinds.keys() - optional <= plain.keys() <= kinds.keys():
         raise InvalidValueError(f"an episode is {plain!r}, but it must have {', '.join(kinds)}, and nothing else")
-    for name, kind in kinds.items():
-        value = plain[name]
+    for name, value in plain.items():
+        if name in optional and value is None:
+            continue
+        kind = float if name in optional else kinds[name]
         # A truth value is a number to Python; JSON writes some floats as integers.
         is_of_kind = type(value) is kind or (kind is float and type(value) is int)
         if not is_of_kind or (kind in (int, float) and not -LARGEST < value < LARGEST):

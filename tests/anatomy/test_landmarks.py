@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from armscan.anatomy import TissueClusters, tissue_dice
+from armscan.anatomy import TissueClusters, nerve_area_error, tissue_dice
 from armscan.errors import InvalidValueError
 
 
@@ -29,3 +29,19 @@ def test_dice_by_hand():
 def test_dice_is_one_where_neither_slice_shows_the_tissue():
     nothing = np.zeros((2, 2), dtype=np.uint8)
     assert set(tissue_dice(nothing, nothing).values()) == {1.0}
+
+
+def test_nerve_area_error_by_hand():
+    reference = np.array([[4, 4, 4], [4, 2, 0]], dtype=np.uint8)
+    pixel_mm = (0.5, 0.25)
+    for shown, off_mm2, off_percent in (
+        (reference, 0.0, 0.0),
+        (reference[:1], 0.125, 25.0),
+        (0 * reference, 0.5, 100.0),
+    ):
+        assert nerve_area_error(shown, reference, pixel_mm) == (off_mm2, off_percent)
+    assert nerve_area_error(np.full((3, 3), 4), reference, pixel_mm) == (0.625, 125.0)
+
+
+def test_nerve_area_error_is_nothing_where_the_reference_shows_no_nerve():
+    assert nerve_area_error(np.full((2, 2), 4), np.ones((2, 2), np.uint8), (1.0, 1.0)) == (None, None)

@@ -40,7 +40,7 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         ),
         (
             ["--agent=random", f"--data={data_folder}", "data.n_test=1"],
-            "there is no key 'n_test' in data, but only path, validation, test or split_seed",
+            "there is no key 'n_test' in data, but only path, validation, test, split_seed, folds or fold",
         ),
         ([run_id, "--episodes=0"], "Invalid value for '--episodes': 0 is not in the range x>=1."),
         ([run_id, f"--data={data_folder}", "--episodes=3"], "episodes, of which each of 4 volumes is to have one"),

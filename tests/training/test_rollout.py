@@ -1,13 +1,14 @@
 """Whole episodes, and what they add up to."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from armscan.envs import make_armscan_env
 from armscan.errors import InvalidValueError
-from armscan.training import Evaluation, evaluate
+from armscan.training import Evaluation, MetricEstimates, ResultTable, evaluate
 from tests.training.test_train import evaluation_of
 
 
@@ -72,6 +73,42 @@ def test_episode_of_the_optimal_plane_shows_its_slice(dataset):
     for episode in evaluate(Oracle(env, 5), env, n_episodes=4, seed=5).episodes:
         assert episode.mean_dice == pytest.approx(1.0, abs=0.01)
         assert episode.seconds_per_plane > 0
+
+
+def test_episode_says_how_far_the_nerves_area_is_from_that_on_the_optimal_plane(phantom):
+    env = make_armscan_env([phantom], max_steps=1, transform=None)
+    (episode,) = evaluate(Still(), env, n_episodes=1, seed=0).episodes
+    env.reset(seed=0)
+    env.step(np.zeros(1))
+    areas = [
+        int((each == 4).sum()) for each in (env.unwrapped.episode.view.slice_xz, phantom.slice(phantom.optimal_action))
+    ]
+    pixel_mm2 = phantom.pixel_mm[0] * phantom.pixel_mm[1]
+    assert areas[0] != areas[1]
+    assert episode.nerve_area_error_mm2 == pytest.approx(abs(areas[0] - areas[1]) * pixel_mm2)
+    assert episode.nerve_area_error_percent == pytest.approx(100 * abs(areas[0] - areas[1]) / areas[1])
+    figures = MetricEstimates.of(Evaluation((episode, replace(episode, nerve_area_error_mm2=None))))
+    assert figures.estimate("median_nerve_area_error_mm2").value == pytest.approx(episode.nerve_area_error_mm2)
+
+
+def test_nerve_is_not_available_where_volumes_have_none(phantom):
+    without = replace(phantom, labels=np.where(phantom.labels == 4, 0, phantom.labels))
+    evaluation = evaluate(Still(), make_armscan_env([without], max_steps=1), n_episodes=2, seed=0)
+    assert {episode.nerve_area_error_mm2 for episode in evaluation.episodes} == {None}
+    figures = MetricEstimates.of(evaluation)
+    assert math.isnan(figures.estimate("median_nerve_area_error_percent").value)
+    assert not any("nerve" in column.title for column in ResultTable({"agent": figures}).quantities)
+    assert Evaluation.of_dict(evaluation.to_dict()) == evaluation
+
+
+def test_episodes_of_older_evaluations_say_nothing_of_the_nerve():
+    contents = evaluation_of(1, 3).to_dict()
+    for episode in contents["episodes"]:
+        del episode["nerve_area_error_mm2"], episode["nerve_area_error_percent"]
+    assert Evaluation.of_dict(contents) == evaluation_of(1, 3)
+    contents["episodes"][0]["nerve_area_error_mm2"] = "1"
+    with pytest.raises(InvalidValueError, match="nerve_area_error_mm2 is '1', but it must be a finite float"):
+        Evaluation.of_dict(contents)
 
 
 class Thrice:
