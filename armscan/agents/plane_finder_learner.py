@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
-import time
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from armscan.agents.base_learner import SupervisedLearner, diverged, teacher_of
 from armscan.agents.finder_parameters import FinderParameters
 from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork
 from armscan.agents.plane_geometry import common_geometry
 from armscan.agents.policy import Policy, batch_of, clip_action
 from armscan.agents.protocols import AgentSetup
-from armscan.agents.tianshou_learner import diverged, is_finite, load_into
 from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
-from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
+from armscan.envs.vector_env import reset_each
 from armscan.errors import InvalidValueError
 from armscan.volumes.plane import FloatArray
 
@@ -34,10 +33,8 @@ DOUBT_WEIGHT = 0.1
 N_CALIBRATION = 96
 
 
-class PlaneFinderLearner:
+class PlaneFinderLearner(SupervisedLearner):
     """Plays episodes in all environments at once, and takes a gradient step on all their looks.
-
-    Every epoch draws everything from `seed` and its own number, so that it goes on from its state bit for bit.
 
     Args:
         finder: parameters.
@@ -45,11 +42,8 @@ class PlaneFinderLearner:
     """
 
     def __init__(self, finder: FinderParameters, setup: AgentSetup) -> None:
-        self._finder, self._seed, self._total_env_steps = finder, setup.seed, setup.total_env_steps
-        self._envs = setup.make_envs(finder.num_envs)
-        self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
-        self._has_stop = len(setup.action_names) > 4
-        self._compute, self._device = setup.compute, setup.compute.torch_device
+        self._finder, self._has_stop = finder, len(setup.action_names) > 4
+        envs = setup.make_envs(finder.num_envs)
         torch.manual_seed(setup.seed)
         space: Any = setup.observation_space
         network = LookNetwork(
@@ -60,58 +54,30 @@ class PlaneFinderLearner:
             hidden_sizes=finder.hidden_sizes,
         )
         sure = None if finder.sure_mm is None or finder.sure_deg is None else (finder.sure_mm, finder.sure_deg)
-        geometry = common_geometry(_teacher(self._envs).rules, finder.n_looks)
-        module = FinderModule(network, geometry, finder.offsets_mm, sure, has_stop=self._has_stop)
-        self._module = module.to(self._device)
-        self._optimiser = torch.optim.Adam(network.parameters(), lr=finder.lr)
-        self._n_env_steps = self._n_epochs = 0
+        geometry = common_geometry(teacher_of(envs).rules, finder.n_looks)
+        self._module = FinderModule(network, geometry, finder.offsets_mm, sure, has_stop=self._has_stop)
+        super().__init__(self._module, finder.lr, envs, setup)
+        self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
         self.expected_error: tuple[float, float] | None = None
         """How far off the plane that `act` chose last is expected to be, in mm and degrees."""
-        setup.compute.apply_to(self._module)
-
-    @property
-    def n_env_steps(self) -> int:
-        """Looks taken so far, the starts of episodes included, calibration left out."""
-        return self._n_env_steps
 
     @property
     def env_steps_at_once(self) -> int:
         """All looks of an episode in each environment."""
-        return self._envs.num_envs * self._finder.n_looks
+        return int(self._envs.num_envs * self._finder.n_looks)
 
-    def warm_up(self) -> None:
-        """Do nothing: the first looks can be learned from."""
-
-    def learn(self, n_env_steps: int) -> dict[str, float]:
-        """Learn for one epoch of at least `n_env_steps`; returns its training metrics by name.
-
-        Raises:
-            DivergedError: if the weights are not finite afterwards.
-        """
-        self._n_epochs += 1
-        for_torch, for_draws, for_envs, for_calibration = np.random.SeedSequence([self._seed, self._n_epochs]).spawn(4)
-        torch.manual_seed(int(for_torch.generate_state(1)[0]))
-        rng = np.random.default_rng(for_draws)
-        seeds = [int(word) for word in for_envs.generate_state(self._envs.num_envs)]
+    def _learn_until(self, n_env_steps: int, seeds: list[int], rng: np.random.Generator) -> list[Tensor]:
+        """See `SupervisedLearner._learn_until`."""
         losses: list[Tensor] = []
-        n_before, start_s = self._n_env_steps, time.perf_counter()
-        while self._n_env_steps - n_before < n_env_steps:
+        while self._n_env_steps < n_env_steps:
             observations, _ = reset_each(self._envs, None if losses else seeds, self._volumes(rng))
             losses.append(self._teach(observations, rng))
             self._n_env_steps += self.env_steps_at_once
-        if not is_finite(self._module):
-            raise diverged(self._n_env_steps)
-        seconds = time.perf_counter() - start_s
-        return {
-            "update/loss": float(torch.stack(losses).mean()),
-            "speed/env_steps_per_s": (self._n_env_steps - n_before) / seconds,
-            "speed/updates_per_s": len(losses) / seconds,
-            **self._calibrate(int(for_calibration.generate_state(1)[0])),
-        }
+        return losses
 
     def _volumes(self, rng: np.random.Generator) -> dict[str, Any] | None:
         """Draw the volume of each episode where phantoms have a share of them; None leaves that to the environments."""
-        phantom_share, names = self._finder.phantom_share, _teacher(self._envs).rules.names
+        phantom_share, names = self._finder.phantom_share, self._teacher.rules.names
         groups = [[name for name in names if name.startswith(PHANTOM) == of_phantoms] for of_phantoms in (True, False)]
         if phantom_share is None or not all(groups):
             return None
@@ -137,10 +103,8 @@ class PlaneFinderLearner:
         errors = torch.stack([off[:, 2].abs(), torch.rad2deg(off[:, :2].norm(dim=1))], dim=1)
         # The likelihood of errors that are distributed exponentially about their mean.
         doubt = (expected.log() + errors / expected).mean()
-        for group in self._optimiser.param_groups:
-            share = min(1.0, self._n_env_steps / self._total_env_steps)
-            fall = 0.5 * (1.0 + math.cos(math.pi * share))
-            group["lr"] = finder.lr * (finder.lr_end_factor + (1.0 - finder.lr_end_factor) * fall)
+        fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, self._n_env_steps / self._total_env_steps)))
+        self._set_lr(finder.lr * (finder.lr_end_factor + (1.0 - finder.lr_end_factor) * fall))
         self._optimiser.zero_grad()
         torch.autograd.backward(loss + DOUBT_WEIGHT * doubt)
         self._optimiser.step()
@@ -164,7 +128,7 @@ class PlaneFinderLearner:
             raise diverged(self._n_env_steps)
         return np.column_stack([actions, np.full(n, -1.0)]) if self._has_stop else actions
 
-    def _calibrate(self, seed: int) -> dict[str, float]:
+    def _further_metrics(self, seed: int) -> dict[str, float]:
         """Scale the expected errors to be right on average where they are judged; returns what was seen there."""
         envs = self._calibration_envs
         if envs is None:
@@ -193,7 +157,7 @@ class PlaneFinderLearner:
 
     def _optima(self, envs: Any) -> Tensor:
         """Return the labelled planes of the current episodes, shape (num_envs, 4)."""
-        optima = torch.as_tensor(_teacher(envs).optimal_actions[:, :4], dtype=torch.float32, device=self._device)
+        optima = torch.as_tensor(teacher_of(envs).optimal_actions[:, :4], dtype=torch.float32, device=self._device)
         return self._module.geometry.planes(optima)
 
     def _tensors(self, observations: Any) -> dict[str, Tensor]:
@@ -223,39 +187,3 @@ class PlaneFinderLearner:
     def policy(self) -> Policy:
         """Return a copy of what `act` asks."""
         return Policy(self._module, clip_action, self._compute)
-
-    def weights(self) -> dict[str, Any]:
-        """Return the network's weights, the geometry and the calibration."""
-        return dict(self._module.state_dict())
-
-    def load_weights(self, weights: dict[str, Any]) -> None:
-        """Take over what `weights` returned.
-
-        Raises:
-            CheckpointError: if it is that of another network.
-        """
-        load_into(self._module, weights)
-
-    def state(self) -> dict[str, Any]:
-        """Return network, optimiser and counters."""
-        return {
-            "network": self.weights(),
-            "optimiser": self._optimiser.state_dict(),
-            "n_env_steps": self._n_env_steps,
-            "n_epochs": self._n_epochs,
-        }
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned.
-
-        Raises:
-            CheckpointError: if it is that of another agent.
-        """
-        load_into(self._module, state["network"])
-        self._optimiser.load_state_dict(state["optimiser"])
-        self._n_env_steps, self._n_epochs = state["n_env_steps"], state["n_epochs"]
-
-
-def _teacher(envs: Any) -> ArmscanVectorEnv:
-    assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
-    return envs.unwrapped

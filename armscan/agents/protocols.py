@@ -55,6 +55,10 @@ class Learner(Agent, Protocol):
     def env_steps_at_once(self) -> int:
         """The fewest environment steps that `learn` can take."""
 
+    @property
+    def update_note(self) -> str | None:
+        """How gradient steps are computed, for a reader of the log; None where there is but one way."""
+
     def warm_up(self) -> None:
         """Take the steps that come before the first update; called once, at the very beginning."""
 

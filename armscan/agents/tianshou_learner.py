@@ -16,6 +16,7 @@ from tianshou.algorithm.algorithm_base import Policy as TianshouPolicy
 from tianshou.data import collector
 from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
+from armscan.agents.base_learner import BaseLearner, diverged, is_finite, load_into, prepare_torch
 from armscan.agents.compile_cache import cache_compiled
 from armscan.agents.compiled_sac import CompiledSAC
 from armscan.agents.epoch_metrics import EpochMetrics
@@ -28,7 +29,6 @@ from armscan.agents.step_collector import StepCollector
 from armscan.agents.tianshou_envs import TianshouVectorEnv
 from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
-from armscan.errors import CheckpointError, DivergedError
 from armscan.volumes.plane import FloatArray
 
 # Tianshou measures how long it takes on the wall clock, and raises an error where that is turned back meanwhile.
@@ -36,7 +36,7 @@ for _module in (algorithm_base, collector, tianshou.trainer):
     vars(_module)["time"] = SimpleNamespace(time=time.perf_counter, sleep=time.sleep)
 
 
-class TianshouLearner:
+class TianshouLearner(BaseLearner):
     """A learner made of a Tianshou trainer.
 
     Its test collector, persistence and progress bars are left out: evaluation, checkpoints and progress are the same
@@ -62,6 +62,7 @@ class TianshouLearner:
         setup: AgentSetup,
         learning_starts: int = 0,
     ) -> None:
+        super().__init__(setup)
         trainer.reset(reset_collectors=False)
         self._trainer = trainer
         self._algorithm: Any = trainer.algorithm
@@ -71,15 +72,12 @@ class TianshouLearner:
         self._envs: TianshouVectorEnv = collector.env
         self._metrics = cast(EpochMetrics, trainer.params.logger)
         self._learning_starts = learning_starts
-        self._seed, self._total_env_steps = setup.seed, setup.total_env_steps
-        self._parameters = parameters
-        self._bounded, self._compute = bounded, setup.compute
-        policy = self._algorithm.policy
+        self._parameters, self._bounded = parameters, bounded
+        self._network = policy = self._algorithm.policy
         self._inference = Inference(policy.actor, bounded, setup.compute, is_sampling=not policy.deterministic_eval)
-        self._n_epochs = 0
         critics = [module for name, module in self._algorithm.named_children() if name.startswith("critic")]
         # Lagging copies of the critics included.
-        for network in (self._algorithm.policy.actor, *critics):
+        for network in (policy.actor, *critics):
             setup.compute.apply_to(network)
 
     @property
@@ -135,16 +133,14 @@ class TianshouLearner:
     def _begin_epoch(self) -> None:
         """Begin episodes anew, and everything that is drawn; the learning rates are those of this moment."""
         self._replay.cut_off()
-        for_torch, for_numpy, for_replay, for_envs = np.random.SeedSequence([self._seed, self._n_epochs]).spawn(4)
-        torch.manual_seed(int(for_torch.generate_state(1)[0]))
+        for_numpy, for_replay, for_envs = self._epoch_seeds()
         # Tianshou shuffles with NumPy's global generator.
         np.random.seed(for_numpy.generate_state(1))  # noqa: NPY002
         self._replay.seed(int(for_replay.generate_state(1)[0]))
         self._envs.seed([int(word) for word in for_envs.generate_state(self._collector.env_num)])
         self._envs.n_ended = self._envs.n_successes = 0
         self._collector.reset_env()
-        for group in self._lr_groups():
-            group["lr"] = self._parameters.lr_after(self.n_env_steps, self._total_env_steps)
+        self._set_lr(self._parameters.lr_after(self.n_env_steps, self._total_env_steps))
 
     def _lr_groups(self) -> list[dict[str, Any]]:
         return [group for optimiser in self._algorithm._optimizers for group in optimiser._optim.param_groups]
@@ -174,18 +170,6 @@ class TianshouLearner:
         """Return a copy of the actor that `act` asks, with the mode of its actions as its answer."""
         policy = self._algorithm.policy
         return Policy(policy.actor, self._bounded, self._compute, is_sampling=not policy.deterministic_eval)
-
-    def weights(self) -> dict[str, Any]:
-        """Return the policy's weights."""
-        return dict(self._algorithm.policy.state_dict())
-
-    def load_weights(self, weights: dict[str, Any]) -> None:
-        """Take over a policy's weights.
-
-        Raises:
-            CheckpointError: if they are those of another network.
-        """
-        load_into(self._algorithm.policy, weights)
 
     def state(self) -> dict[str, Any]:
         """Return networks, optimisers, replay buffer and counters."""
@@ -220,12 +204,6 @@ def training_envs(setup: AgentSetup, num_envs: int) -> TianshouVectorEnv:
     return envs
 
 
-def prepare_torch(seed: int) -> None:
-    """Have torch compute on one thread, on which small networks are fastest, and seed the networks made next."""
-    torch.set_num_threads(1)
-    torch.manual_seed(seed)
-
-
 def training_parameters(policy: TianshouPolicy, envs: TianshouVectorEnv, replay: Replay) -> dict[str, Any]:
     """Return the parameters that Tianshou's trainers share."""
     return {
@@ -234,31 +212,6 @@ def training_parameters(policy: TianshouPolicy, envs: TianshouVectorEnv, replay:
         "verbose": False,
         "show_progress": False,
     }
-
-
-def is_finite(module: torch.nn.Module) -> bool:
-    """Whether all weights are finite."""
-    return all(bool(torch.isfinite(weights).all()) for weights in module.parameters())
-
-
-def diverged(n_env_steps: int, too_large: str = "agent.lr") -> DivergedError:
-    """Return the error of a training whose networks are not finite any more."""
-    return DivergedError(
-        f"learning has diverged: after {n_env_steps} environment steps the networks' weights are not finite any more; "
-        f"a smaller {too_large} may help"
-    )
-
-
-def load_into(module: torch.nn.Module, weights: dict[str, Any]) -> None:
-    """Give a network its weights.
-
-    Raises:
-        CheckpointError: if they are those of another network.
-    """
-    try:
-        module.load_state_dict(weights)
-    except (RuntimeError, KeyError, ValueError) as error:
-        raise CheckpointError(f"the checkpoint is another agent's or network's: {error}") from error
 
 
 def _entropy_optimiser(algorithm: Any) -> torch.optim.Optimizer | None:

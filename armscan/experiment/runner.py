@@ -130,7 +130,7 @@ def train_agent(
     """Train the agent of a setup, which must be a `Learner`, and tell how its updates are computed; see `train`."""
     agent, budget = setup.agent, setup.budget
     assert isinstance(agent, Learner)
-    if note := getattr(agent, "update_note", None):
+    if note := agent.update_note:
         tell(f"update: {note}")
     seed = VALIDATION_SEED + setup.seed
     validate = partial(

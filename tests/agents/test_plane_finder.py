@@ -128,8 +128,8 @@ def test_learner_stops_when_it_is_sure_and_after_its_last_look(phantom, sure, n_
 def test_expected_errors_are_right_on_average_where_they_were_calibrated(phantom):
     learner, _ = made(phantom)
     metrics = learner.learn(24)
-    again = learner._calibrate(seed=5)
-    factors = [learner._calibrate(seed=5)[f"calibration/factor_{unit}"] for unit in ("mm", "deg")]
+    again = learner._further_metrics(seed=5)
+    factors = [learner._further_metrics(seed=5)[f"calibration/factor_{unit}"] for unit in ("mm", "deg")]
     # On the same episodes there is nothing left to scale.
     assert factors == pytest.approx([again[f"calibration/factor_{unit}"] for unit in ("mm", "deg")], rel=1e-4)
     assert metrics["calibration/error_mm"] > 0.0

@@ -1,0 +1,184 @@
+"""What learners share: weights and their checks, and epochs that draw everything from the seed and their number."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from armscan.agents.protocols import AgentSetup
+from armscan.envs.vector_env import ArmscanVectorEnv
+from armscan.errors import CheckpointError, DivergedError
+
+
+class BaseLearner(ABC):
+    """A network and what its epochs begin from; `setup` is the agent's."""
+
+    _network: nn.Module
+
+    def __init__(self, setup: AgentSetup) -> None:
+        self._seed, self._total_env_steps, self._n_epochs = setup.seed, setup.total_env_steps, 0
+        self._compute, self._device = setup.compute, setup.compute.torch_device
+
+    @property
+    def update_note(self) -> str | None:
+        """See `Learner.update_note`."""
+        return None
+
+    def weights(self) -> dict[str, Any]:
+        """Return the network's weights, and whatever else it computes with."""
+        return dict(self._network.state_dict())
+
+    def load_weights(self, weights: dict[str, Any]) -> None:
+        """Take over what `weights` returned.
+
+        Raises:
+            CheckpointError: if it is that of another network.
+        """
+        load_into(self._network, weights)
+
+    @abstractmethod
+    def _lr_groups(self) -> list[dict[str, Any]]:
+        """Return the parameter groups of the optimisers whose learning rate falls."""
+
+    def _set_lr(self, lr: float) -> None:
+        for group in self._lr_groups():
+            group["lr"] = lr
+
+    def _epoch_seeds(self) -> list[np.random.SeedSequence]:
+        """Seed torch for an epoch, the first time before the first; returns three more seeds for what else draws."""
+        for_torch, *others = np.random.SeedSequence([self._seed, self._n_epochs]).spawn(4)
+        torch.manual_seed(int(for_torch.generate_state(1)[0]))
+        return others
+
+
+class SupervisedLearner(BaseLearner):
+    """A learner of one network that the environments teach the optimal planes of their episodes.
+
+    Every epoch begins with new episodes and draws everything from `seed` and its own number, so that it goes on from
+    its state bit for bit.
+
+    Args:
+        network: the network, which the optimiser is given to.
+        lr: learning rate at the beginning.
+        envs: training environments, of `setup`.
+        setup: environments, spaces, budget and seed of the agent.
+    """
+
+    def __init__(self, network: nn.Module, lr: float, envs: Any, setup: AgentSetup) -> None:
+        super().__init__(setup)
+        self._envs, self._teacher = envs, teacher_of(envs)
+        self._network = network.to(self._device)
+        self._optimiser = torch.optim.Adam(self._network.parameters(), lr=lr)
+        self._n_env_steps = 0
+        setup.compute.apply_to(self._network)
+
+    @property
+    def n_env_steps(self) -> int:
+        """Environment steps taken so far, the starts of episodes included."""
+        return self._n_env_steps
+
+    def warm_up(self) -> None:
+        """Do nothing: the first planes can be learned from."""
+
+    def learn(self, n_env_steps: int) -> dict[str, float]:
+        """Learn for one epoch of at least `n_env_steps`; returns its training metrics by name.
+
+        Raises:
+            DivergedError: if the weights are not finite afterwards.
+        """
+        self._n_epochs += 1
+        for_draws, for_envs, for_others = self._epoch_seeds()
+        rng = np.random.default_rng(for_draws)
+        seeds = [int(word) for word in for_envs.generate_state(self._envs.num_envs)]
+        n_before, start_s = self._n_env_steps, time.perf_counter()
+        losses = self._learn_until(n_before + n_env_steps, seeds, rng)
+        if not is_finite(self._network):
+            raise diverged(self._n_env_steps)
+        seconds = time.perf_counter() - start_s
+        return {
+            **({"update/loss": float(torch.stack(losses).mean())} if losses else {}),
+            "speed/env_steps_per_s": (self._n_env_steps - n_before) / seconds,
+            "speed/updates_per_s": len(losses) / seconds,
+            **self._further_metrics(int(for_others.generate_state(1)[0])),
+        }
+
+    @abstractmethod
+    def _learn_until(self, n_env_steps: int, seeds: list[int], rng: np.random.Generator) -> list[Tensor]:
+        """Play and learn until this many environment steps were taken in all.
+
+        Args:
+            n_env_steps: number of environment steps.
+            seeds: seed of the first episode of each environment.
+            rng: whatever else is drawn.
+
+        Returns:
+            The loss of each gradient step.
+        """
+
+    @abstractmethod
+    def _further_metrics(self, seed: int) -> dict[str, float]:
+        """Return further metrics of an epoch, whose draws come from `seed`."""
+
+    def _lr_groups(self) -> list[dict[str, Any]]:
+        return self._optimiser.param_groups
+
+    def state(self) -> dict[str, Any]:
+        """Return network, optimiser and counters."""
+        return {
+            "network": self.weights(),
+            "optimiser": self._optimiser.state_dict(),
+            "n_env_steps": self._n_env_steps,
+            "n_epochs": self._n_epochs,
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what `state` returned.
+
+        Raises:
+            CheckpointError: if it is that of another agent.
+        """
+        self.load_weights(state["network"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._n_env_steps, self._n_epochs = state["n_env_steps"], state["n_epochs"]
+
+
+def teacher_of(envs: Any) -> ArmscanVectorEnv:
+    """Return the environments that say where the optimal planes lie."""
+    assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
+    return envs.unwrapped
+
+
+def is_finite(module: nn.Module) -> bool:
+    """Whether all weights are finite."""
+    return all(bool(torch.isfinite(weights).all()) for weights in module.parameters())
+
+
+def diverged(n_env_steps: int, too_large: str = "agent.lr") -> DivergedError:
+    """Return the error of a training whose networks are not finite any more."""
+    return DivergedError(
+        f"learning has diverged: after {n_env_steps} environment steps the networks' weights are not finite any more; "
+        f"a smaller {too_large} may help"
+    )
+
+
+def load_into(module: nn.Module, weights: dict[str, Any]) -> None:
+    """Give a network its weights.
+
+    Raises:
+        CheckpointError: if they are those of another network.
+    """
+    try:
+        module.load_state_dict(weights)
+    except (RuntimeError, KeyError, ValueError) as error:
+        raise CheckpointError(f"the checkpoint is another agent's or network's: {error}") from error
+
+
+def prepare_torch(seed: int) -> None:
+    """Have torch compute on one thread, on which small networks are fastest, and seed the networks made next."""
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)
