@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 from armscan.errors import ManifestError, few, listed
 from armscan.utils.validation import check_choice, check_path
 from armscan.volumes.manifest import MANIFEST_NAMES, find_manifest, read_manifest, volume_entries, volume_files
-from armscan.volumes.reading import ReadingOptions, read_stored
-from armscan.volumes.resampling import finest_spacing, resample
+from armscan.volumes.read_cache import read_kept, resample_kept
+from armscan.volumes.reading import ReadingOptions
+from armscan.volumes.resampling import finest_spacing
 from armscan.volumes.summary import VolumeReport
 from armscan.volumes.volume import LabelVolume
 
@@ -81,14 +82,14 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
         raise ManifestError(f"{found}: excludes every volume of the folder")
     volumes, stored = {}, {}
     for name, entry in used.items():
-        volumes[name], stored[name] = read_stored(
+        volumes[name], stored[name] = read_kept(
             files[name],
             ReadingOptions(crop_mm=entry.crop_mm, **{key: manifest.setting(entry, key) for key in SHARED_KEYS}),
             optimal_action=entry.plane,
         )
     if manifest.spacing == "finest":
         spacing = finest_spacing(volumes.values())
-        volumes = {name: resample(volume, spacing) for name, volume in volumes.items()}
+        volumes = {name: resample_kept(volume, spacing) for name, volume in volumes.items()}
     subjects = {name: entry.subject or name for name, entry in entries.items()}
     splits = None if manifest.splits is None else _split_of(manifest.splits, subjects, used, f"{found}: splits")
     return Dataset(

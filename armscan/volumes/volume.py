@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self
@@ -65,6 +66,21 @@ class LabelVolume:
                 f"{self.name}: optimal_action is {self.optimal_action!r}, but it must be a ManipulatorAction or None"
             )
 
+    @classmethod
+    def from_checked(cls, labels: NDArray[np.uint8], *, direction: FloatArray, fingerprint: str, **rest: Any) -> Self:
+        """Return a volume of what an earlier one has checked; its labels are not copied.
+
+        Args:
+            labels: labels of the earlier volume, C-contiguous and not writeable.
+            direction: direction cosines of the earlier volume.
+            fingerprint: `fingerprint` of the earlier volume.
+            **rest: its other arguments.
+        """
+        volume = cls.__new__(cls)
+        direction.flags.writeable = False
+        vars(volume).update(rest, labels=labels, direction=direction, fingerprint=fingerprint)
+        return volume
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         # A copy, or one in another process, is as constant as this one: arrays forget that on their way.
         for array in (state["labels"], state["direction"]):
@@ -93,6 +109,15 @@ class LabelVolume:
         """Physical size n * s along each axis."""
         n_x, n_y, n_z = (n * s for n, s in zip(self.shape, self.spacing, strict=True))
         return n_x, n_y, n_z
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """The SHA-256 of all that an agent can notice of the volume: voxels, spacing and labelled plane."""
+        plane = self.optimal_action
+        rest = (self.shape, self.spacing, None if plane is None else plane.to_array().tolist())
+        digest = hashlib.sha256(repr(rest).encode())
+        digest.update(self.labels.data)
+        return digest.hexdigest()
 
     @cached_property
     def centre_mm(self) -> tuple[float, float, float]:

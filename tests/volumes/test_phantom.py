@@ -5,7 +5,7 @@ import pytest
 
 from armscan.anatomy import TissueClusters, landmark_reward
 from armscan.errors import InvalidValueError
-from armscan.volumes import ManipulatorAction, load_phantom, make_phantom
+from armscan.volumes import ManipulatorAction, load_phantom, load_phantoms, make_phantom
 from armscan.volumes.phantom import cache
 from armscan.volumes.phantom.generate import VERSIONS, Pose
 from armscan.volumes.phantom.tube import RADIUS_X, Tube, Y
@@ -134,7 +134,7 @@ def test_phantom_of_a_seed_is_always_the_same(version):
 def test_versions_have_names_and_files_of_their_own(tmp_path):
     made = [load_phantom(7, tmp_path, each) for each in VERSIONS]
     assert [volume.name for volume in made] == ["phantom-7", "phantom-v2-7"]
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.glob("*.volume"))) == 2
     cache._IN_MEMORY.clear()
     for volume, each in zip(made, VERSIONS, strict=True):
         again = load_phantom(7, tmp_path, each)
@@ -180,12 +180,23 @@ def test_cached_phantom_equals_a_new_one_and_is_not_made_again(tmp_path, monkeyp
 
 def test_damaged_cache_is_replaced(tmp_path):
     made = load_phantom(3, tmp_path)
-    (file,) = tmp_path.iterdir()
-    file.write_bytes(file.read_bytes()[:5000])
+    (file,) = tmp_path.glob("*.volume")
+    sound = file.read_bytes()
+    file.unlink()
+    file.write_bytes(sound[:5000])
     cache._IN_MEMORY.clear()
     np.testing.assert_array_equal(load_phantom(3, tmp_path).labels, made.labels)
-    with np.load(file) as kept:
-        np.testing.assert_array_equal(kept["labels"], made.labels)
+    assert file.read_bytes() == sound
+
+
+def test_phantoms_at_once_are_those_one_by_one_also_where_some_are_there(tmp_path):
+    load_phantom(4, tmp_path)
+    cache._IN_MEMORY.clear()
+    several = load_phantoms([3, 4], tmp_path)
+    assert list(several) == ["phantom-3", "phantom-4"]
+    for seed, volume in zip([3, 4], several.values(), strict=True):
+        assert volume is load_phantom(seed, tmp_path)
+        np.testing.assert_array_equal(volume.labels, make_phantom(seed).labels)
 
 
 @pytest.mark.slow

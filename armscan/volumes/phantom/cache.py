@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from weakref import WeakValueDictionary
 
-import numpy as np
-
 from armscan.errors import InvalidValueError
-from armscan.utils.files import atomic_write, cache_folder
+from armscan.utils.files import cache_folder
+from armscan.volumes.mapped import SUFFIX, mapped_volume, open_mapped
 from armscan.volumes.phantom import generate, tube, varied, wrist
-from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.volume import LabelVolume
 
 # Environments that are made one by one share their phantoms; those that nobody has any more are forgotten.
@@ -23,7 +21,12 @@ _IN_MEMORY: WeakValueDictionary[Path, LabelVolume] = WeakValueDictionary()
 
 def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None, version: int = 1) -> dict[str, LabelVolume]:
     """Return the phantoms of the given seeds by name; see `load_phantom`."""
-    return {volume.name: volume for volume in (load_phantom(seed, cache_dir, version) for seed in seeds)}
+    wanted = list(seeds)
+    with ThreadPoolExecutor() as threads:
+        # Those that are there are checked on all cores; held here until they are returned.
+        there = list(threads.map(lambda seed: _opened(_path(seed, cache_dir, version)), wanted))
+    volumes = [volume or load_phantom(seed, cache_dir, version) for seed, volume in zip(wanted, there, strict=True)]
+    return {volume.name: volume for volume in volumes}
 
 
 def load_phantom(seed: int, cache_dir: Path | None = None, version: int = 1) -> LabelVolume:
@@ -35,36 +38,33 @@ def load_phantom(seed: int, cache_dir: Path | None = None, version: int = 1) -> 
         version: as in `make_phantom`. Default: 1.
 
     Returns:
-        The same volume as `make_phantom(seed, version)`.
+        The same volume as `make_phantom(seed, version)`, its voxels in memory once for all processes.
     """
-    name = generate.phantom_name(seed, version)
-    path = (cache_dir or cache_folder()) / f"{name.removesuffix(str(seed))}{_generator_version()}-{seed}.npz"
-    volume = _IN_MEMORY.get(path)
+    path = _path(seed, cache_dir, version)
+    volume = _opened(path)
     if volume is None:
-        _IN_MEMORY[path] = volume = _read_or_made(path, seed, version)
+        try:
+            volume, _ = mapped_volume(path, lambda: (generate.make_phantom(seed, version), None))
+        except OSError as error:
+            raise InvalidValueError(
+                f"{path.parent}: phantoms cannot be kept there ({error.strerror}); name another folder by "
+                "data.cache_dir or the environment variable ARMSCAN_CACHE"
+            ) from error
+        _IN_MEMORY[path] = volume
     return volume
 
 
-def _read_or_made(path: Path, seed: int, version: int) -> LabelVolume:
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            action = ManipulatorAction.from_array(arrays["optimal_action"])
-            spacing = tuple(arrays["spacing"].tolist())
-            return LabelVolume(arrays["labels"], spacing, generate.phantom_name(seed, version), optimal_action=action)
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
-        # Not there, or damaged: a cached phantom can always be made again.
-        volume = generate.make_phantom(seed, version)
-    assert volume.optimal_action is not None
-    arrays = {"labels": volume.labels, "spacing": volume.spacing, "optimal_action": volume.optimal_action.to_array()}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
-    except OSError as error:
-        raise InvalidValueError(
-            f"{path.parent}: phantoms cannot be kept there ({error.strerror}); name another folder by data.cache_dir "
-            "or the environment variable ARMSCAN_CACHE"
-        ) from error
+def _opened(path: Path) -> LabelVolume | None:
+    """Return a phantom that this process has, or that its file holds."""
+    volume = _IN_MEMORY.get(path)
+    if volume is None and (found := open_mapped(path)) is not None:
+        _IN_MEMORY[path] = volume = found[0]
     return volume
+
+
+def _path(seed: int, cache_dir: Path | None, version: int) -> Path:
+    name = generate.phantom_name(seed, version)
+    return (cache_dir or cache_folder()) / f"{name.removesuffix(str(seed))}{_generator_version()}-{seed}{SUFFIX}"
 
 
 @cache

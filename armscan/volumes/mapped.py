@@ -1,0 +1,169 @@
+"""Volumes kept on disk as plain arrays that processes map, so that a machine holds their voxels once.
+
+A file is a line that says what it is, a line with the SHA-256 of all that follows, a line of JSON, and from the next
+page on the voxels. It is written beside its place and renamed, and checked whole whenever it is opened: a file that is
+damaged, torn or another version's is as good as none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import mmap
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from armscan.errors import InvalidValueError
+from armscan.utils.files import UNFINISHED, atomic_write
+from armscan.utils.log import log
+from armscan.volumes.plane import ManipulatorAction
+from armscan.volumes.volume import LabelVolume
+
+MAGIC = b"armscan volume 1\n"
+SUFFIX = ".volume"
+SHA256_CHARACTERS = 64
+# Of the folder: those that nobody has opened for longest make way. Mapped voxels outlive their file.
+DEFAULT_GIB = 16.0
+LIMIT_VARIABLE = "ARMSCAN_CACHE_GIB"
+# Rather than make what another process is making; one that was stopped meanwhile must not stop all others.
+MOST_WAITED_S = 60.0
+UNFINISHED_FOR_S = 3600.0
+
+Made = tuple[LabelVolume, Any]
+"""A volume, and what else is to be kept of it, as JSON has it."""
+
+
+def mapped_volume(path: Path, make: Callable[[], Made]) -> Made:
+    """Return a volume from its file, made and kept there where there is no sound one.
+
+    Args:
+        path: place of the file; its name says all that the volume depends on.
+        make: makes the volume, and what else is to be kept of it.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    if (found := open_mapped(path)) is not None:
+        return found
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(Timeout):
+            stack.enter_context(FileLock(path.parent / ".volumes.lock", timeout=MOST_WAITED_S))
+        if (found := open_mapped(path)) is not None:
+            return found
+        volume, about = make()
+        atomic_write(path, lambda file: _write(file, volume, about))
+        _make_room(path)
+    return open_mapped(path) or (volume, about)
+
+
+def open_mapped(path: Path) -> Made | None:
+    """Return a volume whose voxels are those of the file itself, and what else was kept; None if there is no sound one.
+
+    Args:
+        path: place of the file.
+    """
+    try:
+        with path.open("rb") as file:
+            contents = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            os.utime(file.fileno())
+        start = len(MAGIC) + SHA256_CHARACTERS + 1
+        digest = hashlib.sha256(memoryview(contents)[start:]).hexdigest()
+        if contents[:start] != MAGIC + digest.encode() + b"\n":
+            return None
+        end = contents.find(b"\n", start) + 1
+        kept = json.loads(contents[start:end])
+    # An empty file cannot be mapped, and JSON of a sound file is what this version has written.
+    except (OSError, ValueError):
+        return None
+    labels = np.frombuffer(contents, np.uint8, offset=_next_page(end))
+    plane = kept["optimal_action"]
+    volume = LabelVolume.from_checked(
+        labels.reshape(kept["shape"]),
+        spacing=tuple(kept["spacing"]),
+        name=kept["name"],
+        optimal_action=None if plane is None else ManipulatorAction.from_array(np.array(plane)),
+        origin=tuple(kept["origin"]),
+        direction=np.array(kept["direction"]),
+        fingerprint=kept["fingerprint"],
+    )
+    return volume, kept["about"]
+
+
+def _write(file: BinaryIO, volume: LabelVolume, about: Any) -> None:
+    plane = volume.optimal_action
+    kept = {
+        "shape": volume.shape,
+        "spacing": volume.spacing,
+        "name": volume.name,
+        "optimal_action": None if plane is None else plane.to_array().tolist(),
+        "origin": volume.origin,
+        "direction": volume.direction.tolist(),
+        "fingerprint": volume.fingerprint,
+        "about": about,
+    }
+    line = json.dumps(kept).encode() + b"\n"
+    length = len(MAGIC) + SHA256_CHARACTERS + 1 + len(line)
+    head = line + bytes(_next_page(length) - length)
+    digest = hashlib.sha256(head)
+    digest.update(volume.labels.data)
+    file.write(MAGIC + digest.hexdigest().encode() + b"\n" + head)
+    file.write(volume.labels.data)
+
+
+def _next_page(n_bytes: int) -> int:
+    return -(-n_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
+
+
+def _make_room(kept: Path) -> None:
+    """Remove files that nobody has opened for longest until the folder is within its limit, and those of the killed."""
+    limit = limit_bytes()
+    for unfinished in kept.parent.glob(f".*{SUFFIX}.*.{UNFINISHED}"):
+        with contextlib.suppress(OSError):
+            if unfinished.stat().st_mtime < time.time() - UNFINISHED_FOR_S:
+                unfinished.unlink()
+    files = []
+    for file in kept.parent.glob(f"*{SUFFIX}"):
+        with contextlib.suppress(OSError):
+            files.append((file.stat().st_mtime, file.stat().st_size, file))
+    n_bytes = sum(size for _, size, _ in files)
+    for _, size, file in sorted(files):
+        if n_bytes <= limit:
+            break
+        if file != kept:
+            file.unlink(missing_ok=True)
+            n_bytes -= size
+
+
+def limit_bytes() -> float:
+    """Return how large a folder of volumes may become: `$ARMSCAN_CACHE_GIB`, default: 16.
+
+    Raises:
+        InvalidValueError: if that is no number of 0 or more.
+    """
+    word = os.environ.get(LIMIT_VARIABLE) or str(DEFAULT_GIB)
+    try:
+        gib = float(word)
+    except ValueError:
+        gib = -1.0
+    if not gib >= 0.0:
+        raise InvalidValueError(
+            f"the environment variable {LIMIT_VARIABLE} is {word!r}, but it must be a number of GiB, 0 or more"
+        )
+    return gib * 2**30
+
+
+def kept_if_possible(path: Path, make: Callable[[], Made]) -> Made:
+    """Return a volume as `mapped_volume` does, or one of this process alone where the file cannot be written."""
+    try:
+        return mapped_volume(path, make)
+    except OSError as error:
+        log(f"{path.parent}: volumes cannot be kept there ({error.strerror}), so that each process holds its own")
+        return make()

@@ -1,0 +1,103 @@
+"""Labelmaps that were read, kept in the machine's cache: read once, and in memory once for all processes."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from armscan.utils.files import cache_folder
+from armscan.volumes import (
+    header_checks,
+    labelmap,
+    nifti_header,
+    orientation,
+    reading,
+    resampling,
+    segmentation,
+    stored_voxels,
+    summary,
+    volume,
+)
+from armscan.volumes.header_checks import TEXT_HEADER_BYTES
+from armscan.volumes.mapped import SUFFIX, Made, kept_if_possible
+from armscan.volumes.plane import ManipulatorAction
+from armscan.volumes.resampling import Spacing, resample
+from armscan.volumes.summary import StoredFile
+from armscan.volumes.volume import LabelVolume
+
+# What volumes are made by: changed code never meets what the old one has read.
+CODE = (
+    *(header_checks, labelmap, nifti_header, orientation, reading, resampling, segmentation, stored_voxels, summary),
+    volume,
+)
+# A text header that says so has its voxels in another file, or may have.
+ELSEWHERE = {
+    "nrrd": re.compile(rb"(?im)^data ?file"),
+    "mha": re.compile(rb"\A(?!.*^ElementDataFile *= *LOCAL *\r?\n)", re.DOTALL | re.MULTILINE | re.IGNORECASE),
+}
+ELSEWHERE["mhd"] = ELSEWHERE["mha"]
+
+
+def read_kept(
+    path: Path, options: reading.ReadingOptions, optimal_action: ManipulatorAction | None
+) -> tuple[LabelVolume, StoredFile]:
+    """Read a volume as `read_stored` does, or find it in the cache.
+
+    It is found by the contents of its file and all that it is read with. A file that leaves its voxels to another one
+    is read anew.
+
+    Args:
+        path: file of the volume.
+        options: how it is read.
+        optimal_action: labelled plane, in the volume's frame.
+    """
+    from pydantic import TypeAdapter
+
+    if (digest := _digest(path)) is None:
+        return reading.read_stored(path, options, optimal_action=optimal_action)
+    details = TypeAdapter(StoredFile)
+
+    def make() -> Made:
+        made, stored = reading.read_stored(path, options, optimal_action=optimal_action)
+        return made, details.dump_python(stored, mode="json")
+
+    found, stored = kept_if_possible(_place("labelmap", path.name, digest, options, optimal_action), make)
+    return found, details.validate_python(stored)
+
+
+def resample_kept(labelled: LabelVolume, spacing: Spacing) -> LabelVolume:
+    """Resample a volume as `resample` does, or find it in the cache."""
+    way_back = labelled.origin, labelled.direction.tolist()
+    path = _place("resampled", labelled.name, labelled.fingerprint, way_back, spacing)
+    return kept_if_possible(path, lambda: (resample(labelled, spacing), None))[0]
+
+
+def _digest(path: Path) -> str | None:
+    """Return the SHA-256 of a file that holds its voxels itself; None for others, and for those that cannot be read."""
+    try:
+        with path.open("rb") as file:
+            elsewhere = ELSEWHERE.get(path.suffix[1:])
+            if elsewhere is not None and elsewhere.search(file.read(TEXT_HEADER_BYTES)):
+                return None
+            file.seek(0)
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    # Reading says what is wrong with it.
+    except (OSError, ValueError):
+        return None
+
+
+def _place(kind: str, *depends_on: Any) -> Path:
+    key = hashlib.sha256(repr((_code_version(), depends_on)).encode()).hexdigest()
+    return cache_folder() / f"{kind}-{key}{SUFFIX}"
+
+
+@cache
+def _code_version() -> str:
+    digest = hashlib.sha256(version("SimpleITK").encode())
+    for module in CODE:
+        digest.update(Path(str(module.__file__)).read_bytes())
+    return digest.hexdigest()

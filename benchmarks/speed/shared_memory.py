@@ -1,0 +1,83 @@
+"""Memory of several workers that train on the same phantoms, and how soon they have them.
+
+    python -m benchmarks.speed.shared_memory [WORKERS] [PHANTOMS]
+
+Default: 8 workers, 128 phantoms. Each builds a default SAC learner, its environments and all that a training imports,
+takes some steps and gradient steps, and reads every voxel. What counts is the proportional set size of all together
+(PSS: a page that several processes map counts for each by its share), which no page counts twice in.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import time
+from functools import partial
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from typing import Any
+
+from armscan.volumes import load_phantoms
+
+N_STEPS = 400
+
+
+def pss_bytes() -> int:
+    """Return the proportional set size of this process."""
+    lines = Path(f"/proc/{os.getpid()}/smaps_rollup").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("Pss:"))
+
+
+def work(n_phantoms: int, together: Barrier, answers: Any) -> None:
+    """Train for a moment; report bytes and the seconds until the phantoms were there."""
+    import mlflow  # noqa: F401
+
+    from armscan.agents import MLP, SAC, AgentSetup, Compute
+    from armscan.envs import EnvFactory
+
+    together.wait()
+    start_s, start_cpu_s = time.perf_counter(), time.process_time()
+    volumes = load_phantoms(range(n_phantoms))
+    seconds, cpu_seconds = time.perf_counter() - start_s, time.process_time() - start_cpu_s
+    env_factory = EnvFactory(projection="y")
+    setup = AgentSetup(
+        make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
+        observation_space=env_factory.make_env(volumes).observation_space,
+        action_names=("ty",),
+        total_env_steps=20_000,
+        seed=0,
+        compute=Compute("cpu"),
+    )
+    learner = SAC(network=MLP((64, 64)), learning_starts=N_STEPS).agent(setup)
+    learner.warm_up()
+    learner.learn(N_STEPS)
+    assert all(volume.labels.max() == 4 for volume in volumes.values())
+    together.wait()
+    answers.put((pss_bytes(), seconds, cpu_seconds))
+    together.wait()
+
+
+def main(words: list[str]) -> None:
+    """Print the table."""
+    n_workers, n_phantoms = (int(word) for word in (*words, *("8", "128")[len(words) :]))
+    n_voxels = sum(volume.labels.size for volume in load_phantoms(range(n_phantoms)).values())
+    context = multiprocessing.get_context("spawn")
+    together, answers = context.Barrier(n_workers), context.Queue()
+    workers = [context.Process(target=work, args=(n_phantoms, together, answers)) for _ in range(n_workers)]
+    for worker in workers:
+        worker.start()
+    reports = [answers.get() for _ in workers]
+    for worker in workers:
+        worker.join()
+    n_bytes = sum(pss for pss, _, _ in reports)
+    allowed = 1.3 * n_voxels + n_workers * 700 * 2**20
+    print("| workers | phantoms | MiB of voxels | PSS of all, MiB | allowed | s until they are there | processor s |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    slowest, dearest = max(seconds for _, seconds, _ in reports), max(cpu for _, _, cpu in reports)
+    figures = " | ".join(f"{figure / 2**20:.0f}" for figure in (n_voxels, n_bytes, allowed))
+    print(f"| {n_workers} | {n_phantoms} | {figures} | {slowest:.2f} | {dearest:.2f} |")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
