@@ -258,7 +258,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["+foo=1"], "there is no key 'foo' at the top, but only data, obs, "),
         (["+evaluation.seed=4"], "there is no key 'seed' in evaluation, but only episodes"),
         (["network.images=null"], "network.images is None, but it must have the methods of Network"),
-        (["agent.network=mlp"], "network is 'mlp', but it must have the methods of Network, chosen_for first; on the"),
+        (["agent.network=mlp"], "network is 'mlp', but it must have the methods of Network, for_space first; on the"),
         (["agent._target_=builtins.dict"], "agent is {"),
         (["compute.precision=half"], "compute.precision is 'half', but it must be float32 or bfloat16"),
         (

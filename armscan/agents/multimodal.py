@@ -50,8 +50,8 @@ class Multimodal:
             for name, sizes in (("vector_sizes", vector_sizes), ("head_sizes", head_sizes))
         )
 
-    def chosen_for(self, observation_space: spaces.Space[Any]) -> Multimodal:
-        """See `NetworkChoice.chosen_for`."""
+    def for_space(self, observation_space: spaces.Space[Any]) -> Multimodal:
+        """See `NetworkChoice.for_space`."""
         images = images_of(observation_space)
         if not images:
             raise InvalidValueError(

@@ -26,7 +26,7 @@ ACTIVATIONS = {"relu": "ReLU", "tanh": "Tanh", "elu": "ELU", "gelu": "GELU"}
 class NetworkChoice(Protocol):
     """Chooses the network by the observation."""
 
-    def chosen_for(self, observation_space: spaces.Space[Any]) -> Network:
+    def for_space(self, observation_space: spaces.Space[Any]) -> Network:
         """Return the network for such observations; a network returns itself, if it can take them.
 
         Raises:
@@ -67,8 +67,8 @@ class MLP:
         )
         self.activation = ACTIVATIONS[check_choice("network.activation", activation, list(ACTIVATIONS))]
 
-    def chosen_for(self, observation_space: spaces.Space[Any]) -> MLP:
-        """See `NetworkChoice.chosen_for`."""
+    def for_space(self, observation_space: spaces.Space[Any]) -> MLP:
+        """See `NetworkChoice.for_space`."""
         if not is_vector(observation_space):
             raise InvalidValueError(
                 "network is mlp, which takes one vector, but the observation has the parts "
@@ -103,10 +103,10 @@ class NetworkByObservation:
         self.vector = check_network(vector, "network.vector")
         self.images = check_network(images, "network.images")
 
-    def chosen_for(self, observation_space: spaces.Space[Any]) -> Network:
-        """See `NetworkChoice.chosen_for`."""
+    def for_space(self, observation_space: spaces.Space[Any]) -> Network:
+        """See `NetworkChoice.for_space`."""
         chosen = self.vector if is_vector(observation_space) else self.images
-        return chosen.chosen_for(observation_space)
+        return chosen.for_space(observation_space)
 
 
 def is_vector(space: spaces.Space[Any]) -> bool:
@@ -120,10 +120,10 @@ def check_network(network: NetworkChoice, name: str = "network") -> NetworkChoic
     Raises:
         InvalidValueError: if it cannot say which network takes an observation.
     """
-    if isinstance(network, type) or not callable(getattr(network, "chosen_for", None)):
+    if isinstance(network, type) or not callable(getattr(network, "for_space", None)):
         by_name = f"; on the command line network={network} chooses one by its name" if isinstance(network, str) else ""
         raise InvalidValueError(
-            f"{name} is {network!r}, but it must have the methods of Network, chosen_for first{by_name}"
+            f"{name} is {network!r}, but it must have the methods of Network, for_space first{by_name}"
         )
     return network
 

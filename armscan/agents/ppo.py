@@ -66,7 +66,7 @@ class PPO(PolicyParameters):
             InvalidValueError: if the training is shorter than a collection, a collection too small for a batch, or the
                 network cannot take the observations.
         """
-        network = self.network.chosen_for(setup.observation_space)
+        network = self.network.for_space(setup.observation_space)
         n_collected = check_collection(self.env_steps_per_collection, self.num_envs, setup)
         check_batch(self.batch_size, n_collected, "the environment steps of a collection")
         return self._learner(setup, network, n_collected)

@@ -50,7 +50,7 @@ class Regression(Parameters):
             InvalidValueError: if the training takes too few steps to learn anything, or the network cannot take the
                 observations.
         """
-        network = self.network.chosen_for(setup.observation_space)
+        network = self.network.for_space(setup.observation_space)
         if self.num_envs > setup.total_env_steps:
             raise InvalidValueError(
                 f"agent.num_envs is {self.num_envs}, but it must be at most training.env_steps = "

@@ -68,7 +68,7 @@ class SAC(PolicyParameters):
             InvalidValueError: if the training takes too few steps to learn anything, or the network cannot take the
                 observations.
         """
-        network = self.network.chosen_for(setup.observation_space)
+        network = self.network.for_space(setup.observation_space)
         n_random = round_up(self.learning_starts, self.num_envs)
         if n_random >= setup.total_env_steps:
             raise InvalidValueError(

@@ -22,7 +22,7 @@ THIRD = 1 / 3
 class Reward(Protocol):
     """Scores slices; implement both methods to make one's own."""
 
-    def fitted_to(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Reward:
+    def fit(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Reward:
         """Return the reward with what it takes from labelled planes of training volumes, if it has nothing yet.
 
         `tissues` says how what they show is clustered.
@@ -50,7 +50,7 @@ class LandmarkReward:
     def __init__(self, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
         self.targets = check_targets(targets)
 
-    def fitted_to(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Self:
+    def fit(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Self:
         """Return the reward as it is: it takes nothing from volumes."""
         return self
 
@@ -103,8 +103,8 @@ class AgreementReward(LandmarkReward):
         self.slack_mm = check_float("slack_mm", slack_mm, at_least=0.0, at_most=1000.0)
         self._ranges: list[Range] | None = None
 
-    def fitted_to(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Self:
-        """See `Reward.fitted_to`.
+    def fit(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Self:
+        """See `Reward.fit`.
 
         Raises:
             OptimalPlaneError: if a volume has no labelled plane, or a tissue has no cluster on it.
@@ -132,7 +132,7 @@ class AgreementReward(LandmarkReward):
             InvalidValueError: if the reward has not been fitted to volumes.
         """
         if self._ranges is None:
-            raise InvalidValueError("the reward has no ranges yet: call fitted_to(volumes) with the training volumes")
+            raise InvalidValueError("the reward has no ranges yet: call fit(volumes) with the training volumes")
         costs = 0.0
         for feature, range_ in zip(_features(landmarks, pixel_mm), self._ranges, strict=True):
             costs += 1.0 if feature is None else range_.cost(feature)

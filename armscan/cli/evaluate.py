@@ -66,7 +66,7 @@ OPTIONS = {
     "--out",
     type=FILE_PATH,
     metavar="PATH",
-    help="JSON file of metrics and episodes, or folder of the video.  [default: in evaluations or films]",
+    help="JSON file of metrics and episodes, or folder of the video.  [default: in evaluations or videos]",
 )
 @click.option(
     "--success-threshold", type=click.FloatRange(0, 1, min_open=True), help="End episodes above minus this reward."
@@ -134,14 +134,14 @@ def evaluate(
     if tracking_experiment is not None:
         store["experiment"] = tracking_experiment
     if agent is None:
-        subject = evaluation.agent_of_run(tracking, run[0], changes, trust=trust)
+        source = evaluation.agent_of_run(tracking, run[0], changes, trust=trust)
     else:
         import_from_here()
-        subject = evaluation.agent_of_overrides(overrides, folder, changes)
+        source = evaluation.agent_of_overrides(overrides, folder, changes)
     if video:
-        applied = apply(subject, data, phantoms, render_mode="rgb_array")
+        applied = apply(source, data, phantoms, render_mode="rgb_array")
     else:
-        applied = apply(subject, data, phantoms, check=lambda groups: _check_episodes(n_episodes, groups))
+        applied = apply(source, data, phantoms, check=lambda groups: _check_episodes(n_episodes, groups))
     if video:
         from armscan.evaluation.video import record_video
         from armscan.experiment.console import from_here

@@ -38,12 +38,12 @@ class EnvFactory:
             raise InvalidValueError(f"env has no rule {unknown[0]!r}, but only {listed(allowed)}")
         self.rules = rules
 
-    def fitted_to(self, volumes: Mapping[str, LabelVolume]) -> EnvFactory:
+    def fit(self, volumes: Mapping[str, LabelVolume]) -> EnvFactory:
         """Return a factory whose reward is fitted to these volumes; its environments may have other volumes."""
         tissues = check_tissues(self.rules.get("clustering", "pixels"))
         reward = check_reward(self.rules.get("reward"), self.rules.get("targets", PUBLISHED_TARGETS))
         return EnvFactory(
-            **self.rules | {"reward": reward.fitted_to(volumes.values(), tissues), "targets": PUBLISHED_TARGETS}
+            **self.rules | {"reward": reward.fit(volumes.values(), tissues), "targets": PUBLISHED_TARGETS}
         )
 
     def undeformed(self) -> EnvFactory:

@@ -69,7 +69,7 @@ class Rules:
         self.max_steps = check_int("max_steps", max_steps, at_least=1)
         self.start = check_choice("start", start, STARTS)
         self.tissues = check_tissues(clustering)
-        self.reward = check_reward(reward, targets).fitted_to(self.volumes.values(), self.tissues)
+        self.reward = check_reward(reward, targets).fit(self.volumes.values(), self.tissues)
         rotation = check_numbers("rotation_bounds_deg", rotation_bounds_deg, 2, "for rz and rx")
         if translation_bounds_mm is not None:
             translation = check_numbers("translation_bounds_mm", translation_bounds_mm, 2, "for tx and ty")
@@ -223,6 +223,6 @@ def check_reward(reward: Reward | None, targets: Sequence[int]) -> Reward:
         return LandmarkReward(targets)
     if targets != PUBLISHED_TARGETS:
         raise InvalidValueError(f"targets is {targets} beside a reward of its own, but only one of both may be given")
-    if isinstance(reward, type) or not all(callable(getattr(reward, name, None)) for name in ("fitted_to", "score")):
+    if isinstance(reward, type) or not all(callable(getattr(reward, name, None)) for name in ("fit", "score")):
         raise InvalidValueError(f"reward is {reward!r}, but it must be an object with the methods of Reward")
     return reward

@@ -18,7 +18,7 @@ from armscan.experiment.build import apply_crop, make_agent, make_env_factory, o
 from armscan.tracking import FoundRun
 from armscan.training import PARTS, Evaluation, Split, TrainingDomain, evaluate, evaluate_baselines
 from armscan.training.domain import smallest_slice
-from armscan.training.rollout import Env
+from armscan.training.evaluation import Env
 
 # First seed of an evaluation's episodes: none of them is played by a run, whose seeds lie below.
 FIRST_SEED = 5 * 10**6
@@ -31,14 +31,14 @@ class PreparedAgent:
     """An agent that is ready to play on volumes.
 
     Args:
-        subject: the agent's configuration and weights.
+        source: the agent's configuration and weights.
         agent: the agent with its weights.
         envs: its environments, by what their volumes are called.
         notes: differences from its training, one sentence each.
         data: the folder of the volumes, `phantom`, or None for the volumes of the agent's own configuration.
     """
 
-    subject: TrainedAgent
+    source: TrainedAgent
     agent: Agent
     envs: dict[str, Env]
     notes: tuple[str, ...]
@@ -59,7 +59,7 @@ class PreparedAgent:
         """
         evaluations: dict[str, Evaluation] = {}
         baselines: dict[str, dict[str, Evaluation]] = {}
-        on_plane = on_plane_of(self.subject.config)
+        on_plane = on_plane_of(self.source.config)
         for label, env in self.envs.items():
             tell(f"playing {n_episodes} episodes on {len(env.get_wrapper_attr('volumes'))} {label}")
             how = {"n_episodes": n_episodes, "seed": FIRST_SEED + seed}
@@ -70,7 +70,7 @@ class PreparedAgent:
 
 
 def apply(
-    subject: TrainedAgent,
+    source: TrainedAgent,
     data: str | None,
     n_phantoms: int,
     *,
@@ -80,7 +80,7 @@ def apply(
     """Bring an agent to volumes, and print what differs from its training.
 
     Args:
-        subject: the agent.
+        source: the agent.
         data: a folder of volumes, `phantom`, or None for the volumes of the agent's own configuration.
         n_phantoms: number of phantoms, at least 1; used for `phantom` only.
         check: raises an error if the volumes, by their labels, do not suit the caller.
@@ -91,14 +91,14 @@ def apply(
     """
     # Elsewhere, of an agent's own volumes only those matter that its reward is fitted to.
     parts = ("training",) if data else PARTS
-    own = cache(partial(own_split, subject, parts))
+    own = cache(partial(own_split, source, parts))
     groups = volume_groups(data, n_phantoms, own)
     check(groups)
-    prepared = prepare(subject, groups, own, render_mode=render_mode)
+    prepared = prepare(source, groups, own, render_mode=render_mode)
     notes = list(prepared.notes)
-    if data and subject.run:
-        notes += known_volumes(subject, groups)
-    if subject.run and subject.volumes is None and own.cache_info().currsize:
+    if data and source.run:
+        notes += known_volumes(source, groups)
+    if source.run and source.volumes is None and own.cache_info().currsize:
         notes.append("the run has not kept fingerprints of its volumes: nobody knows whether these are still the same")
     for note in notes:
         print(f"note: {note}")
@@ -106,12 +106,12 @@ def apply(
 
 
 def prepare(
-    subject: TrainedAgent, groups: Mapping[str, Volumes], own: Callable[[], Split], *, render_mode: str | None = None
+    source: TrainedAgent, groups: Mapping[str, Volumes], own: Callable[[], Split], *, render_mode: str | None = None
 ) -> PreparedAgent:
     """Make the agent and its environments on the volumes that it is evaluated on.
 
     Args:
-        subject: the agent's configuration and weights.
+        source: the agent's configuration and weights.
         groups: the volumes, by what they are called.
         own: reads the agent's own volumes; called only where its reward is fitted to those that it was trained on.
         render_mode: Gymnasium render mode of the environments; default: None.
@@ -121,26 +121,26 @@ def prepare(
     """
     envs: dict[str, Env] = {}
     notes: list[str] = []
-    trained = subject.domain
+    trained = source.domain
     agent = None
     for label, volumes in groups.items():
-        config = subject.config
+        config = source.config
         if trained is not None:
             config = apply_crop(config, trained.slice_px, smallest_slice(volumes.values()))
         env_factory = make_env_factory(config, TrainingVolumes(own))
         envs[label] = _env(env_factory, volumes, config.env.clustering, render_mode)
         here = TrainingDomain.of(envs[label])
-        if subject.domain is not None:
-            notes += [f"{label}: {difference}" for difference in subject.domain.differences(here)]
+        if source.domain is not None:
+            notes += [f"{label}: {difference}" for difference in source.domain.differences(here)]
         # Of a run that has not kept what its agent was trained on, all volumes must at least look alike.
         trained = trained or here
         trained.check_observed(here)
         if agent is None:
             budget = int(config.training.env_steps)
             agent = make_agent(config, env_factory, volumes, total_env_steps=budget, seed=int(config.seed))
-            _load_weights(agent, subject)
+            _load_weights(agent, source)
     assert agent is not None
-    return PreparedAgent(subject, agent, envs, tuple(notes))
+    return PreparedAgent(source, agent, envs, tuple(notes))
 
 
 def _env(env_factory: EnvFactory, volumes: Volumes, clustering: object, render_mode: str | None) -> Env:
@@ -162,18 +162,18 @@ def _env(env_factory: EnvFactory, volumes: Volumes, clustering: object, render_m
         ) from error
 
 
-def _load_weights(agent: Agent, subject: TrainedAgent) -> None:
+def _load_weights(agent: Agent, source: TrainedAgent) -> None:
     if not isinstance(agent, Learner):
         return
-    if subject.run is None:
-        raise InvalidValueError(f"{subject.name} has to be trained first: give the RUN that has trained one")
-    if subject.weights is None:
-        raise CheckpointError(_without_checkpoint(subject.run))
+    if source.run is None:
+        raise InvalidValueError(f"{source.name} has to be trained first: give the RUN that has trained one")
+    if source.weights is None:
+        raise CheckpointError(_without_checkpoint(source.run))
     try:
-        agent.load_weights(subject.weights)
+        agent.load_weights(source.weights)
     except CheckpointError as error:
         # torch lists every name that it misses, and every one that it does not know.
-        raise CheckpointError(f"run {subject.run.run_id}: {shorten(str(error), MAX_REASON_CHARS)}") from error
+        raise CheckpointError(f"run {source.run.run_id}: {shorten(str(error), MAX_REASON_CHARS)}") from error
 
 
 def _without_checkpoint(run: FoundRun) -> str:

@@ -48,18 +48,18 @@ def evaluate_and_track(
     Raises:
         ArmscanError: if the report cannot be written or tracked.
     """
-    subject = applied.subject
+    source = applied.source
     _check_out(out)
-    if subject.run is not None:
-        client, experiment_id = subject.run.client, subject.run.experiment_id
+    if source.run is not None:
+        client, experiment_id = source.run.client, source.run.experiment_id
         check_artifacts(client, experiment_id)
     else:
         client, experiment_id = open_store(**store)
     deliver_pending(client)
-    of, data = subject.run.run_id if subject.run else subject.name, data_name(applied.data)
+    of, data = source.run.run_id if source.run else source.name, data_name(applied.data)
     facts = {
         "of": of,
-        "name": subject.name,
+        "name": source.name,
         "data": applied.data or data,
         "episodes_a_split": n_episodes,
         "seed": seed,
@@ -69,11 +69,11 @@ def evaluate_and_track(
     with TrackedRun.start(
         client,
         experiment_id,
-        name=f"evaluation: {subject.name} on {data}",
-        config={**to_plain(subject.config), "evaluation": facts},
+        name=f"evaluation: {source.name} on {data}",
+        config={**to_plain(source.config), "evaluation": facts},
         tags={EVALUATED_TAG: of},
         folder=FOLDER,
-        parent_id=subject.run.run_id if subject.run else None,
+        parent_id=source.run.run_id if source.run else None,
     ) as tracked:
         evaluations, baselines = applied.evaluate(n_episodes, seed, tell=partial(print, flush=True))
         # An agent's own training and test volumes are never merged into one total.
@@ -85,8 +85,8 @@ def evaluate_and_track(
         )
         for group, metrics in report.metrics().items():
             named = {f"{group}/{name}": value for name, value in metrics.items()}
-            tracked.log_metrics(named, n_env_steps=subject.n_env_steps)
-        own = FOLDER / f"{file_name(f'{subject.name}-{data}')}-{tracked.run_id[:8]}{SUFFIX}"
+            tracked.log_metrics(named, n_env_steps=source.n_env_steps)
+        own = FOLDER / f"{file_name(f'{source.name}-{data}')}-{tracked.run_id[:8]}{SUFFIX}"
         file = out or own
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, lambda opened: opened.write(text.encode()), follow_link=True)

@@ -12,7 +12,7 @@ from armscan.evaluation.volumes import check_out, data_name, file_name
 from armscan.training import TEST, VideoRecorder, outcome
 from armscan.utils.files import atomic_write
 
-FOLDER = Path("films")
+FOLDER = Path("videos")
 SUFFIXES = (".gif", ".mp4")
 
 
@@ -23,22 +23,22 @@ def record_video(applied: PreparedAgent, *, n_episodes: int, seed: int, out: Pat
         applied: the agent on its volumes; of its own volumes, only the test volumes are shown.
         n_episodes: number of episodes for each group of volumes.
         seed: seed of the first episode; the others follow from it.
-        out: the folder of the files. Default: `films`.
+        out: the folder of the files. Default: `videos`.
 
     Returns:
         The GIF and the MP4.
     """
     folder = out or FOLDER
     check_out(folder / "video", folder, "video")
-    subject = applied.subject
-    which = [subject.run.run_id[:8]] if subject.run else []
-    name = file_name("-".join([subject.name, data_name(applied.data), *which, f"seed{seed}"]))
+    source = applied.source
+    which = [source.run.run_id[:8]] if source.run else []
+    name = file_name("-".join([source.name, data_name(applied.data), *which, f"seed{seed}"]))
     files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
     with tempfile.TemporaryDirectory() as made_in:
         made = [Path(made_in) / f"video{suffix}" for suffix in SUFFIXES]
         _record(applied, n_episodes, seed, *made)
-        for source, file in zip(made, files, strict=True):
-            with source.open("rb") as contents:
+        for recorded, file in zip(made, files, strict=True):
+            with recorded.open("rb") as contents:
                 atomic_write(file, partial(shutil.copyfileobj, contents), follow_link=True)
     return files
 

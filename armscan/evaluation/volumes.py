@@ -23,20 +23,20 @@ PHANTOMS_FIRST_SEED = 3_000_000
 Volumes = dict[str, LabelVolume]
 
 
-def own_split(subject: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
+def own_split(source: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
     """Read an agent's own volumes: those that its configuration describes.
 
     Args:
-        subject: the agent.
+        source: the agent.
         parts: parts of the split that matter: in these the volumes of a run must be those that it was started with.
 
     Raises:
         ChangedVolumesError: if they are not.
         InvalidValueError: if they cannot be read.
     """
-    run = subject.run
+    run = source.run
     try:
-        split: Split = instantiate(subject.config.data, _convert_="object")
+        split: Split = instantiate(source.config.data, _convert_="object")
     # Hydra wraps exceptions raised by constructors.
     except Exception as error:
         line = one_line_message(error)
@@ -46,9 +46,9 @@ def own_split(subject: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
             f"the volumes of run {run.run_id} cannot be read: {line} (it was started in "
             f"{run.tags.get('working_folder', 'a folder that was not kept')} on {run.tags.get('host', 'some host')})"
         ) from error
-    if run is not None and subject.volumes is not None:
+    if run is not None and source.volumes is not None:
         now = {part: prints for part, prints in split.fingerprints().items() if part in parts}
-        check_unchanged(subject.volumes, now, f"run {run.run_id} was started with")
+        check_unchanged(source.volumes, now, f"run {run.run_id} was started with")
     return split
 
 
@@ -94,28 +94,28 @@ def check_out(file: Path, out: Path | None, what: str) -> None:
         raise InvalidValueError(f"--out is {named!r}, but no {what} can be written there: {error.strerror}") from error
 
 
-def known_volumes(subject: TrainedAgent, groups: Mapping[str, Volumes]) -> list[str]:
+def known_volumes(source: TrainedAgent, groups: Mapping[str, Volumes]) -> list[str]:
     """Return a sentence for each purpose that an agent's run has had these volumes for, or others of these names.
 
     Args:
-        subject: the agent of a run.
+        source: the agent of a run.
         groups: the volumes, by what they are called.
     """
-    assert subject.run is not None
+    assert source.run is not None
     volumes = {name: volume for group in groups.values() for name, volume in group.items()}
-    prints = {name: fingerprint(volume) for name, volume in volumes.items()} if subject.volumes else {}
+    prints = {name: fingerprint(volume) for name, volume in volumes.items()} if source.volumes else {}
     notes = []
     for part, what in (
         ("training", "the agent was trained on"),
         ("validation", "the agent's checkpoint was chosen on"),
     ):
-        had = (subject.volumes or {}).get(part, {})
+        had = (source.volumes or {}).get(part, {})
         names_of = {print_: name for name, print_ in had.items()}
         same = {name: names_of[print_] for name, print_ in prints.items() if print_ in names_of}
         if same:
             shown = (name if name == there else f"{name} (there {there})" for name, there in same.items())
             notes.append(f"{what} these volumes: {', '.join(shown)}")
-        names = had or subject.run.tags.get(f"volumes.{part}", "").split(" ")
+        names = had or source.run.tags.get(f"volumes.{part}", "").split(" ")
         if others := [name for name in volumes if name in names and name not in same]:
             which = "other volumes" if had else "volumes"
             notes.append(f"{what} {which} of these names: {', '.join(others)}")

@@ -26,7 +26,7 @@ from armscan.training import (
     check_on_plane,
 )
 from armscan.training.domain import smallest_slice, with_crops
-from armscan.training.rollout import Env
+from armscan.training.evaluation import Env
 from armscan.utils.log import silence_library_warnings
 from armscan.utils.validation import check_int, check_seed
 from armscan.volumes import LabelVolume
@@ -185,7 +185,7 @@ def apply_crop(config: DictConfig, trained_px: tuple[int, int], here_px: tuple[i
 def make_env_factory(config: DictConfig, training: Mapping[str, LabelVolume]) -> EnvFactory:
     """Return the factory of environments, its reward fitted to the training volumes."""
     env_factory: EnvFactory = instantiate(config.env, _convert_="object")
-    return env_factory.fitted_to(training)
+    return env_factory.fit(training)
 
 
 def make_agent(

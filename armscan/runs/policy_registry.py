@@ -41,19 +41,19 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
     Raises:
         ArmscanError: if there is no such run, its agent does not learn, or its checkpoint or volumes are missing.
     """
-    subject = agent_of_run(tracking, run_id, {}, trust=trust)
-    assert subject.run is not None
+    source = agent_of_run(tracking, run_id, {}, trust=trust)
+    assert source.run is not None
     # A policy answers as the agent was evaluated: with its most likely action, on the CPU.
-    subject.config.compute.update(PLAIN_COMPUTE)
-    if "deterministic_eval" in subject.config.agent:
-        subject.config.agent.deterministic_eval = True
-    own = cache(partial(own_split, subject, ("training", "test")))
-    evaluator = prepare(subject, {TEST: own().test}, own)
+    source.config.compute.update(PLAIN_COMPUTE)
+    if "deterministic_eval" in source.config.agent:
+        source.config.agent.deterministic_eval = True
+    own = cache(partial(own_split, source, ("training", "test")))
+    evaluator = prepare(source, {TEST: own().test}, own)
     if not isinstance(evaluator.agent, Learner):
         raise InvalidValueError(f"run is {run_id!r}, but its agent does not learn and has no policy")
     env = evaluator.envs[TEST]
-    make_model(evaluator.agent, env, folder, facts_of(to_plain(subject.config), env, subject.run.run_id))
-    return subject.run
+    make_model(evaluator.agent, env, folder, facts_of(to_plain(source.config), env, source.run.run_id))
+    return source.run
 
 
 def register_policy(tracking: str, run_id: str, name: str, *, trust: bool = False) -> str:

@@ -1,4 +1,4 @@
-"""One training: splits, rollouts, checkpoints, callbacks, progress, video."""
+"""One training: splits, episodes and what they add up to, checkpoints, callbacks, progress, video."""
 
 from armscan.training.baselines import evaluate_baselines
 from armscan.training.callbacks import Callback, EpochReport
@@ -6,11 +6,11 @@ from armscan.training.checkpoint import load_checkpoint, load_weights, save_chec
 from armscan.training.checkpointing import CheckpointProvenance, resume_from_checkpoint
 from armscan.training.domain import TrainingDomain
 from armscan.training.episodes import evaluate
+from armscan.training.evaluation import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint, fingerprints_in
 from armscan.training.metrics import MetricEstimates
 from armscan.training.on_plane import ON_PLANE, OnPlane, check_on_plane
 from armscan.training.result_table import ResultTable
-from armscan.training.rollout import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation
 from armscan.training.splits import PARTS, Split, mixed_data, nifti_data, phantom_data
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
 from armscan.training.video import VideoRecorder, outcome, record_episode

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from armscan.training.rollout import Evaluation
+from armscan.training.evaluation import Evaluation
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -57,8 +57,8 @@ def distances_of_accepted(
 def main(folder: str) -> None:
     """Print the table."""
     split = mixed_data(folder, n_training=64, n_validation=1, n_test=12)
-    fitted = AgreementReward().fitted_to(split.training.values())
-    tight = AgreementReward(slack=0.0, slack_mm=0.0).fitted_to(split.training.values())
+    fitted = AgreementReward().fit(split.training.values())
+    tight = AgreementReward(slack=0.0, slack_mm=0.0).fit(split.training.values())
     rewards = {
         "every plane drawn": (lambda _: LandmarkReward(), np.inf),
         "published, success threshold 0.05": (lambda _: LandmarkReward(), 0.05),
@@ -66,7 +66,7 @@ def main(folder: str) -> None:
         "agreement, success threshold 0.01": (lambda _: fitted, 0.01),
         "agreement without slack, success threshold 1e-9": (lambda _: tight, 1e-9),
         "agreement, its own plane, success threshold 1e-9": (
-            lambda volume: AgreementReward().fitted_to([volume]),
+            lambda volume: AgreementReward().fit([volume]),
             1e-9,
         ),
     }

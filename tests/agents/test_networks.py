@@ -30,24 +30,24 @@ def space_of(phantom, observation, **rules):
     ],
 )
 def test_network_is_chosen_from_the_observation(phantom, observation, rules, kind):
-    assert isinstance(BY_OBSERVATION.chosen_for(space_of(phantom, observation, **rules)), kind)
+    assert isinstance(BY_OBSERVATION.for_space(space_of(phantom, observation, **rules)), kind)
 
 
 def test_mlp_refuses_images(phantom):
     with pytest.raises(InvalidValueError, match=r"mlp, which takes one vector, but .* action, reward, slice; take net"):
-        MLP((8,)).chosen_for(space_of(phantom, "slice"))
+        MLP((8,)).for_space(space_of(phantom, "slice"))
 
 
 def test_multimodal_refuses_vectors(phantom):
     with pytest.raises(InvalidValueError, match=r"multimodal, which takes images, but the observation has none"):
-        Multimodal().chosen_for(space_of(phantom, "cluster"))
+        Multimodal().for_space(space_of(phantom, "cluster"))
 
 
 @pytest.mark.parametrize("shape", [(35, 36), (36, 35)])
 def test_multimodal_refuses_images_too_small_with_the_smallest_size_that_works(phantom, shape):
     space = space_of(phantom, SliceObservation(shape=shape))
     with pytest.raises(InvalidValueError, match=r"slice is 3\d x 3\d pixels, but .* need at least 36 x 36"):
-        Multimodal().chosen_for(space)
+        Multimodal().for_space(space)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_network_of_too_many_weights_is_refused_before_it_is_made(phantom, netwo
     with pytest.raises(
         InvalidValueError, match=r"network is m\w+ with \d+ weights, but there must be at most 67108864"
     ):
-        network.chosen_for(space_of(phantom, observation))
+        network.for_space(space_of(phantom, observation))
 
 
 def test_smallest_side_leaves_one_pixel_and_one_less_leaves_none():

@@ -90,7 +90,7 @@ def test_landmark_reward_with_junk(value):
 def test_agreement_reward_with_junk(phantom_reward_volumes, changed, value):
     reward = refuses(lambda: AgreementReward(**{changed: value}))
     if reward is not None:
-        fitted = reward.fitted_to(phantom_reward_volumes)
+        fitted = reward.fit(phantom_reward_volumes)
         assert -1.0 <= fitted.score(np.ones((3, 4)), (0.3, 0.5)) <= 0.0
 
 
@@ -102,8 +102,8 @@ def phantom_reward_volumes(phantom):
 @SETTINGS
 @given(value=junk)
 def test_agreement_reward_fitted_to_junk(phantom, value):
-    assert refuses(lambda: AgreementReward().fitted_to(value)) is None
-    assert refuses(lambda: AgreementReward().fitted_to([phantom, value])) is None
+    assert refuses(lambda: AgreementReward().fit(value)) is None
+    assert refuses(lambda: AgreementReward().fit([phantom, value])) is None
 
 
 def test_landmark_reward_says_what_clusters_are():

@@ -65,7 +65,7 @@ def test_landmark_reward_refuses_impossible_targets(targets):
 
 @pytest.fixture(scope="module")
 def agreement(dataset):
-    return AgreementReward().fitted_to(dataset.values())
+    return AgreementReward().fit(dataset.values())
 
 
 def score(reward, volume, action):
@@ -104,12 +104,12 @@ def test_agreement_reward_needs_labelled_planes_that_show_every_tissue(dataset):
     unlabelled = LabelVolume(volume.labels, volume.spacing, "unlabelled")
     elsewhere = LabelVolume(volume.labels, volume.spacing, "elsewhere", ManipulatorAction((0, 0), (0, 5000)))
     with pytest.raises(OptimalPlaneError, match="unlabelled: has no labelled optimal plane"):
-        AgreementReward().fitted_to([unlabelled])
+        AgreementReward().fit([unlabelled])
     with pytest.raises(OptimalPlaneError, match=r"elsewhere: the labelled optimal plane shows \(0, 0, 0\)"):
-        AgreementReward().fitted_to([elsewhere])
+        AgreementReward().fit([elsewhere])
     with pytest.raises(InvalidValueError, match="volumes is empty"):
-        AgreementReward().fitted_to([])
-    with pytest.raises(InvalidValueError, match="fitted_to"):
+        AgreementReward().fit([])
+    with pytest.raises(InvalidValueError, match=r"call fit\("):
         AgreementReward().score(np.zeros((3, 4)), (0.27, 0.55))
 
 

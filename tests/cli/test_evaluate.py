@@ -128,12 +128,12 @@ def test_video_answers_mistakes_in_one_line(answer, tmp_path):
         ),
         (["--agent=sac", *FEW], "sac has to be trained first: give the RUN that has trained one"),
         ([run, "--out=file"], "--out is 'file', but no video can be written there: "),
-        ([run, "--out=/proc/films"], "--out is '/proc/films', but no video can be written there: "),
+        ([run, "--out=/proc/videos"], "--out is '/proc/videos', but no video can be written there: "),
         ([run, "--success-threshold=7"], "Invalid value for '--success-threshold': 7.0 is not in the range 0<x<=1."),
     ):
         code, _, errors = answer("--video", *words)
         assert code == 2, words
         assert errors.startswith(f"error: {line}"), (words, errors)
         assert len(errors.splitlines()) == 1, errors
-    assert not (tmp_path / "films").exists()
+    assert not (tmp_path / "videos").exists()
     assert (tmp_path / "file").read_text() == "mine"

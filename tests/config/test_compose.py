@@ -16,7 +16,7 @@ def choices(group):
 
 def one_env(volume, *overrides):
     config = compose(overrides)
-    return instantiate(config.env, _convert_="object").fitted_to({volume.name: volume}).make_env([volume])
+    return instantiate(config.env, _convert_="object").fit({volume.name: volume}).make_env([volume])
 
 
 @pytest.mark.parametrize("reward", choices("reward"))
@@ -70,8 +70,7 @@ def test_conf_fits_the_reward_to_the_volumes_that_are_trained_on(dataset):
     first, second = list(dataset.values())[:2]
     env_factory = instantiate(compose(["reward=agreement", "env.success_threshold=0.5"]).env, _convert_="object")
     rewards = [
-        env_factory.fitted_to({volume.name: volume}).make_env([first]).unwrapped.rules.reward
-        for volume in (first, second)
+        env_factory.fit({volume.name: volume}).make_env([first]).unwrapped.rules.reward for volume in (first, second)
     ]
     landmarks = np.array([[4, 3000, 180, 40], [3, 1000, 180, 45], [1, 100, 190, 50]], dtype=float)
     scores = [reward.score(landmarks, first.pixel_mm) for reward in rewards]

@@ -207,7 +207,7 @@ def test_actions_that_are_not_finite_are_refused_and_others_clipped(wrist, wrong
 class Anything:
     """A reward that takes every plane as solved."""
 
-    def fitted_to(self, volumes, tissues):
+    def fit(self, volumes, tissues):
         return self
 
     def score(self, landmarks, pixel_mm):

@@ -204,15 +204,15 @@ def test_gymnasiums_wrappers_work_on_it(wrist, variant):
 @pytest.mark.parametrize("variant", ["remembering", "images"])
 def test_gymnasium_records_a_video_of_it(wrist, variant, tmp_path):
     with warnings.catch_warnings():
-        # Writing a film is MoviePy's own matter.
+        # Writing a video is MoviePy's own matter.
         warnings.filterwarnings("default", module="moviepy")
-        env = RecordVideo(make_mixed(wrist, variant, render_mode="rgb_array"), str(tmp_path / "film"), lambda _: True)
+        env = RecordVideo(make_mixed(wrist, variant, render_mode="rgb_array"), str(tmp_path / "video"), lambda _: True)
         env.reset(seed=0)
         for _ in range(2):
             env.step(np.full(env.action_space.shape, -1.0))
         assert [frame.shape for frame in env.recorded_frames] == [(512, 860, 3)] * 3
         env.close()
-    assert [path.stat().st_size > 1000 for path in tmp_path.glob("film/*.mp4")] == [True]
+    assert [path.stat().st_size > 1000 for path in tmp_path.glob("video/*.mp4")] == [True]
 
 
 @pytest.mark.parametrize("variant", ["vector", "remembering", "image", "on_budget", "on_stop"])

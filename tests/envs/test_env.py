@@ -298,7 +298,7 @@ def test_env_takes_volumes_of_different_spacing_by_metric_clustering(dataset):
 class ArteryOnly:
     """A user's own reward: 0 where exactly one artery is seen."""
 
-    def fitted_to(self, volumes, tissues):
+    def fit(self, volumes, tissues):
         return self
 
     def score(self, landmarks, pixel_mm):
@@ -306,7 +306,7 @@ class ArteryOnly:
 
 
 def agreement(volume):
-    return AgreementReward().fitted_to([volume])
+    return AgreementReward().fit([volume])
 
 
 @pytest.mark.parametrize(
@@ -338,7 +338,7 @@ def test_env_fits_a_reward_to_its_volumes_and_leaves_the_one_given_as_it_is(wris
     given = AgreementReward()
     fitted = ArmscanEnv([wrist], reward=given).rules.reward
     assert isinstance(fitted, AgreementReward)
-    with pytest.raises(InvalidValueError, match="fitted_to"):
+    with pytest.raises(InvalidValueError, match=r"call fit\("):
         given.score(np.zeros((3, 4)), wrist.pixel_mm)
     assert ArmscanEnv([wrist], reward=fitted).rules.reward is fitted
 
@@ -368,7 +368,7 @@ class Broken:
     def __init__(self, given):
         self.given = given
 
-    def fitted_to(self, volumes, tissues):
+    def fit(self, volumes, tissues):
         return self
 
     def score(self, landmarks, pixel_mm):

@@ -1,4 +1,4 @@
-"""The command that films an agent, as a person types it, on real tracked runs."""
+"""`armscan evaluate --video`, as a person types it, on real tracked runs."""
 
 import json
 import re
@@ -44,7 +44,7 @@ def difference(one, other):
     return np.asarray(ImageChops.difference(one, other)).mean()
 
 
-def test_film_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(answer, armscan, tmp_path):
+def test_video_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(answer, armscan, tmp_path):
     run_id = tracked(tmp_path, "projection=zy")
     code, printed, errors = answer(run_id[:8], "--episodes=2", "--seed=4", "--max-steps=3")
     assert (code, errors) == (0, "")
@@ -59,7 +59,7 @@ def test_film_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(a
     n_steps = [each["n_steps"] for each in episodes]
     assert [int(steps) for *_, steps, _ in told] == n_steps
     assert [float(mm) for *_, mm in told] == [round(each["distance_mm"], 1) for each in episodes]
-    name = f"films/tiny-own-volumes-{run_id[:8]}-seed4"
+    name = f"videos/tiny-own-volumes-{run_id[:8]}-seed4"
     assert printed.endswith(f"look at   {name}.gif\nlook at   {name}.mp4\n")
     frames = gif_frames(tmp_path / f"{name}.gif")
     durations = [ms for steps in n_steps for ms in [*steps * [600], 2400]]
@@ -76,16 +76,16 @@ def test_film_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(a
         at += ms // 100
 
 
-def test_film_goes_over_every_split_of_a_folder_and_says_what_is_known(answer, tmp_path, wrists):
+def test_video_goes_over_every_split_of_a_folder_and_says_what_is_known(answer, tmp_path, wrists):
     run_id = tracked(tmp_path, "projection=zy", agent=GUESSER, **ON_FILES)
-    code, printed, errors = answer(run_id, "--trust", "--data=wrists", "--episodes=1", "--out=elsewhere/films")
+    code, printed, errors = answer(run_id, "--trust", "--data=wrists", "--episodes=1", "--out=elsewhere/videos")
     assert (code, errors) == (0, "")
     assert "note: the agent was trained on these volumes: " in printed
     assert [label for label, *_ in EPISODE.findall(printed)] == ["train split", "validation split", "test split"]
-    assert {file.suffix for file in (tmp_path / "elsewhere" / "films").iterdir()} == {".gif", ".mp4"}
+    assert {file.suffix for file in (tmp_path / "elsewhere" / "videos").iterdir()} == {".gif", ".mp4"}
 
 
-def test_baseline_is_filmed_without_a_store(answer, tmp_path):
+def test_baseline_is_recorded_without_a_store(answer, tmp_path):
     (tmp_path / "mlruns.db").unlink()
     words = [*GUESSER_OF_ANYTHING, "--data=phantom", "--phantoms=2", "--max-steps=2"]
     code, printed, errors = answer(*words)
@@ -93,7 +93,7 @@ def test_baseline_is_filmed_without_a_store(answer, tmp_path):
     assert [volume for _, volume, *_ in EPISODE.findall(printed)] == [
         *("phantom-3000000", "phantom-3000001", "phantom-3000000")
     ]
-    assert {file.name for file in (tmp_path / "films").iterdir()} == {"sac-phantom-seed0.gif", "sac-phantom-seed0.mp4"}
+    assert {file.name for file in (tmp_path / "videos").iterdir()} == {"sac-phantom-seed0.gif", "sac-phantom-seed0.mp4"}
     assert not (tmp_path / "mlruns.db").exists()
 
 
@@ -113,4 +113,4 @@ def test_checkpoints_that_are_gone_or_damaged_or_anothers_are_refused(answer, tm
         code, _, errors = answer(run_id)
         assert code == 2
         assert errors.startswith(f"error: run {run_id}: {line}")
-    assert not (tmp_path / "films").exists()
+    assert not (tmp_path / "videos").exists()

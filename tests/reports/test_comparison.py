@@ -75,7 +75,7 @@ def test_success_without_a_failure_has_the_interval_of_wilson(written, make_trai
     assert "100.0%<br> <small>67.6–100.0</small>" in page
 
 
-def test_the_film_is_of_the_median_training(written, make_training):
+def test_the_video_is_of_the_median_training(written, make_training):
     trainings = [make_training(seed, mean_steps=steps) for seed, steps in enumerate((9, 5, 2))]
     page, _ = written(*trainings, make_training(3, evaluation=None), make_training(4, video=None, mean_steps=1))
     assert "<figcaption>1. sac: seed 1</figcaption>" in page
@@ -107,7 +107,7 @@ def test_groups_have_the_ids_of_their_runs_and_rounded_times(written, make_train
     assert '<td data-label="environment steps"><div>200</div></td>' in summary
 
 
-def test_curves_have_markers_and_films_come_after_charts(written, make_training):
+def test_curves_have_markers_and_videos_come_after_charts(written, make_training):
     page, _ = written(*(make_training(0, params={"agent.lr": str(lr)}) for lr in (1, 2)))
     assert page.count('"mode":"lines+markers"') == 2 * 2
     assert page.rindex("<h2>Which") < page.index("<h2>Episodes") < page.index("<h2>Runs")

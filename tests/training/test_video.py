@@ -17,7 +17,7 @@ class Still:
         return np.array([-1.0])
 
 
-def test_film_has_a_frame_for_the_start_and_for_every_step(phantom, tmp_path):
+def test_video_has_a_frame_for_the_start_and_for_every_step(phantom, tmp_path):
     env = make_armscan_env([phantom], max_steps=3, render_mode="rgb_array")
     record_episode(Still(), env, tmp_path / "episode.gif", seed=0)
     with Image.open(tmp_path / "episode.gif") as video:

@@ -154,17 +154,17 @@ def _said(state: str) -> str:
 
 def _videos(final_trials: Sequence[FrozenTrial]) -> str:
     """Return a video of each finally evaluated configuration, of its first training that has one here."""
-    films: dict[int, str] = {}
+    videos: dict[int, str] = {}
     for trial in final_trials:
         files = sorted(Path(trial.user_attrs.get(FOLDER, "nowhere")).glob("seed_*/episode.gif"))
         number = trial.user_attrs[FINALIST]
-        if files and number not in films:
+        if files and number not in videos:
             address = video_address(files[0].read_bytes())
             caption = f"<figcaption>trial {number}</figcaption>"
-            films[number] = f'<figure><img alt="an episode" src="{address}">{caption}</figure>'
-    if not films:
+            videos[number] = f'<figure><img alt="an episode" src="{address}">{caption}</figure>'
+    if not videos:
         return ""
-    return f'<h2>Episodes on a test volume</h2><div class="videos">{"".join(films.values())}</div>'
+    return f'<h2>Episodes on a test volume</h2><div class="videos">{"".join(videos.values())}</div>'
 
 
 def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> dict[str, Any]:

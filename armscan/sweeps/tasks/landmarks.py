@@ -63,7 +63,7 @@ class LandmarksTask:
         reward, tissues = instantiate(config.reward, _convert_="object"), self._tissues(config)
         at_plane, elsewhere = [], []
         for volume in volumes.values():
-            judge, labelled = PlaneScorer(volume, reward.fitted_to([volume], tissues), tissues), volume.optimal_action
+            judge, labelled = PlaneScorer(volume, reward.fit([volume], tissues), tissues), volume.optimal_action
             if labelled is None:
                 raise InvalidValueError(f"{volume.name}: has no labelled plane, which clusterings are judged by")
             at_plane.append(judge.seen(labelled)[0])

@@ -132,7 +132,7 @@ def test_history_has_the_best_so_far_and_every_number_is_rounded(answer, tmp_pat
     assert float(typed) == points["y"][0]
 
 
-def test_films_are_after_the_charts_and_pruned_trials_look_so(answer, tmp_path):
+def test_videos_are_after_the_charts_and_pruned_trials_look_so(answer, tmp_path):
     storage = searched(tmp_path, ["mean_steps"])
     judge(storage, tmp_path)
     assert answer("--study=a")[0] == 0
