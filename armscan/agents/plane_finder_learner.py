@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from armscan.agents.base_learner import SupervisedLearner, diverged, teacher_of
@@ -16,6 +18,7 @@ from armscan.agents.plane_geometry import common_geometry
 from armscan.agents.policy import Policy, batch_of, clip_action
 from armscan.agents.protocols import AgentSetup
 from armscan.envs.actions import ActionBounds
+from armscan.envs.history import rows_of
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import reset_each
 from armscan.errors import InvalidValueError
@@ -60,6 +63,8 @@ class PlaneFinderLearner(SupervisedLearner):
         self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
         self.expected_error: tuple[float, float] | None = None
         """How far off the plane that `act` chose last is expected to be, in mm and degrees."""
+        self.expected_errors: FloatArray = np.empty((0, 2))
+        """The same of the planes that `act_all` chose last in each of its episodes, shape (n, 2)."""
 
     @property
     def env_steps_at_once(self) -> int:
@@ -183,6 +188,20 @@ class PlaneFinderLearner(SupervisedLearner):
             (actions, expected), _ = self._module(self._tensors(batch))
         self.expected_error = (float(expected[0, 0]), float(expected[0, 1]))
         return np.asarray(actions[0].clamp(-1.0, 1.0).cpu().numpy())
+
+    def begin_all(self, *, seeds: Sequence[int], bounds: Sequence[ActionBounds]) -> None:
+        """See `BatchAgent.begin_all`."""
+        for seed, its_bounds in zip(seeds, bounds, strict=True):
+            self.begin(seed=seed, bounds=its_bounds)
+        self.expected_errors = np.full((len(seeds), 2), np.nan)
+
+    def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[np.int64]) -> FloatArray:
+        """See `BatchAgent.act_all`; one by one, because convolutions of a larger batch are not the same to the bit."""
+        actions = []
+        for row, (episode, reward) in enumerate(zip(episodes.tolist(), rewards.tolist(), strict=True)):
+            actions.append(self.act(rows_of(observations, row), reward))
+            self.expected_errors[episode] = self.expected_error
+        return np.array(actions)
 
     def policy(self) -> Policy:
         """Return a copy of what `act` asks."""

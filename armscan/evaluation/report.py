@@ -15,7 +15,7 @@ from rich.text import Text
 
 from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
 from armscan.training import Evaluation, MetricEstimates, ResultTable
-from armscan.training.metrics import NOT_STARTED_SOLVED
+from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
 from armscan.training.result_table import interval_text
 
 TOTAL = "all volumes"
@@ -29,6 +29,12 @@ FURTHER_ROWS = (
     ("steps, median", "median_steps", "{:.1f}"),
     ("steps, 95th percentile", "p95_steps", "{:.1f}"),
     ("time per plane (ms), mean", "mean_seconds_per_plane", "{:.2f}"),
+)
+# Of agents that say how far off they expect to be.
+BY_DOUBT = tuple(
+    (f"{title} of the {which} sure quarter, median", f"median_distance_{unit}{suffix}", "{:.2f}")
+    for unit, title in (("mm", "distance mm"), ("deg", "angle °"))
+    for which, suffix in (("most", SUREST), ("least", LEAST_SURE))
 )
 OF_THE_OTHERS = (("success, by reward", "success_rate", "{:.1%}"), ("steps, mean", "mean_steps", "{:.2f}"))
 
@@ -146,6 +152,10 @@ def _further(metrics: Mapping[str, MetricEstimates]) -> Table:
     apart = "\n" if len(metrics) > 1 else "  "
     for text, key, form in FURTHER_ROWS:
         table.add_row(text, *(_cell(_shown(each, key), form, apart=apart) for each in metrics.values()))
+    if any(key in each.estimates for _, key, _ in BY_DOUBT for each in metrics.values()):
+        table.add_section()
+        for text, key, form in BY_DOUBT:
+            table.add_row(text, *(_cell(each.estimate(key), form, apart=apart) for each in metrics.values()))
     table.add_section()
     table.add_row("those not started solved:")
     for text, key, form in OF_THE_OTHERS:

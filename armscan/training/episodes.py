@@ -73,9 +73,13 @@ def _play_all(
         goes_on = ~(terminated | truncated)
         observations, rewards, running = rows_of(observations, goes_on), rewards[goes_on], running[goes_on]
     optima = bare.rules.look([episode.scene for episode in episodes], [episode.scene.optimum for episode in episodes])
+    # Of agents that say how far off they expect to be.
+    expected = getattr(agent, "expected_errors", np.full((len(planned), 2), None)).tolist()
     return [
-        _result(episode, seed, its_seconds, optimal.slice_xz)
-        for episode, seed, its_seconds, optimal in zip(episodes, seeds, seconds.tolist(), optima, strict=True)
+        _result(episode, seed, its_seconds, optimal.slice_xz, its_expected)
+        for episode, seed, its_seconds, optimal, its_expected in zip(
+            episodes, seeds, seconds.tolist(), optima, expected, strict=True
+        )
     ]
 
 
@@ -103,11 +107,26 @@ def play(
         look()
     seconds = time.perf_counter() - start_s
     (optimal,) = env.get_wrapper_attr("rules").look([episode.scene], [episode.scene.optimum])
-    return _result(episode, seed, seconds, optimal.slice_xz)
+    expected = getattr(agent, "expected_error", None) or (None, None)
+    return _result(episode, seed, seconds, optimal.slice_xz, expected)
 
 
-def _result(episode: Episode, seed: int, seconds: float, optimal_xz: NDArray[np.uint8]) -> EpisodeResult:
-    """Return how an episode went that has ended; `optimal_xz` is the slice of its optimal plane."""
+def _result(
+    episode: Episode,
+    seed: int,
+    seconds: float,
+    optimal_xz: NDArray[np.uint8],
+    expected: Sequence[float | None],
+) -> EpisodeResult:
+    """Return how an episode went that has ended.
+
+    Args:
+        episode: the episode.
+        seed: seed that it was reset with.
+        seconds: wall time of all its steps.
+        optimal_xz: slice of its optimal plane.
+        expected: how far off the agent expects its last plane to be, in mm and degrees, or None and None.
+    """
     # The first is the start's.
     _, *rewards = episode.rewards
     distance_mm, distance_deg = episode.distance
@@ -127,5 +146,7 @@ def _result(episode: Episode, seed: int, seconds: float, optimal_xz: NDArray[np.
         seconds_per_plane=seconds / episode.n_steps,
         nerve_area_error_mm2=nerve_mm2,
         nerve_area_error_percent=nerve_percent,
+        expected_mm=expected[0],
+        expected_deg=expected[1],
         **{f"dice_{tissue}": value for tissue, value in dice.items()},
     )

@@ -61,6 +61,8 @@ class EpisodeResult:
         nerve_area_error_mm2: how far the median nerve's area on the last slice is from that on the optimal plane's, in
             mm2. Default: None, the optimal plane's shows no nerve, or nobody has measured it.
         nerve_area_error_percent: the same in per cent of the area on the optimal plane's. Default: None, likewise.
+        expected_mm: how far off the agent expected its last plane to be, in mm. Default: None, it expects nothing.
+        expected_deg: the same in degrees. Default: None, likewise.
     """
 
     volume: str
@@ -79,6 +81,8 @@ class EpisodeResult:
     seconds_per_plane: float = field(compare=False)
     nerve_area_error_mm2: float | None = None
     nerve_area_error_percent: float | None = None
+    expected_mm: float | None = None
+    expected_deg: float | None = None
 
     @property
     def mean_dice(self) -> float:
@@ -197,7 +201,7 @@ class Evaluation:
 
 def _episode_of(plain: object) -> EpisodeResult:
     kinds = get_type_hints(EpisodeResult)
-    # Older evaluations have nothing of the nerve.
+    # Older evaluations have nothing of the nerve, nor of what is expected.
     optional = {each.name for each in fields(EpisodeResult) if each.default is None}
     if not isinstance(plain, dict) or not kinds.keys() - optional <= plain.keys() <= kinds.keys():
         raise InvalidValueError(f"an episode is {plain!r}, but it must have {', '.join(kinds)}, and nothing else")

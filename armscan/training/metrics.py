@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from armscan.stats.bootstrap import Estimate, Statistic, estimates, interquartile_mean, mean, quantile, wilson
-from armscan.training.evaluation import MEANS, Evaluation
+from armscan.training.evaluation import MEANS, EpisodeResult, Evaluation
 from armscan.training.on_plane import OnPlane, limits_among
 
 # Suffix of metrics over the episodes that did not start solved, and of rates with Wilson's interval.
 NOT_STARTED_SOLVED, WILSON = "_not_started_solved", "_wilson"
+# Suffixes of errors of the episodes that an agent was surest, and least sure of.
+SUREST, LEAST_SURE = "_surest_quarter", "_least_sure_quarter"
 # Suffixes of the ends of an interval, and the names of the counts.
 ENDS = ("_low", "_high")
 COUNTS = ("volumes", "episodes", "episodes_started_solved")
@@ -34,6 +36,7 @@ METRICS: dict[str, tuple[Statistic, str]] = {
         for value in ("nerve_area_error_mm2", "nerve_area_error_percent")
         for name, statistic in (("median", MEDIAN), ("p90", P90))
     },
+    **{f"median_{value}": (MEDIAN, value) for value in ("expected_mm", "expected_deg")},
     **{f"mean_{value}": (mean, value) for value in ("dice_bones", "dice_tendons", "dice_artery", "seconds_per_plane")},
 }
 
@@ -79,6 +82,7 @@ class MetricEstimates:
             # What was never measured is no figure.
             if any(each is not None for each in measured) or not measured:
                 columns[name] = statistic, [math.nan if each is None else float(each) for each in measured]
+        columns |= _by_doubt(episodes)
         for name, (statistic, values) in list(columns.items()):
             columns[name + NOT_STARTED_SOLVED] = statistic, np.where(is_other, values, math.nan).tolist()
         wilsons = {}
@@ -143,3 +147,19 @@ class MetricEstimates:
         for name, estimate in estimates.items():
             metrics |= dict(zip((name, *(name + end for end in ENDS)), estimate, strict=True))
         return metrics
+
+
+def _by_doubt(episodes: Sequence[EpisodeResult]) -> dict[str, tuple[Statistic, list[float]]]:
+    """Return errors of the quarters of the episodes that the agent was surest and least sure of; none without doubt."""
+    columns: dict[str, tuple[Statistic, list[float]]] = {}
+    for unit in ("mm", "deg"):
+        expected = [getattr(episode, f"expected_{unit}") for episode in episodes]
+        if not expected or None in expected:
+            return {}
+        order = np.argsort(expected, kind="stable")
+        n_quarter = math.ceil(len(order) / 4)
+        for which, chosen in ((SUREST, order[:n_quarter]), (LEAST_SURE, order[-n_quarter:])):
+            values = np.full(len(order), math.nan)
+            values[chosen] = [getattr(episodes[index], f"distance_{unit}") for index in chosen]
+            columns[f"median_distance_{unit}{which}"] = MEDIAN, values.tolist()
+    return columns

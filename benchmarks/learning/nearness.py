@@ -1,45 +1,73 @@
-"""How near the labelled plane the agent of a run comes, and what its own doubt says of it.
+"""How near the labelled plane the agents of runs come, and what their own doubt says of it.
 
-    python -m benchmarks.learning.nearness RUN [FOLDER | phantom] [--tracking URI] [--episodes N]
+    python -m benchmarks.learning.nearness RUN [FOLDER | phantom] [--tracking URI] [--episodes N] [--rx DEG]
+    python -m benchmarks.learning.nearness GRID ...
 
 Medians and 90th percentiles of the distance and the angle, how often both are within 1.5 mm and 4 degrees, over all
 volumes and for each; and, for an agent that says how far off it expects to be (`agent=plane_finder`), the errors by
-quintile of that. Volumes: a folder, or 12 phantoms that no run trains on; default: the run's own test volumes.
+quintile of that. Volumes: a folder, or 12 phantoms that no run trains on; default: the run's own test volumes. Of a
+grid (`data.folds`) all runs, each on its own test volumes. `--rx` turns volumes by up to as many degrees about the axis
+across, as `env.transform.rx_deg` does.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 import numpy as np
 
 from armscan.config.defaults import PHANTOM, default_tracking
 from armscan.evaluation.agent_source import agent_of_run
 from armscan.evaluation.runner import FIRST_SEED, apply
-from armscan.training import TEST
-from armscan.training.episodes import play
+from armscan.tracking import find_run, open_existing_store
+from armscan.training import TEST, evaluate
+from armscan.training.evaluation import EpisodeResult
 
 N_PHANTOMS, N_QUINTILES = 12, 5
 NEAR_MM, NEAR_DEG = 1.5, 4.0
 
 
-def measured(agent, env, n_episodes: int) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Return the volumes of episodes, their errors and the expected ones (else NaN), shape (n, 2), mm and degrees."""
-    names = list(env.get_wrapper_attr("volumes"))
-    volumes = [names[i % len(names)] for i in range(n_episodes)]
-    errors, expected = [], []
-    for i, name in enumerate(volumes):
-        episode = play(agent, env, name, FIRST_SEED + i)
-        errors.append((episode.distance_mm, episode.distance_deg))
-        expected.append(getattr(agent, "expected_error", None) or (np.nan, np.nan))
-    return volumes, np.array(errors), np.array(expected)
+def runs_of(tracking: str, run_id: str) -> list[str]:
+    """Return the IDs of a grid's runs, or that of the run itself."""
+    store = open_existing_store(tracking)
+    run = find_run(store, run_id)
+    children = store.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
+    return [child.info.run_id for child in children if "choice.agent" in child.data.tags] or [run.info.run_id]
 
 
-def print_row(name: str, errors: np.ndarray) -> None:
+def played(tracking: str, run_id: str, data: str | None, n_episodes: int, rx_deg: float | None) -> list[EpisodeResult]:
+    """Return the episodes of a run's agent on the volumes."""
+    subject = agent_of_run(tracking, run_id, {})
+    if rx_deg is not None:
+        subject.config.env.transform.rx_deg = rx_deg
+    prepared = apply(subject, data, N_PHANTOMS)
+    label = data if data == PHANTOM else TEST
+    env = prepared.envs.get(label, list(prepared.envs.values())[-1])
+    return list(evaluate(prepared.agent, env, n_episodes=n_episodes, seed=FIRST_SEED).episodes)
+
+
+def print_row(name: str, episodes: Sequence[EpisodeResult]) -> None:
     """Print a row of the table for some episodes."""
+    errors = np.array([(each.distance_mm, each.distance_deg) for each in episodes])
     (mm, deg), (mm_90, deg_90) = np.median(errors, axis=0), np.percentile(errors, 90, axis=0)
     near = (errors < (NEAR_MM, NEAR_DEG)).all(axis=1).mean()
-    print(f"| {name} | {len(errors)} | {mm:.2f} / {mm_90:.1f} | {deg:.1f} / {deg_90:.1f} | {100 * near:.0f} |")
+    success = np.mean([each.is_success for each in episodes])
+    figures = f"{mm:.2f} / {mm_90:.1f} | {deg:.1f} / {deg_90:.1f} | {100 * near:.0f} | {100 * success:.0f}"
+    print(f"| {name} | {len(episodes)} | {figures} |")
+
+
+def print_doubt(episodes: Sequence[EpisodeResult]) -> None:
+    """Print what the expected errors say, where there are any."""
+    for unit in ("mm", "deg"):
+        expected = np.array([getattr(each, f"expected_{unit}") or np.nan for each in episodes])
+        if np.isnan(expected).any():
+            return
+        errors = np.array([getattr(each, f"distance_{unit}") for each in episodes])
+        print(f"correlation of expected and real error, {unit}: {np.corrcoef(expected, errors)[0, 1]:.2f}")
+        for k, chosen in enumerate(np.array_split(expected.argsort(), N_QUINTILES)):
+            name = f"quintile {k + 1} of expected {unit}, {expected[chosen].mean():.2f}"
+            print_row(name, [episodes[index] for index in chosen])
 
 
 def main() -> None:
@@ -49,22 +77,17 @@ def main() -> None:
     parser.add_argument("data", nargs="?")
     parser.add_argument("--tracking", default=default_tracking()["uri"])
     parser.add_argument("--episodes", type=int, default=300)
+    parser.add_argument("--rx", type=float)
     given = parser.parse_args()
-    prepared = apply(agent_of_run(given.tracking, given.run, {}), given.data, N_PHANTOMS)
-    label = given.data if given.data == PHANTOM else TEST
-    env = prepared.envs.get(label, list(prepared.envs.values())[-1])
-    volumes, errors, expected = measured(prepared.agent, env, given.episodes)
-    print("| | episodes | mm, median / p90 | degrees, median / p90 | both < 1.5 mm and < 4 degrees, % |")
-    print("| --- | --- | --- | --- | --- |")
-    print_row("all", errors)
-    for name in dict.fromkeys(volumes):
-        print_row(name, errors[np.array(volumes) == name])
-    if np.isnan(expected).any():
-        return
-    for i, unit in enumerate(("mm", "degrees")):
-        print(f"correlation of expected and real error, {unit}: {np.corrcoef(expected[:, i], errors[:, i])[0, 1]:.2f}")
-        for k, chosen in enumerate(np.array_split(expected[:, i].argsort(), N_QUINTILES)):
-            print_row(f"quintile {k + 1} of expected {unit}, {expected[chosen, i].mean():.2f}", errors[chosen])
+    run_ids = runs_of(given.tracking, given.run)
+    n_each = -(-given.episodes // len(run_ids))
+    episodes = [each for run_id in run_ids for each in played(given.tracking, run_id, given.data, n_each, given.rx)]
+    print("| | episodes | mm, median / p90 | degrees, median / p90 | both < 1.5 mm and < 4 degrees, % | success, % |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    print_row("all", episodes)
+    for name in dict.fromkeys(each.volume for each in episodes):
+        print_row(name, [each for each in episodes if each.volume == name])
+    print_doubt(episodes)
 
 
 if __name__ == "__main__":

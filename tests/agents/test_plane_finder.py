@@ -14,6 +14,8 @@ from armscan.agents.torch_export import export_program
 from armscan.envs import EnvFactory, MetricSliceObservation, RandomTransform
 from armscan.envs.actions import ActionBounds
 from armscan.errors import CheckpointError, InvalidValueError
+from armscan.training import evaluate
+from armscan.training.episodes import play
 from armscan.volumes import LabelVolume
 from tests.agents.conftest import setup_for
 
@@ -123,6 +125,16 @@ def test_learner_stops_when_it_is_sure_and_after_its_last_look(phantom, sure, n_
     assert terminated
     assert len(actions) - 1 == n_steps
     assert (actions[1:, 4] > 0).tolist() == [False] * (n_steps - 1) + [True]
+
+
+def test_episodes_side_by_side_are_those_played_one_by_one_with_what_was_expected(phantom):
+    learner, env = made(phantom, {"ends": "on_stop", "max_steps": 3}, sure_mm=3.0, sure_deg=8.0)
+    learner.learn(24)
+    side_by_side = evaluate(learner, env, n_episodes=5, seed=7).episodes
+    alone = tuple(play(learner, env, phantom.name, 7 + i) for i in range(5))
+    assert side_by_side == alone
+    assert len({each.expected_mm for each in alone}) > 1
+    assert min(min(each.expected_mm, each.expected_deg) for each in alone) > 0.0
 
 
 def test_expected_errors_are_right_on_average_where_they_were_calibrated(phantom):

@@ -33,3 +33,19 @@ def test_figures_of_episodes_that_all_start_solved_are_not_those_of_others():
     metrics = MetricEstimates.of(Evaluation(episodes)).metrics()
     assert metrics["success_rate"] == 1.0
     assert metrics["success_rate_not_started_solved"] != metrics["success_rate_not_started_solved"]
+
+
+def test_errors_of_the_surest_and_the_least_sure_quarter_are_those_of_the_episodes_themselves():
+    (usual,) = evaluation_of(1).episodes
+    episodes = tuple(
+        dataclasses.replace(
+            usual, seed=i, distance_mm=float(i), distance_deg=1.0, expected_mm=10.0 - i, expected_deg=float(i)
+        )
+        for i in range(8)
+    )
+    figures = MetricEstimates.of(Evaluation(episodes))
+    assert figures.estimate("median_distance_mm_surest_quarter").value == 6.5
+    assert figures.estimate("median_distance_mm_least_sure_quarter").value == 0.5
+    assert figures.estimate("median_expected_mm").value == 6.5
+    without = dataclasses.replace(episodes[0], expected_mm=None, expected_deg=None)
+    assert not any("quarter" in name for name in MetricEstimates.of(Evaluation((*episodes, without))).estimates)
