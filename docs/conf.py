@@ -20,6 +20,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
     "configuration_reference",
+    "local_plotly",
     "markdown_docstrings",
     "mathml",
 ]
