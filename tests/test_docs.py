@@ -7,8 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from nbclient import NotebookClient
 
 from armscan.cli.main import armscan as program
 
@@ -31,9 +33,11 @@ PLACEHOLDERS = {
 OF_HYDRA = {"-m", "--multirun", "--plan", "--help"}
 # So that each command of a journey takes seconds.
 SMALL = (
-    *("training.env_steps=2064", "training.eval_every_env_steps=64", "training.validation_episodes=4"),
-    *("evaluation.episodes=8", "data.n_training=2", "data.n_validation=1", "data.n_test=2"),
+    *("training.env_steps=2064", "training.eval_every_env_steps=64", "training.validation_episodes=2"),
+    *("evaluation.episodes=2", "tracking.policy=false"),
 )
+OF_PHANTOMS = ("data.n_training=2", "data.n_validation=1", "data.n_test=2")
+OF_STUDIES = ("study.n_trials=2", "study.final_eval.top_k=1", "study.final_eval.n_seeds=1")
 OWN_VOLUMES = ("data=nifti", "data=mixed")
 
 
@@ -124,24 +128,36 @@ def test_tutorial_runs_as_it_stands(data_folder, tmp_path, monkeypatch, capsys):
     assert "00001_labels.nii.gz (360, 800, 80)" in capsys.readouterr().out
 
 
-@pytest.mark.full
+def small(words):
+    """What is added to a command so that it takes seconds, where it says nothing else."""
+    added = [*SMALL]
+    if not set(words) & set(OWN_VOLUMES):
+        added += OF_PHANTOMS
+    if any(word.startswith("sweep=") for word in words):
+        added += OF_STUDIES
+    given = {word.partition("=")[0] for word in words}
+    return [word for word in added if word.partition("=")[0] not in given]
+
+
 @pytest.mark.parametrize(
     "page",
     [
-        ROOT / "README.md",
-        *(DOCS / f"{name}.md" for name in ("first-training", "first-study", "own-volumes", "extending")),
+        pytest.param("README.md", marks=pytest.mark.full),
+        *(
+            pytest.param(f"docs/{name}.md", marks=pytest.mark.slow)
+            for name in ("first-training", "first-study", "own-volumes", "extending")
+        ),
     ],
-    ids=lambda page: page.stem,
 )
 def test_journeys_of_pages_are_made_with_small_budgets(page, tmp_path, data_folder):
-    write_files(page, tmp_path)
+    write_files(ROOT / page, tmp_path)
     done = 0
-    for words in commands(page):
+    for words in commands(ROOT / page):
         line = [word.replace("FOLDER", str(data_folder)) for word in words]
         if "ui" in line or "label" in line or any("resume=" in word or word == "ID" for word in line):
             continue
-        if line[0] == "run" and "--help" not in line and not any(word in line for word in OWN_VOLUMES):
-            line += [word for word in SMALL if not any(word.split("=")[0] == given.split("=")[0] for given in line)]
+        if line[0] == "run" and "--help" not in line:
+            line += small(line)
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         command = [sys.executable, "-P", "-m", "armscan", *line]
         ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
@@ -158,3 +174,11 @@ def test_page_links_to_what_is_there(page):
 
 def test_readme_is_short():
     assert len((ROOT / "README.md").read_text().split()) <= 800
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("notebook", sorted((DOCS / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+def test_notebooks_run_as_they_stand(notebook, tmp_path):
+    cells = nbformat.read(notebook, as_version=4)
+    assert all(cell.get("outputs", True) for cell in cells.cells[-1:]), "outputs are kept with the notebook"
+    NotebookClient(cells, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
