@@ -31,6 +31,9 @@ myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath"
 myst_heading_anchors = 3
 # Notebooks are run by tests/test_docs.py and kept with their outputs.
 nb_execution_mode = "off"
+nb_merge_streams = True
+# Charts are there as HTML, too.
+suppress_warnings = ["mystnb.unknown_mime_type"]
 
 # API
 default_role = "code"
