@@ -6,6 +6,9 @@ from pathlib import Path
 from plotly.offline import get_plotlyjs
 from sphinx.application import Sphinx
 
+ELSEWHERE = re.compile(r'<script[^>]*src="https://cdn.plot.ly/[^"]*"[^>]*>')
+LOCAL = '<script src="../_static/plotly.min.js">'
+
 
 def localise(app: Sphinx, exception: Exception | None) -> None:
     """Replace the address of Plotly in the built notebooks."""
@@ -13,9 +16,7 @@ def localise(app: Sphinx, exception: Exception | None) -> None:
         return
     (Path(app.outdir) / "_static/plotly.min.js").write_text(get_plotlyjs(), encoding="utf-8")
     for page in Path(app.outdir, "notebooks").glob("*.html"):
-        text = page.read_text(encoding="utf-8")
-        local = re.sub(r'<script[^>]*src="https://cdn.plot.ly/[^"]*"[^>]*>', '<script src="../_static/plotly.min.js">', text)
-        page.write_text(local, encoding="utf-8")
+        page.write_text(ELSEWHERE.sub(LOCAL, page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
