@@ -7,7 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tianshou.algorithm.algorithm_base import _gae, _nstep_return
 from tianshou.data import Batch, VectorReplayBuffer
+from tianshou.data.buffer.manager import _next_index, _prev_index
+
+# Kept on disk, or else each process would compile them anew, for five seconds.
+for _compiled in (_gae, _nstep_return, _next_index, _prev_index):
+    _compiled.enable_caching()
 
 Tree = dict[str, Any]
 """Tensors by name, and such dicts."""

@@ -17,7 +17,6 @@ from tianshou.data import collector
 from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
 from armscan.agents.base_learner import BaseLearner, diverged, is_finite, load_into, prepare_torch
-from armscan.agents.compile_cache import cache_compiled
 from armscan.agents.compiled_sac import CompiledSAC
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.hyperparameters import Parameters
@@ -198,7 +197,6 @@ class TianshouLearner(BaseLearner):
 
 def training_envs(setup: AgentSetup, num_envs: int) -> TianshouVectorEnv:
     """Return the training environments, and seed the weights of the networks that are made next."""
-    cache_compiled()
     envs = TianshouVectorEnv(setup.make_envs(num_envs))
     prepare_torch(setup.seed)
     return envs

@@ -35,13 +35,14 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     launcher = composed(given.launching)[1][LAUNCHER]
     if launcher in ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))
-    check_space(settings, task, trial_words, config)
-    # Before anything is made: a study or a storage that would be refused.
+    # Before the space is checked, which takes seconds, and anything is made.
     existing = existing_study(settings, to_plain(config))
+    if not given.is_plan:
+        check_launcher(launcher)
+    check_space(settings, task, trial_words, config)
     if given.is_plan:
         print_plan(settings, existing)
         return 0
-    check_launcher(launcher)
     opened = open_for_work(settings, task, config, trial_words)
     for phase in opened.phases:
         if n_failed := phase.scheduler.reset_failures():
