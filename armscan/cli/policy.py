@@ -54,7 +54,8 @@ def export(run: str, out: Path, tracking: str, trust: bool) -> None:
 def register(run: str, name: str, tracking: str, trust: bool) -> None:
     """Register the policy of RUN in MLflow's model registry.
 
-    RUN is an MLflow run ID or its first four or more characters. Each call registers a new version.
+    RUN is an MLflow run ID or its first four or more characters. Each call registers a new version, which gets
+    the alias champion: models:/NAME@champion.
     """
     from armscan.runs.policy_registry import register_policy
 

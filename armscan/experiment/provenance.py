@@ -84,6 +84,7 @@ def start_tracking(
         folder=invocation.folder,
         parent_id=job.parent_run_id if job else None,
     )
+    tracked.log_datasets(setup.fingerprints)
     tracked.log_files(*(invocation.folder / name for name in files))
     return tracked
 

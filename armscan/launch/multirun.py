@@ -169,6 +169,7 @@ def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Ma
     Returns:
         The runs of those that got as far as that, in the order of the jobs.
     """
+    from armscan.launch.best_job import show_best
     from armscan.tracking import note_end, open_store, sync
     from armscan.tracking.run import FAILURE_TAG
     from armscan.tracking.sync import PROCESS_DIED
@@ -187,4 +188,6 @@ def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Ma
             store.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
     if not children:
         store.delete_run(word["run_id"])
+    else:
+        show_best(store, word["run_id"], children)
     return sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))

@@ -15,6 +15,7 @@ from armscan.config.legacy import migrate
 from armscan.errors import TrackingError
 from armscan.reports.select import ID_CHARS, SelectedRuns
 from armscan.tracking import TrackingStore
+from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
 from armscan.training import ON_PLANE, TEST, Evaluation
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE, sha256
@@ -142,7 +143,7 @@ def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> Tr
     is_cut = found.is_pruned and n_env_steps < float(params.get(BUDGET, "inf"))
     return TrackedTraining(
         run_id=run.info.run_id,
-        name=run.info.run_name or run.info.run_id,
+        name=(run.info.run_name or run.info.run_id).removesuffix(PRUNED),
         status="pruned" if is_cut and run.info.status == "FINISHED" else run.info.status.lower(),
         started_ms=run.info.start_time or 0,
         is_whole=run.info.status == "FINISHED" and not is_cut,

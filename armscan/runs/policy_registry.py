@@ -25,6 +25,8 @@ from armscan.training import TEST
 from armscan.utils.files import POLICY_FOLDER
 
 MAX_NAME_CHARS = 256
+# The alias of the version that was registered last, `models:/NAME@champion`.
+CHAMPION = "champion"
 # A policy computes its most likely action in 32 bits on the CPU, however the run trained and evaluated it.
 PLAIN_COMPUTE = {"device": "cpu", "precision": "float32", "compile": False}
 
@@ -139,4 +141,5 @@ def _registered(run: FoundRun, name: str, card: Card) -> str:
         if error.error_code != "RESOURCE_ALREADY_EXISTS":
             raise
     version = run.client.create_model_version(name, source, run.run_id, tags=card.tags, description=card.text)
+    run.client.set_registered_model_alias(name, CHAMPION, version.version)
     return f"models:/{name}/{version.version}"

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from armscan.training import EpochReport
 
 MODEL_FILE = "MLmodel"
+# After the name of a run whose trial was pruned.
+PRUNED = " (pruned)"
 # Why a run ended before its end.
 FAILURE_TAG = "failure"
 MAX_REASON_CHARS, MAX_DIGITS = 5000, 9
@@ -113,6 +115,18 @@ class TrackedRun:
         """Set tags."""
         if tags:
             self._add(tags=tags_of(tags))
+
+    def set_pruned(self) -> None:
+        """Show that the trial of this run was pruned: by a tag, and by the name."""
+        self.set_tags({"pruned": "true", "mlflow.runName": f"{self.name.removesuffix(PRUNED)}{PRUNED}"})
+
+    def log_datasets(self, prints: Mapping[str, Mapping[str, str]]) -> None:
+        """Log the volumes as datasets of the run.
+
+        Args:
+            prints: fingerprint of each volume by its name, by the part (training, validation, test) that it is in.
+        """
+        self._add(datasets=[[part, volumes] for part, volumes in prints.items() if volumes])
 
     def _log_config(self, config: Mapping[str, Any]) -> None:
         if params := params_of(config):

@@ -7,7 +7,7 @@ import logging
 import os
 import sqlite3
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from filelock import FileLock
 from armscan.config.credentials import SERVER_PASSWORD, TRACKING_PASSWORD, check_address, database_url, read_password
 from armscan.errors import TrackingError
 from armscan.tracking.client import TrackingStore, reason_in
+from armscan.tracking.view import VIEW, VIEW_TAG
 from armscan.utils.files import SQLITE_PREFIX, check_writable, sqlite_file
 from armscan.utils.validation import check_bool, check_float
 
@@ -207,16 +208,26 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
     if found is None:
         _check_writable(location)
         try:
-            return str(store.create_experiment(name, artifact_location=location))
+            experiment_id = str(store.create_experiment(name, artifact_location=location))
         except MlflowException as error:
             # Somebody else may just have made it, or it was this one, and only the answer was lost.
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
             found = store.get_experiment_by_name(name)
+        else:
+            _keep_view(store, experiment_id, {})
+            return experiment_id
     if found.lifecycle_stage != "active":
         raise TrackingError(f"tracking.experiment is {name!r}, but it was deleted; restore it, or name another")
     _check_writable(found.artifact_location)
+    _keep_view(store, str(found.experiment_id), found.tags)
     return str(found.experiment_id)
+
+
+def _keep_view(store: TrackingStore, experiment_id: str, tags: Mapping[str, str]) -> None:
+    """Give an experiment the saved view of its runs, unless it has it."""
+    if tags.get(VIEW_TAG) != VIEW:
+        store.set_experiment_tag(experiment_id, VIEW_TAG, VIEW)
 
 
 def check_artifacts(store: TrackingStore, experiment_id: str) -> None:

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import json
 import threading
 import time
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from armscan.config.trust import TRUST
 from armscan.errors import TrackingError, UntrustedError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, why_away
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
+from armscan.tracking.sanitize import MAX_PARAM_CHARS, shortened
+from armscan.utils.files import VOLUMES_FILE
 from armscan.utils.log import log
 from armscan.utils.retry import FIRST_PAUSE_S
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+    from mlflow.entities import DatasetInput
 
 # Of each, the class in mlflow.entities, and how many MLflow takes in one request.
 AT_ONCE = {"metrics": ("Metric", 1000), "params": ("Param", 100), "tags": ("RunTag", 100)}
 ENTRIES_AT_ONCE = 200
+# Of a dataset, at most 36 in MLflow.
+DIGEST_CHARS = 16
 LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
 
 
@@ -143,6 +151,22 @@ def deliver(
         n_delivered += len(entries)
 
 
+def dataset_input(part: str, prints: Mapping[str, str]) -> DatasetInput:
+    """Return volumes as a dataset of MLflow; whose digest is that of their fingerprints.
+
+    Args:
+        part: what the volumes are for, such as `training`.
+        prints: fingerprint of each volume by its name.
+    """
+    from mlflow.entities import Dataset, DatasetInput, InputTag
+
+    digest = hashlib.sha256("".join(sorted(prints.values())).encode()).hexdigest()[:DIGEST_CHARS]
+    profile = json.dumps({"volumes": len(prints)})
+    source = shortened(" ".join(prints), MAX_PARAM_CHARS, VOLUMES_FILE)
+    dataset = Dataset(f"{part} volumes", digest, "armscan", json.dumps({"volumes": source}), profile=profile)
+    return DatasetInput(dataset, [InputTag("mlflow.data.context", part)])
+
+
 def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any]) -> None:
     from mlflow import entities
     from mlflow.exceptions import MlflowException
@@ -175,6 +199,9 @@ def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any])
                     client.log_artifact(run_id, str(file), place)
                 else:
                     log(f"run {run_id}: {file} was removed before the store could keep it")
+        case "datasets":
+            for datasets in values:
+                client.log_inputs(run_id, [dataset_input(*each) for each in datasets])
         case "address":
             return
         case _:

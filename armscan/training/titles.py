@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from armscan.training.on_plane import limits_among
 from armscan.training.result_table import QUANTITIES
 
@@ -18,7 +20,14 @@ TITLES = {
     "solved": "solved, share of seeds",
 }
 # What a few lines have place for, beside the on-plane rates.
-LEADING = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps", "env_steps", "training_s")
+LEADING = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
+COSTS = ("env_steps", "training_s")
+
+
+def leading_among(metrics: Iterable[str]) -> list[str]:
+    """Return the names of the leading metrics among some, on-plane rates first."""
+    known = list(metrics)
+    return [*(limits.metric for limits in limits_among(known)), *(name for name in LEADING if name in known)]
 
 
 def title_of(metric: str) -> str:

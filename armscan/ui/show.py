@@ -61,7 +61,10 @@ def show(
         print(f"studies   {start_dashboard(studies, artifacts, dashboard_port, mlflow=runs_at)}", flush=True)
     if has_runs:
         with mlflow_server(tracking, mlflow_port) as process:
-            print(f"runs      http://{HOST}:{mlflow_port}   under Model training, at its top left")
+            # Deferred: it loads what knows of runs.
+            from armscan.ui.runs_page import runs_page
+
+            print(f"runs      {runs_page(f'http://{HOST}:{mlflow_port}')}")
             print(f"Ctrl-C ends {'both' if studies is not None else 'it'}", flush=True)
             process.wait()
     elif studies is not None:

@@ -198,7 +198,7 @@ def test_ui_shows_what_is_there_until_it_is_interrupted(both, look):
     looked = look(both)
     assert looked.printed.splitlines()[-3:] == [
         f"studies   {looked.dashboard}",
-        f"runs      {looked.mlflow}   under Model training, at its top left",
+        f"runs      {looked.mlflow}/#/experiments",
         "Ctrl-C ends both",
     ]
     assert studies_at(looked.dashboard) == ["a"]
@@ -353,10 +353,11 @@ def test_ui_shows_a_study_in_the_browser(small_study, look, browser):
     assert browser.address.startswith(f"{looked.mlflow}/#/")
     assert study.trials[1].user_attrs["mlflow_run"] in browser.address
 
-    browser.open(looked.mlflow)
-    browser.click("span", text="Model training")
-    browser.click("a", text="armscan")
+    (page,) = [line.split()[1] for line in looked.printed.splitlines() if line.startswith("runs ")]
+    browser.open(page)
     browser.find("a", text="study small")
+    # Of the saved view, with the figures of the best trial.
+    browser.find("[col-id='metrics.`test_volumes/on_plane_5mm_10deg`']")
     assert not browser.has("a", text="small-0001")
     # The button that shows the children of a run.
     browser.click("[data-component-id*='runnamecellrenderer']")

@@ -7,15 +7,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import optuna
 from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.stats.aggregation import over_seeds
 from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
+from armscan.sweeps.study.study import best_trials
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.metrics import COUNTS
 from armscan.training.on_plane import limits_among
 from armscan.training.result_table import with_baselines
+from armscan.training.titles import leading_among
 
 OF_VOLUME = re.compile(r"test/volume/(.+)/(\w+)")
 OF_TEST = "test/"
@@ -66,6 +69,24 @@ def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
         if trial.state == TrialState.COMPLETE:
             of_number.setdefault(int(trial.user_attrs[FINALIST]), []).append(trial)
     return [_config_result(number, of_seeds) for number, of_seeds in of_number.items()]
+
+
+def best_metrics(search: optuna.Study, final: Sequence[FrozenTrial]) -> dict[str, float]:
+    """Return the leading metrics of a study's best trial and of its best final evaluation, by the names that runs use.
+
+    Args:
+        search: study of the search.
+        final: trials of the final evaluation; empty without one.
+    """
+    found: dict[str, float] = {}
+    if best := best_trials(search, 1):
+        metrics = best[0].user_attrs.get(METRICS, {})
+        found |= {f"validation/{name}": metrics[name] for name in leading_among(metrics)}
+    if results := [result.figures.metrics() for result in final_results(final)]:
+        leading = leading_among(results[0])
+        highest = max(results, key=lambda metrics: metrics[leading[0]] if leading else 0.0)
+        found |= {f"test_volumes/{name}": highest[name] for name in leading_among(highest)}
+    return found
 
 
 def _config_result(number: int, of_seeds: Sequence[FrozenTrial]) -> ConfigResult:

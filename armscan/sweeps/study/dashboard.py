@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import optuna
@@ -11,10 +11,8 @@ from optuna.artifacts import FileSystemArtifactStore, upload_artifact
 from optuna.trial import Trial
 
 from armscan.config.services import MLFLOW_PORT
-from armscan.sweeps.scheduling.state import ENV_STEPS
 from armscan.tracking import TrackingStore
-from armscan.training.on_plane import limits_among
-from armscan.training.titles import LEADING, title_of, value_text
+from armscan.training.titles import COSTS, leading_among, title_of, value_text
 from armscan.utils.log import log
 
 # Where `armscan ui` serves the runs of a store that is no server, but where it was given another port.
@@ -53,7 +51,7 @@ def note_run(
 def table_of_seeds(of_seeds: Mapping[int, Mapping[str, float]]) -> str:
     """Return the leading metrics of seeds as a table in Markdown, a column for each seed."""
     known = next(iter(of_seeds.values()))
-    names = _leading(known)
+    names = [*leading_among(known), *(name for name in COSTS if name in known)]
     rows = [["validation, best epoch", *(f"seed {seed}" for seed in of_seeds)], ["---", *("---:" for _ in of_seeds)]]
     for name in names:
         values = (metrics.get(name, math.nan) for metrics in of_seeds.values())
@@ -71,14 +69,15 @@ def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float
     tested = {name.removeprefix(TEST): value for name, value in metrics.items() if name.startswith(TEST)}
     of, statistic = "test volumes: " if tested else "", f" (IQM of {n_seeds} seeds)" if n_seeds > 1 else ""
     chosen = tested or metrics
-    names = [name for name in _leading(chosen) if name != ENV_STEPS and math.isfinite(chosen[name])]
+    names = [name for name in leading_among(chosen) if math.isfinite(chosen[name])]
     return {f"{of}{title_of(name)}{statistic}": float(f"{chosen[name]:.4g}") for name in names}
 
 
-def _leading(metrics: Iterable[str]) -> list[str]:
-    """Return the names of the leading metrics among some, on-plane rates first."""
-    known = list(metrics)
-    return [*(limits.metric for limits in limits_among(known)), *(name for name in LEADING if name in known)]
+def named_as_of_runs(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Return the leading metrics of a trial by the names that runs use, so that MLflow has them in the same columns."""
+    tested = {name.removeprefix(TEST): value for name, value in metrics.items() if name.startswith(TEST)}
+    of_phases = {"validation": metrics, "test_volumes": tested}
+    return {f"{of}/{name}": each[name] for of, each in of_phases.items() for name in leading_among(each)}
 
 
 def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:

@@ -144,6 +144,7 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
                 )
             except optuna.TrialPruned as error:
                 pruned = error
+                tracked.set_pruned()
             else:
                 concluded = conclude(setup, result, tracked, folder) if conclude else {}
             draw_learning_curve(reporter.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)

@@ -22,7 +22,7 @@ from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.components import make, read_settings
-from armscan.sweeps.study.dashboard import note_run, show_picture, shown_metrics
+from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_picture, shown_metrics
 from armscan.sweeps.study.open import Phase, open_for_work
 from armscan.sweeps.study.study import enqueue_final_trials
 from armscan.sweeps.tasks.attempt import (
@@ -200,9 +200,9 @@ class Worker:
         log(f"trial {trial.number} " + (f"failed: {reason}" if reason else f"{state.name.lower()} {shown}".rstrip()))
         if tracked is None:
             return
-        tracked.log_metrics(metrics, n_env_steps=0)
+        tracked.log_metrics(metrics | named_as_of_runs(metrics), n_env_steps=0)
         if state == TrialState.PRUNED:
-            tracked.set_tags({"pruned": "true"})
+            tracked.set_pruned()
         tracked.end("FAILED" if reason else "FINISHED", reason=reason)
 
     def _let_go(self, trial: Trial, tracked: TrackedRun | None) -> None:

@@ -1,0 +1,36 @@
+"""The best job of a grid, whose figures the grid's own run shows in MLflow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mlflow.entities import Metric, Run, RunTag
+
+from armscan.tracking import TrackingStore
+from armscan.tracking.outbox import now_ms
+from armscan.training.on_plane import ON_PLANE, PREFIX
+from armscan.training.titles import leading_among
+
+TESTED = "test_volumes/"
+# Of the grid's run: which job its figures are of.
+BEST_TAG = "best.run"
+
+
+def best_of(runs: Sequence[Run]) -> Run | None:
+    """Return the run with the highest on-plane rate on its test volumes; None if none was evaluated."""
+    names = {name for run in runs for name in run.data.metrics if name.startswith(f"{TESTED}{PREFIX}")}
+    # By other limits, where the configuration has others.
+    usual = f"{TESTED}{ON_PLANE[0].metric}"
+    rate = usual if usual in names or not names else min(names)
+    evaluated = [run for run in runs if rate in run.data.metrics]
+    return max(evaluated, key=lambda run: float(run.data.metrics[rate]), default=None)
+
+
+def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:
+    """Give the run of a grid the leading figures of its best job, in the columns that jobs have them in."""
+    if (best := best_of(jobs)) is None:
+        return
+    tested = {name.removeprefix(TESTED): value for name, value in best.data.metrics.items() if name.startswith(TESTED)}
+    now = now_ms()
+    metrics = [Metric(f"{TESTED}{name}", tested[name], now, 0) for name in leading_among(tested)]
+    store.log_batch(parent_id, metrics=metrics, tags=[RunTag(BEST_TAG, best.info.run_id)])

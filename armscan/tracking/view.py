@@ -1,0 +1,67 @@
+"""The view of an experiment's runs in MLflow: the columns that matter, and learning curves as the first charts.
+
+MLflow keeps a shared view as a tag of the experiment, and shows it where an address names its key.
+"""
+
+from __future__ import annotations
+
+import json
+
+from armscan.training.on_plane import ON_PLANE
+
+VIEW_KEY = "armscan"
+VIEW_TAG = f"mlflow.sharedViewState.{VIEW_KEY}"
+LEADING = ON_PLANE[0].metric
+FIGURES = (LEADING, "median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
+CURVES = {
+    f"validation/{LEADING}": ON_PLANE[0].title,
+    "validation/success_rate": "success, by reward",
+    "validation/mean_steps": "steps, mean",
+}
+SECTION = "learning-curves"
+# Of a heading.
+LETTER_PX, AROUND_PX = 6, 40
+
+
+def _line(metric: str, title: str) -> dict[str, object]:
+    """Return a chart of a metric by environment step, as MLflow describes it."""
+    return {
+        "type": "LINE",
+        "uuid": f"{SECTION}-{metric.rpartition('/')[2]}",
+        "metricSectionId": SECTION,
+        "metricKey": metric,
+        "selectedMetricKeys": [metric],
+        "displayName": title,
+        "xAxisKey": "step",
+        "runsCountToCompare": 10,
+        "lineSmoothness": 0,
+        "scaleType": "linear",
+        "deleted": False,
+        "isGenerated": False,
+    }
+
+
+def _columns() -> dict[str, int]:
+    """Return the columns in their order, each with its width in pixels."""
+    metrics = [*(f"test_volumes/{name}" for name in FIGURES), f"validation/{LEADING}"]
+    return {
+        **{f"metrics.`{name}`": LETTER_PX * len(name) + AROUND_PX for name in metrics},
+        "params.`seed`": 80,
+        "tags.`overrides`": 260,
+        "tags.`pruned`": 90,
+    }
+
+
+VIEW = json.dumps(
+    {
+        "selectedColumns": [*_columns()],
+        "columnOrder": [*_columns()],
+        "columnWidths": _columns(),
+        "compareRunCharts": [_line(*each) for each in CURVES.items()],
+        "compareRunSections": [
+            {"uuid": SECTION, "name": "Learning curves, validation", "display": True, "isReordered": False}
+        ],
+        "isAccordionReordered": True,
+    },
+    ensure_ascii=False,
+)

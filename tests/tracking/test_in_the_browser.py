@@ -1,0 +1,85 @@
+"""What MLflow's UI shows of runs without a hand: columns, best figures, pruned trials, datasets."""
+
+import json
+
+import pytest
+from mlflow.entities import Metric
+
+from armscan.launch.best_job import BEST_TAG, show_best
+from armscan.tracking import TrackedRun, open_store
+from armscan.tracking.view import VIEW, VIEW_TAG
+
+RATE, STEPS = "test_volumes/on_plane_5mm_10deg", "test_volumes/mean_steps"
+
+
+@pytest.fixture
+def store(tmp_path):
+    settings = {"experiment": "a", "artifacts": str(tmp_path / "artifacts"), "wait_s": 10.0}
+    return lambda: open_store(f"sqlite:///{tmp_path}/mlruns.db", **settings)
+
+
+@pytest.fixture
+def tracked(store, tmp_path):
+    client, experiment_id = store()
+    with TrackedRun.start(client, experiment_id, name="a-0001", config={}, tags={}, folder=tmp_path) as started:
+        yield started
+
+
+def run_of(tracked, store):
+    """Ends a run; returns it as the store has it."""
+    assert tracked.end("FINISHED")
+    return store()[0].get_run(tracked.run_id)
+
+
+def test_experiment_has_the_view_also_where_it_was_made_before(store):
+    client, experiment_id = store()
+    assert client.get_experiment(experiment_id).tags[VIEW_TAG] == VIEW
+    client.set_experiment_tag(experiment_id, VIEW_TAG, "{}")
+    store()
+    assert client.get_experiment(experiment_id).tags[VIEW_TAG] == VIEW
+
+
+def test_view_leads_with_the_on_plane_rate_and_its_curve():
+    view = json.loads(VIEW)
+    assert view["selectedColumns"][0] == f"metrics.`{RATE}`"
+    assert view["columnOrder"] == view["selectedColumns"] == [*view["columnWidths"]]
+    (section,) = view["compareRunSections"]
+    first = view["compareRunCharts"][0]
+    assert (first["metricKey"], first["type"]) == ("validation/on_plane_5mm_10deg", "LINE")
+    assert {chart["metricSectionId"] for chart in view["compareRunCharts"]} == {section["uuid"]}
+
+
+def test_run_of_a_grid_shows_the_figures_of_its_best_job(store):
+    client, experiment_id = store()
+    parent, *jobs = (client.create_run(experiment_id, name=name, tags={}).info.run_id for name in ("parent", "a", "b"))
+    for job, rate in zip(jobs, (0.25, 0.75), strict=True):
+        metrics = [Metric(RATE, rate, 1, 5), Metric(STEPS, 4 * rate, 1, 5), Metric(f"{RATE}_low", 0.1, 1, 5)]
+        client.log_batch(job, metrics=metrics)
+    show_best(client, parent, [client.get_run(job) for job in jobs])
+    run = client.get_run(parent)
+    assert run.data.metrics == {RATE: 0.75, STEPS: 3.0}
+    assert run.data.tags[BEST_TAG] == jobs[1]
+
+
+def test_run_of_a_grid_without_evaluated_jobs_shows_nothing(store):
+    client, experiment_id = store()
+    parent = client.create_run(experiment_id, name="parent", tags={}).info.run_id
+    show_best(client, parent, [client.get_run(parent)])
+    assert client.get_run(parent).data.metrics == {}
+
+
+def test_pruned_run_says_so_in_its_name(tracked, store):
+    tracked.set_pruned()
+    run = run_of(tracked, store)
+    assert (run.info.run_name, run.data.tags["pruned"]) == ("a-0001 (pruned)", "true")
+
+
+def test_volumes_are_datasets_with_a_digest_of_their_fingerprints(tracked, store):
+    tracked.log_datasets({"training": {"a": "1" * 64, "b": "2" * 64}, "test": {"b": "2" * 64, "a": "1" * 64}, "x": {}})
+    inputs = {each.dataset.name: each for each in run_of(tracked, store).inputs.dataset_inputs}
+    assert {name: each.tags[0].value for name, each in inputs.items()} == {
+        "training volumes": "training",
+        "test volumes": "test",
+    }
+    assert len({each.dataset.digest for each in inputs.values()}) == 1
+    assert json.loads(inputs["training volumes"].dataset.source) == {"volumes": "a b"}
