@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -9,11 +12,13 @@ import click
 from armscan.cli.options import FILE_PATH, examples, is_given, storage_option, tracking_option
 from armscan.errors import InvalidValueError, StudyError, listed
 
+# Between two writings of a report that is watched.
+WATCH_S = 10
 # The option with the place of what the report is of.
 PLACES = {"study": "storage", "runs": "tracking"}
 
 
-@click.command(epilog=examples("report --study sac_y", "report --runs 4f2a,91c0"))
+@click.command(epilog=examples("report --study sac_y", "report --study sac_y --watch", "report --runs 4f2a,91c0"))
 @click.option("--study", metavar="NAME", help="Report on this study.")
 @click.option(
     "--runs",
@@ -22,9 +27,10 @@ PLACES = {"study": "storage", "runs": "tracking"}
     "it, experiment:NAME for an MLflow experiment.",
 )
 @click.option("--out", type=FILE_PATH, metavar="FOLDER", help="Folder of the report.  [default: a new one in reports]")
+@click.option("--watch", is_flag=True, help="Write the report of a study again and again until Ctrl-C; it refreshes.")
 @storage_option(help="Optuna storage of the study.")
 @tracking_option(help="MLflow tracking store of the runs.")
-def report(study: str | None, runs: str | None, out: Path | None, storage: str, tracking: str) -> None:
+def report(study: str | None, runs: str | None, out: Path | None, watch: bool, storage: str, tracking: str) -> None:
     """Report on a study, or compare runs.
 
     The report is one HTML file that needs no server, with its numbers as CSV beside it. The study or the runs may still
@@ -36,6 +42,8 @@ def report(study: str | None, runs: str | None, out: Path | None, storage: str, 
     of, other = ("study", "runs") if runs is None else ("runs", "study")
     if is_given(PLACES[other]):
         raise click.UsageError(f"--{PLACES[other]} is given, but it is for --{other}, and this report is of --{of}")
+    if watch and runs is not None:
+        raise click.UsageError("--watch is given, but it is for --study, and this report is of --runs")
     if out is not None:
         nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
         if not nearest.is_dir():
@@ -46,11 +54,32 @@ def report(study: str | None, runs: str | None, out: Path | None, storage: str, 
     if runs is not None:
         file = compare_runs(runs, tracking, None if out is None else str(out))
     elif study is not None:
-        file = _report_on_study(study, storage, out)
+        write = _reporter_on_study(study, storage, out)
+        if watch:
+            _watch(write)
+            return
+        file = write(None)
     print(f"look at   {file}")
 
 
-def _report_on_study(name: str, uri: str, out: Path | None) -> Path:
+def _watch(write: Callable[[int | None], Path]) -> None:
+    """Write a report again and again until Ctrl-C, which writes it for the last time."""
+    from armscan.errors import StorageAwayError
+    from armscan.utils.retry import no_retry
+
+    print(f"look at   {write(WATCH_S)}", f"it is written every {WATCH_S} s; Ctrl-C ends that", sep="\n", flush=True)
+    try:
+        while True:
+            time.sleep(WATCH_S)
+            # What is there stays as it is until the storage is back.
+            with contextlib.suppress(StorageAwayError), no_retry():
+                write(WATCH_S)
+    finally:
+        write(None)
+
+
+def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int | None], Path]:
+    """Return what writes the report of a study as it stands then, for a browser that reads it again after seconds."""
     import optuna
 
     from armscan.sweeps.results.report import write_report
@@ -71,10 +100,14 @@ def _report_on_study(name: str, uri: str, out: Path | None) -> Path:
     study = optuna.load_study(study_name=name, storage=storage.optuna)
     if not is_ours(study):
         raise StudyError(f"--study is {name!r}, but that one in {storage.uri!r} was not made by armscan")
-    check_trials(study)
-    evaluated = []
-    if name + FINAL_EVAL_SUFFIX in names:
-        final = optuna.load_study(study_name=name + FINAL_EVAL_SUFFIX, storage=storage.optuna)
-        check_trials(final, n_searched=len(study.get_trials(deepcopy=False)))
-        evaluated = final.get_trials(deepcopy=False)
-    return write_report(study, evaluated, out or Path("reports", name))
+
+    def write(refresh_s: int | None) -> Path:
+        check_trials(study)
+        evaluated = []
+        if name + FINAL_EVAL_SUFFIX in optuna.get_all_study_names(storage.optuna):
+            final = optuna.load_study(study_name=name + FINAL_EVAL_SUFFIX, storage=storage.optuna)
+            check_trials(final, n_searched=len(study.get_trials(deepcopy=False)))
+            evaluated = final.get_trials(deepcopy=False)
+        return write_report(study, evaluated, out or Path("reports", name), refresh_s=refresh_s)
+
+    return write

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armscan.cli.options import FILE_PATH, CommaSeparated, Moment, UriParam, examples, tracking_option, trust_option
+from armscan.cli.options import (
+    FILE_PATH,
+    CommaSeparated,
+    Moment,
+    UriParam,
+    examples,
+    storage_option,
+    tracking_option,
+    trust_option,
+)
 from armscan.errors import printable
 
 if TYPE_CHECKING:
@@ -53,7 +62,7 @@ def _with_selection(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @click.group()
 def runs() -> None:
-    """List, show, prune, sync and reproduce runs."""
+    """List, show, stop, prune, sync and reproduce runs."""
 
 
 @runs.command(
@@ -129,6 +138,35 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
     if taken:
         print(f"remove it {armscan_command(*click.get_current_context().obj, '--apply')}")
     return 0
+
+
+@runs.command(epilog=examples("runs stop sac_y", "runs stop 3bf2"))
+@click.argument("target", metavar="RUN|STUDY")
+@storage_option(help="Optuna storage of the study.")
+@tracking_option()
+def stop(target: str, storage: str, tracking: str) -> None:
+    """Stop a trial, a study, or a run of this machine.
+
+    STUDY is the name of a study: its trials are requeued at their next report, and the same command resumes it.
+    RUN is an MLflow run ID or its first four or more characters. A trial ends at its next report, as pruned, and counts
+    as finished; a run that is of no study is interrupted as by Ctrl-C.
+    """
+    from armscan.runs.stop import interrupt, target_of
+    from armscan.sweeps.stop import is_study, stop_study, stop_trial
+    from armscan.sweeps.storage.storage import existing_storage
+    from armscan.tracking import find_run
+
+    if is_study(existing_storage(storage, where="--storage"), target):
+        print(stop_study(storage, target))
+        return
+    with _open(tracking) as client:
+        run = find_run(client, target)
+    if (found := target_of(run)) is None:
+        print(interrupt(run))
+    elif found.trial is None:
+        print(stop_study(storage, found.study))
+    else:
+        print(stop_trial(storage, found.study, found.trial))
 
 
 @runs.command(epilog=examples("runs sync outputs", "runs sync studies/sac_y"))

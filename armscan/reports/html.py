@@ -6,10 +6,12 @@ import base64
 import csv
 import html
 from collections.abc import Mapping, Sequence
+from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from armscan.errors import InvalidValueError
+from armscan.utils.files import atomic_write
 
 if TYPE_CHECKING:
     from plotly import graph_objects
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 REPORT_FILE = "report.html"
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="generator" content="armscan">
-<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">{head}<title>{title}</title>
 <style>
 body {{ font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1160px; margin: 1.5rem auto; padding: 0 1rem; }}
 h1, p, li, summary, figcaption, code, td {{ overflow-wrap: anywhere; }}
@@ -60,6 +62,11 @@ summary {{ cursor: pointer; font-weight: bold; margin: 1rem 0; }}
 {body}
 </body></html>
 """
+# A page that reads itself again, and stays where it was scrolled to.
+REFRESH = """<meta http-equiv="refresh" content="{0}"><script>
+addEventListener("beforeunload", () => sessionStorage.setItem("scrolled", scrollY));
+addEventListener("load", () => scrollTo(0, sessionStorage.getItem("scrolled") ?? 0));
+</script>"""
 # By which a report is known.
 MARK, N_MARK_CHARS = '<meta name="generator" content="armscan">', 200
 # Without what leads elsewhere: a button would offer to upload a chart.
@@ -76,7 +83,14 @@ class Markup(str):
     __slots__ = ()
 
 
-def write_page(folder: Path, title: str, parts: Sequence[str], tables: Mapping[str, Sequence[Row]]) -> Path:
+def write_page(
+    folder: Path,
+    title: str,
+    parts: Sequence[str],
+    tables: Mapping[str, Sequence[Row]],
+    *,
+    refresh_s: int | None = None,
+) -> Path:
     """Write a report.
 
     Args:
@@ -84,6 +98,7 @@ def write_page(folder: Path, title: str, parts: Sequence[str], tables: Mapping[s
         title: title of the page.
         parts: pieces of HTML, one below the other.
         tables: rows by the names of their files; each row's values by column.
+        refresh_s: seconds after which a browser reads the page again. Default: None, never.
 
     Returns:
         The HTML file.
@@ -104,19 +119,23 @@ def write_page(folder: Path, title: str, parts: Sequence[str], tables: Mapping[s
     links = "".join(f'<li><a href="{each}.csv">{each}.csv</a></li>' for each in tables)
     body = "\n".join([*parts, f"<h2>Numbers</h2><ul>{links}</ul>"])
     file = folder / REPORT_FILE
-    file.write_text(page(title, body, script=get_plotlyjs()))
+    text = page(title, body, script=get_plotlyjs(), refresh_s=refresh_s)
+    # A browser may be reading it.
+    atomic_write(file, methodcaller("write", text.encode()))
     return file
 
 
-def page(title: str, body: str, *, script: str = "") -> str:
+def page(title: str, body: str, *, script: str = "", refresh_s: int | None = None) -> str:
     """Return a page that needs no server.
 
     Args:
         title: title and first heading.
         body: pieces of HTML.
         script: JavaScript of the page. Default: none.
+        refresh_s: seconds after which a browser reads the page again. Default: None, never.
     """
-    return PAGE.format(title=html.escape(title), script=script, body=body)
+    head = "" if refresh_s is None else REFRESH.format(refresh_s)
+    return PAGE.format(title=html.escape(title), head=head, script=script, body=body)
 
 
 def _is_report(file: Path) -> bool:

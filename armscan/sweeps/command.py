@@ -45,6 +45,8 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
         return 0
     opened = open_for_work(settings, task, config, trial_words)
     for phase in opened.phases:
+        if phase.scheduler.go_on():
+            print(f"{phase.name}: was stopped, and goes on")
         if n_failed := phase.scheduler.reset_failures():
             print(f"{phase.name}: {n_failed} failures before this start are ignored")
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from armscan.config.services import MLFLOW_PORT
@@ -26,10 +26,11 @@ NAMES = {
     "retry_of": "retry of trial",
     "judged": "final training of trial",
     "judged_seed": "seed",
+    "stop": "stopped",
 }
 # Of a running trial, from what its worker reports.
 PROGRESS = {"worker": "worker", "seed": "seed", "env_steps": "environment steps", "return": "return, mean"}
-Attributes = Sequence[Mapping[str, Any]]
+TELL = re.compile(r"/api/trials/(\d+)/tell")
 
 
 class DashboardView:
@@ -37,14 +38,20 @@ class DashboardView:
 
     Args:
         application: Optuna's dashboard.
+        stop: asks the worker of a trial to end it, by the trial's ID in the storage; returns whether there is one. The
+            button that fails a running trial does that: a worker keeps what it has, and the trial ends as pruned.
         mlflow: address of MLflow's UI, to which the links of trials lead. Default: None, they stay as they are.
     """
 
-    def __init__(self, application: WSGIApplication, mlflow: str | None = None) -> None:
-        self._application, self._mlflow = application, mlflow
+    def __init__(self, application: WSGIApplication, stop: Callable[[int], bool], mlflow: str | None = None) -> None:
+        self._application, self._stop, self._mlflow = application, stop, mlflow
 
     def __call__(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         """Answer a request."""
+        told = TELL.fullmatch(environ.get("PATH_INFO", ""))
+        if told and environ["REQUEST_METHOD"] == "POST" and self._stop(int(told[1])):
+            start_response("204 No Content", [("Content-Length", "0")])
+            return []
         if environ["REQUEST_METHOD"] != "GET" or not STUDIES.fullmatch(environ.get("PATH_INFO", "")):
             return self._application(environ, start_response)
         answered: list[tuple[str, list[tuple[str, str]]]] = []

@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from socketserver import ThreadingMixIn
 from threading import Thread
@@ -75,8 +76,11 @@ def start_dashboard(
     from optuna.artifacts import FileSystemArtifactStore
     from optuna_dashboard import wsgi
 
+    from armscan.sweeps.stop import stop_running_trial
+
     application = wsgi(storage.optuna, artifact_store=FileSystemArtifactStore(artifacts))
-    checked = HostCheck(DashboardView(application, mlflow), allowed_hosts or (f"{HOST}:{port}", f"localhost:{port}"))
+    view = DashboardView(application, partial(stop_running_trial, storage), mlflow)
+    checked = HostCheck(view, allowed_hosts or (f"{HOST}:{port}", f"localhost:{port}"))
     server = make_server(host, port, checked, server_class=_Threaded, handler_class=_Quiet)
     Thread(target=server.serve_forever, daemon=True).start()
     return f"http://{host}:{port}"

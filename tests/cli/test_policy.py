@@ -77,7 +77,7 @@ def test_policy_is_registered_with_the_figures_of_its_run(answer, armscan, tmp_p
     assert first.run_id == run_id
     assert f"`armscan evaluate {run_id}" in first.description
     assert first.tags == {}
-    assert client.get_model_version_by_alias("wrist plane", "champion").version == "1"
+    assert str(client.get_model_version_by_alias("wrist plane", "champion").version) == "1"
     assert client.get_run(run_id).data.tags["policy"] == "kept"
     models = [mlflow.pyfunc.load_model(uri) for uri in ("models:/wrist plane/1", f"runs:/{run_id}/policy")]
     np.testing.assert_array_equal(*(model.predict(model.input_example) for model in models))
@@ -92,7 +92,7 @@ def test_policy_is_registered_with_the_figures_of_its_run(answer, armscan, tmp_p
     assert "| steps, mean | 3.00 (2.00–4.00) |" in second.description
     assert second.tags["test_volumes/mean_steps"] == "3"
     assert second.source == first.source
-    assert client.get_model_version_by_alias("wrist plane", "champion").version == "2"
+    assert str(client.get_model_version_by_alias("wrist plane", "champion").version) == "2"
     assert client.get_run(run_id).info.end_time == made_at
 
     assert armscan("evaluate", run_id, "--episodes=2", "--success-threshold=0.2")[0] == 0

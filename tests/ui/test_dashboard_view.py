@@ -92,6 +92,36 @@ def test_studies_of_others_are_shown_as_they_are(dashboard):
     assert shown(study["user_attrs"]) == {"space": "theirs"}
 
 
+def fail_trial(storage, tmp_path, trial):
+    """Presses the button that fails a trial; returns how the trial stands then."""
+    port, _ = free_ports()
+    address = start_dashboard(storage, tmp_path, port)
+    told = urllib.request.Request(
+        f"{address}/api/trials/{trial._trial_id}/tell",
+        json.dumps({"state": "fail"}).encode(),
+        {"Content-Type": "application/json"},
+    )
+    with urllib.request.urlopen(told, timeout=30) as answer:
+        assert answer.status == 204
+    return storage.optuna.get_trial(trial._trial_id)
+
+
+def test_button_that_fails_a_trial_asks_its_worker_to_end_it(tmp_path):
+    storage = open_storage(str(tmp_path / "optuna.journal"))
+    trial = optuna.create_study(study_name="a", storage=storage.optuna).ask()
+    trial.set_user_attr("lease", LEASE)
+    asked = fail_trial(storage, tmp_path, trial)
+    assert asked.state.name == "RUNNING"
+    assert asked.user_attrs["stop"].startswith("at 20")
+
+
+def test_button_fails_trials_of_others(tmp_path):
+    storage = open_storage(str(tmp_path / "optuna.journal"))
+    trial = optuna.create_study(study_name="theirs", storage=storage.optuna).ask()
+    failed = fail_trial(storage, tmp_path, trial)
+    assert (failed.state.name, failed.user_attrs) == ("FAIL", {})
+
+
 @pytest.mark.parametrize("lease", ["{", "[1]", [1], 3])
 def test_lease_that_is_none_hides_no_study(dashboard, lease):
     _, study = dashboard({}, {"lease": lease, "env_steps": 3}, is_running=True)

@@ -20,7 +20,7 @@ from armscan.errors import StorageAwayError
 from armscan.experiment.console import print_table, print_where_to_look
 from armscan.experiment.results import volume_notes
 from armscan.sweeps.results.summary import final_results, final_table, values_of
-from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, StudyState
+from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, STOP, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.study import best_trials
@@ -141,7 +141,8 @@ def _describe(trial: FrozenTrial, objectives: Iterable[str]) -> str:
     if trial.state == TrialState.FAIL:
         return f"{name} failed{', retried' if RETRIED in attributes else ''}: {attributes.get(FAILURE)} [{tried}]"
     if trial.state == TrialState.PRUNED:
-        return f"{name} pruned after {attributes.get(ENV_STEPS)} environment steps [{tried}]"
+        how = "stopped" if STOP in attributes else "pruned"
+        return f"{name} {how} after {attributes.get(ENV_STEPS)} environment steps [{tried}]"
     return f"{name} done: {values_of(trial, objectives)} [{tried}]"
 
 
@@ -150,6 +151,9 @@ def print_result(opened: OpenedStudy) -> int:
     scheduler, settings = opened.search.scheduler, opened.settings
     state = scheduler.state()
     print(_summary(opened, state))
+    if stopped := scheduler.look_for_stop():
+        print(f"the study was stopped {stopped}; the same command resumes it")
+        return 0
     wrong = scheduler.broken(state)
     if wrong is None and scheduler.end(state) is None:
         wrong = (

@@ -24,6 +24,7 @@ from armscan.sweeps.scheduling.state import (
     METRICS,
     RETRIED,
     RETRY_OF,
+    STOP,
     StudyState,
     env_steps_of,
 )
@@ -39,13 +40,16 @@ STATES = {"complete": "finished", "fail": "failed"}
 Row = dict[str, Any]
 
 
-def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folder: Path) -> Path:
+def write_report(
+    study: optuna.Study, final_trials: Sequence[FrozenTrial], folder: Path, *, refresh_s: int | None = None
+) -> Path:
     """Write the report of a study.
 
     Args:
         study: in its storage.
         final_trials: those of the final evaluation; empty without one.
         folder: takes `report.html` and the CSV files.
+        refresh_s: seconds after which a browser reads the page again. Default: None, never.
 
     Returns:
         The HTML file.
@@ -83,7 +87,7 @@ def write_report(study: optuna.Study, final_trials: Sequence[FrozenTrial], folde
         "<h2>Failures</h2>",
         _failures(trials),
     ]
-    return write_page(folder, f"Study {study.study_name}", parts, tables)
+    return write_page(folder, f"Study {study.study_name}", parts, tables, refresh_s=refresh_s)
 
 
 def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
@@ -193,6 +197,8 @@ def _endings(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
             cause = _cause(trial) + (", retried" if RETRIED in trial.user_attrs else "")
         elif trial.state == TrialState.PRUNED:
             cause = f"behind the others at environment step {trial.last_step}"
+            if STOP in trial.user_attrs:
+                cause = f"stopped: {trial.user_attrs[STOP]}"
         of_ending.setdefault((trial.state.name.lower(), cause), []).append(trial.number)
     return [
         {"ending": ending, "cause": cause, "trials": len(numbers), "which": " ".join(map(str, numbers))}

@@ -24,6 +24,7 @@ from armscan.sweeps.scheduling.state import (
     RESET_FAILURES,
     RETRIED,
     RETRY_OF,
+    STOP,
     Limits,
     PendingWrites,
     StudyState,
@@ -39,6 +40,8 @@ class TrialScheduler:
     def __init__(self, study: optuna.Study, storage: Storage, limits: Limits, *, is_open: bool = True) -> None:
         self.study, self.storage = study, storage
         self.limits, self._is_open = limits, is_open
+        # Who asked the study to stop, as far as this process knows; see `look_for_stop`.
+        self.stopped = ""
 
     def state(self) -> StudyState:
         """Return the state of the study."""
@@ -98,6 +101,8 @@ class TrialScheduler:
             return f"{len(state.finished)} trials have finished"
         if broken := self.broken(state):
             return broken
+        if self.stopped:
+            return f"the study was stopped {self.stopped}"
         if not self._is_open and not state.waiting:
             return f"{len(state.finished)} trials have finished, {len(state.failed)} failed"
         return self.limits.spent(state)
@@ -106,6 +111,19 @@ class TrialScheduler:
         """See `Limits.broken`; failures before the last restart are ignored."""
         reset = self.study.user_attrs.get(RESET_FAILURES, ()) if state.failed else ()
         return self.limits.broken(state, reset)
+
+    def look_for_stop(self) -> str:
+        """Return who has asked the study to stop; an empty text where nobody has."""
+        self.stopped = str(self.study.user_attrs.get(STOP, ""))
+        return self.stopped
+
+    def go_on(self) -> bool:
+        """Let the study go on because it is started again; returns whether it was stopped."""
+        was_stopped = bool(self.look_for_stop())
+        if was_stopped:
+            self.study.set_user_attr(STOP, "")
+            self.stopped = ""
+        return was_stopped
 
     def reset_failures(self) -> int:
         """Ignore the failures so far if they have ended the study, because it is started again.
@@ -153,7 +171,10 @@ class TrialScheduler:
             with contextlib.suppress(UpdateFinishedTrialError):
                 if trial is not None:
                     self.study._storage.set_trial_user_attr(trial._trial_id, LEASE, dict(lease))
-            return self.state() if is_checking else None
+            if not is_checking:
+                return None
+            self.look_for_stop()
+            return self.state()
 
         return self.storage.transaction(renewed)
 

@@ -20,8 +20,10 @@ RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
 FINALIST, FINAL_SEED = "judged", "judged_seed"
 # A system attribute: the episodes of the final evaluation.
 EPISODES = "episodes"
+# Of a trial, or of a study: who asked it to stop, and when; an empty text where a study goes on again.
+STOP = "stop"
 # What a retry has from the attempt before.
-KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED)
+KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED, STOP)
 # Of a study: trials whose failures are ignored.
 RESET_FAILURES = "forgiven"
 # In a lease: the worker that holds the trial.

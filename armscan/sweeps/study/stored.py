@@ -36,6 +36,7 @@ class StudyAttributes(_Attributes):
     fixed_config: dict[str, Any] = Field(description="values by the names of keys")
     objectives: dict[str, str] = Field(description="directions by the names of metrics")
     mlflow_run: Text = ""
+    stop: Text = ""
     forgiven: list[Number] = Field(default=[], description="a list of numbers of trials")
 
 
@@ -60,6 +61,7 @@ class TrialAttributes(_Attributes):
     env_steps: Number = 0
     figures: dict[str, float] = Field(default={}, description="numbers by their names")
     failure: Text = ""
+    stop: Text = ""
     retried: bool = Field(default=False, description="true or false")
     retry_of: Number = 0
     attempt: Number = 0

@@ -9,10 +9,11 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
+import optuna
 from optuna.trial import FrozenTrial, Trial
 
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import HOLDER, LEASE, PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.state import HOLDER, LEASE, STOP, PendingWrites, TrialOutcome
 from armscan.utils.log import log
 from armscan.utils.processes import ProcessInfo
 
@@ -30,7 +31,7 @@ REQUEUE_TIMEOUT_S = 5.0
 
 
 class LimitReachedError(Exception):
-    """The study's time or environment steps are spent: the current trial is requeued."""
+    """The study's time or environment steps are spent, or it was stopped: the current trial is requeued."""
 
 
 class LivenessCheck:
@@ -90,6 +91,8 @@ class Heartbeat:
         self.cleanup: Callable[[], None] | None = None
         self.writes = PendingWrites()
         self._limit: str | None = None
+        # Whether somebody has asked for the end of the current trial.
+        self._is_trial_stopped = False
         self._next_check_s = 0.0
         # Held while a trial is claimed or requeued, so that leaving in between forgets none.
         self._changing, self._cleaning = threading.Lock(), threading.Lock()
@@ -116,6 +119,7 @@ class Heartbeat:
             self._lease = {key: self._lease[key] for key in (*HOLDER, "beat")}
             self._trial = self._scheduler.claim(self._lease, outcome)
             self.cleanup, self.writes = cleanup, PendingWrites()
+            self._is_trial_stopped = False
         self._leave_if_told_to()
         return self._trial
 
@@ -130,10 +134,13 @@ class Heartbeat:
         """Keep the trial's progress for the next renewal of the lease.
 
         Raises:
-            LimitReachedError: if the study's time or environment steps are spent.
+            LimitReachedError: if the study's time or environment steps are spent, or it was stopped.
+            optuna.TrialPruned: if the trial was stopped.
         """
         self._lease = self._lease | progress
         self._leave_if_told_to()
+        if self._is_trial_stopped:
+            raise optuna.TrialPruned
         if self._limit is not None:
             raise LimitReachedError(self._limit)
 
@@ -178,6 +185,8 @@ class Heartbeat:
             self._lease = self._lease | {"beat": self._lease["beat"] + 1}
             is_checking = time.monotonic() >= self._next_check_s
             state = self._scheduler.renew(self._trial, self._lease, is_checking=is_checking)
+            own = [trial for trial in state.running if self._is_own(trial)] if state else []
+            self._is_trial_stopped = any(trial.user_attrs.get(STOP) for trial in own)
         if state is None:
             return
         self._liveness.interval_s = HEARTBEAT_S * max(1.0, len(state.running) / MAX_CHECKERS)
@@ -185,4 +194,7 @@ class Heartbeat:
         self._next_check_s = time.monotonic() + self._liveness.interval_s - HEARTBEAT_S / 2
         for trial in self._scheduler.reclaim(self._liveness.is_dead, state):
             self._on_death(trial)
-        self._limit = self._scheduler.limits.spent(state)
+        self._limit = self._scheduler.stopped or self._scheduler.limits.spent(state)
+
+    def _is_own(self, trial: FrozenTrial) -> bool:
+        return self._trial is not None and trial.number == self._trial.number

@@ -33,11 +33,12 @@ class StudyMonitor:
     def is_over(self) -> bool:
         """Whether no trial is running, and none is missing."""
         for phase in self._opened.phases:
+            phase.scheduler.look_for_stop()
             state = phase.scheduler.state()
             if state.running or phase.scheduler.end(state) is None:
                 return False
         search, final = self._opened.search.scheduler, self._opened.final_eval
-        if final is None or search.broken(search.state()):
+        if final is None or search.stopped or search.broken(search.state()):
             return True
         return not missing_final_trials(self._opened.settings, search.study, final.scheduler.study)
 

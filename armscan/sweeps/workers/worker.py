@@ -72,6 +72,7 @@ class Worker:
         """Wait until a trial can be claimed; returns None then, or why there will be none."""
         scheduler = self._phase.scheduler
         while True:
+            scheduler.look_for_stop()
             state = scheduler.state()
             reason = scheduler.end(state)
             # A running trial may yet have to be retried.
@@ -238,6 +239,7 @@ def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None
     search, final = opened.search, opened.final_eval
     run_phase(search)
     state = search.scheduler.state()
-    if final is not None and state.finished and not search.scheduler.broken(state):
+    is_over = search.scheduler.look_for_stop() or search.scheduler.broken(state)
+    if final is not None and state.finished and not is_over:
         enqueue_final_trials(search.scheduler.storage, opened.settings, search.scheduler.study, final.scheduler.study)
         run_phase(final)

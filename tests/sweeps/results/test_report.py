@@ -165,6 +165,23 @@ def test_report_fits_a_screen_and_a_phone(answer, tmp_path, browser):
         assert browser.wider_than_page(width) == []
 
 
+def test_watched_report_refreshes_until_it_is_interrupted(answer, tmp_path, monkeypatch):
+    study = optuna.load_study(study_name="a", storage=searched(tmp_path, ["mean_steps"]).optuna)
+    file, pages = tmp_path / "reports" / "a" / "report.html", []
+
+    def look(seconds):
+        pages.append(file.read_text())
+        assert f'http-equiv="refresh" content="{seconds}"' in pages[-1]
+        if len(pages) == 2:
+            raise KeyboardInterrupt
+        study.ask().suggest_float("agent.lr", 0.0, 1.0)
+
+    monkeypatch.setattr("armscan.cli.report.time.sleep", look)
+    assert answer("--study=a", "--watch")[0] == 130
+    assert ["Running now" in page for page in pages] == [False, True]
+    assert 'http-equiv="refresh"' not in file.read_text()
+
+
 def test_report_needs_only_to_read_the_storage(answer, tmp_path):
     searched(tmp_path, ["mean_steps"])
     with (tmp_path / "optuna.journal").open("ab") as journal:
@@ -197,6 +214,7 @@ def test_report_needs_only_to_read_the_storage(answer, tmp_path):
         (["--study=../a"], "error: --study is '../a', but it must begin with a letter, a digit or _"),
         (["--study=foreign"], "error: --study is 'foreign', but that one in '/"),
         (["--study=a", "--out=/dev/null/a"], "error: --out is '/dev/null/a', but /dev/null is no folder"),
+        (["--runs=a", "--watch"], "error: --watch is given, but it is for --study, and this report is of --runs"),
         (["--study=a", "--foo=1"], "error: No such option '--foo'."),
         (["--study=a", "foo"], "error: Got unexpected extra argument (foo)"),
     ],

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,15 @@ import pytest
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
+from armscan.sweeps.stop import stop_study, stop_trial
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.open import Phase
 from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.workers import heartbeat
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
 from armscan.tracking import open_store
+from tests.support.waiting import HANG_S
 
 SPACE = {"agent.lr": {"low": 1e-4, "high": 1e-2, "log": True}, "agent.batch_size": {"choices": [64, 128, 256]}}
 TPE = {"_target_": "optuna.samplers.TPESampler", "n_startup_trials": 2, "multivariate": True}
@@ -57,11 +61,11 @@ def work(tmp_path, empty_database):
             experiment_id=experiment_id,
             run_id=client.create_run(experiment_id, name="study", tags={}).info.run_id,
         )
-        heartbeat = Heartbeat(
+        beating = Heartbeat(
             phase.scheduler, "0", is_told_to_leave=lambda: False, leave=lambda: os._exit(1), on_death=lambda _: None
         )
-        with heartbeat.running():
-            Worker(phase, ["data.n_training=1"], heartbeat).work()
+        with beating.running():
+            Worker(phase, ["data.n_training=1"], beating).work()
         return study
 
     run_study.storage = lambda folder: open_storage(str(tmp_path / folder / "optuna.journal"))
@@ -160,3 +164,48 @@ def test_worker_needs_of_a_report_only_what_is_pruned_by(work):
         return {"mean_steps": 1.0}
 
     assert {trial.state.name for trial in work("a", reports).trials} == {"COMPLETE"}
+
+
+def report_until_told_otherwise(attempt):
+    """Reports as a long training does."""
+    until_s = time.monotonic() + HANG_S
+    while time.monotonic() < until_s:
+        attempt.report({"mean_return": -1.0}, seed=0, n_env_steps=100, grid=100, total=1000)
+        time.sleep(0.01)
+    raise AssertionError
+
+
+def test_stopped_trial_is_pruned_and_counts_as_finished(work, tmp_path, monkeypatch):
+    monkeypatch.setattr(heartbeat, "HEARTBEAT_S", 0.05)
+    journal = str(tmp_path / "a" / "optuna.journal")
+
+    def second_is_stopped(attempt):
+        if attempt.trial.number == 1:
+            assert stop_trial(journal, "a", 1).startswith("trial 1 of study a will end at its next report, as pruned")
+            report_until_told_otherwise(attempt)
+        return far_from_a_thousandth(attempt)
+
+    trials = work("a", second_is_stopped, n_trials=3).trials
+    assert [trial.state.name for trial in trials] == ["COMPLETE", "PRUNED", "COMPLETE"]
+    assert trials[1].user_attrs["stop"].startswith("at 20")
+    assert trials[1].user_attrs["env_steps"] == 100
+
+
+def test_stopped_study_requeues_its_trial_and_goes_on_when_it_is_started_again(work, tmp_path, monkeypatch):
+    monkeypatch.setattr(heartbeat, "HEARTBEAT_S", 0.05)
+    journal = str(tmp_path / "a" / "optuna.journal")
+
+    def stopped_in_the_second(attempt):
+        if attempt.trial.number == 1:
+            assert "1 running trial will be requeued" in stop_study(journal, "a")
+            report_until_told_otherwise(attempt)
+        return far_from_a_thousandth(attempt)
+
+    study = work("a", stopped_in_the_second, n_trials=3)
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE", "WAITING"]
+    # Until it is told to go on, workers that come do nothing.
+    assert len(work("a", n_trials=3).trials) == 2
+    scheduler = TrialScheduler(study, work.storage("a"), Limits(n_trials=3))
+    assert scheduler.go_on()
+    assert not scheduler.go_on()
+    assert [trial.state.name for trial in work("a", n_trials=3).trials] == ["COMPLETE"] * 3

@@ -1,0 +1,57 @@
+"""What a run is that is to be stopped: of a trial, of a study, or of a process of this machine."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import dataclass
+
+from mlflow.entities import Run
+
+from armscan.errors import TrackingError
+from armscan.tracking.notes import Note
+
+STUDY_TAG, TRIAL_TAG = "study", "trial"
+
+
+@dataclass(frozen=True)
+class Target:
+    """A trial or a study.
+
+    Args:
+        study: name of the study.
+        trial: number of the trial; None for the whole study.
+    """
+
+    study: str
+    trial: int | None
+
+
+def target_of(run: Run) -> Target | None:
+    """Return the trial or the study that a run is of; None if it is of none.
+
+    Raises:
+        TrackingError: if its tag is no number of a trial.
+    """
+    tags = run.data.tags
+    if STUDY_TAG not in tags:
+        return None
+    number = tags.get(TRIAL_TAG)
+    if number is not None and not number.isdecimal():
+        raise TrackingError(f"run {run.info.run_id}: its tag {TRIAL_TAG} is {number[:50]!r}, but it must be a number")
+    return Target(tags[STUDY_TAG], None if number is None else int(number[:9]))
+
+
+def interrupt(run: Run) -> str:
+    """Interrupt the process of a run that is of no study, as Ctrl-C does; returns what will happen, in one line.
+
+    Raises:
+        TrackingError: if it is not running on this machine.
+    """
+    run_id, note = run.info.run_id, Note.of(run.info.run_id)
+    if run.info.status != "RUNNING":
+        raise TrackingError(f"run {run_id} has ended already ({run.info.status})")
+    if note is None or not note.process.is_here or not note.process.is_alive:
+        raise TrackingError(f"run {run_id} is of no study, and no process of it is known on this machine")
+    os.kill(note.process.pid, signal.SIGINT)
+    return f"run {run_id}: its process {note.process.pid} was interrupted, and ends as with Ctrl-C"

@@ -1,0 +1,89 @@
+"""`armscan runs stop`: ask the workers of a study to end a trial, or the study; they see it at their next report."""
+
+from __future__ import annotations
+
+import getpass
+from datetime import datetime
+
+import optuna
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.trial import TrialState
+
+from armscan.errors import StudyError
+from armscan.sweeps.scheduling.state import LEASE, STOP
+from armscan.sweeps.storage.storage import Storage, existing_storage, open_storage
+from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX
+from armscan.sweeps.study.study import is_ours
+
+STOPPED_BY = "at {:%Y-%m-%d %H:%M:%S} by {}"
+
+
+def reason() -> str:
+    """Return who stops it, and when."""
+    return STOPPED_BY.format(datetime.now(), getpass.getuser())
+
+
+def is_study(storage: Storage | None, name: str) -> bool:
+    """Return whether a study of armscan has this name; the final trainings of one belong to it."""
+    if storage is None or name not in optuna.get_all_study_names(storage.optuna):
+        return False
+    return is_ours(optuna.load_study(study_name=name, storage=storage.optuna))
+
+
+def stop_study(uri: str, name: str) -> str:
+    """Stop a study: its trials are requeued, and its command resumes it; returns what will happen, in one line."""
+    storage = _storage_with(uri, name)
+    names, n_running = optuna.get_all_study_names(storage.optuna), 0
+    for each in (name, name + FINAL_EVAL_SUFFIX):
+        if each in names:
+            study = optuna.load_study(study_name=each, storage=storage.optuna)
+            study.set_user_attr(STOP, reason())
+            n_running += len(study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
+    return (
+        f"study {name}: {n_running} running trial{'' if n_running == 1 else 's'} will be requeued at the next report; "
+        "the same command resumes it"
+    )
+
+
+def stop_trial(uri: str, name: str, number: int) -> str:
+    """Stop a trial of a study: it ends as pruned, and counts as finished; returns what will happen, in one line.
+
+    Args:
+        uri: storage of the study.
+        name: name of the study.
+        number: number of the trial.
+
+    Raises:
+        StudyError: if there is no such trial, or it has ended.
+    """
+    storage = _storage_with(uri, name)
+    trials = optuna.load_study(study_name=name, storage=storage.optuna).get_trials(deepcopy=False)
+    if number >= len(trials):
+        raise StudyError(f"the trial is {number}, but study {name} has {len(trials)} trials")
+    try:
+        storage.optuna.set_trial_user_attr(trials[number]._trial_id, STOP, reason())
+    except UpdateFinishedTrialError as error:
+        ended = trials[number].state.name.lower()
+        raise StudyError(f"trial {number} of study {name} has ended already ({ended})") from error
+    return f"trial {number} of study {name} will end at its next report, as pruned; it counts as finished"
+
+
+def stop_running_trial(storage: Storage, trial_id: int) -> bool:
+    """Stop a trial by its ID in the storage; returns false, and does nothing, unless a worker of armscan runs it."""
+    try:
+        trial = storage.optuna.get_trial(trial_id)
+        if trial.state != TrialState.RUNNING or LEASE not in trial.user_attrs:
+            return False
+        storage.optuna.set_trial_user_attr(trial_id, STOP, reason())
+    # It has ended in between, or there is none.
+    except (KeyError, UpdateFinishedTrialError):
+        return False
+    return True
+
+
+def _storage_with(uri: str, name: str) -> Storage:
+    """Open a storage that has a study, to write; nothing is made where there is none."""
+    there = existing_storage(uri, where="--storage")
+    if there is None or name not in optuna.get_all_study_names(there.optuna):
+        raise StudyError(f"the study is {name!r}, but it is not in {uri!r}: give --storage URI")
+    return open_storage(uri, where="--storage")

@@ -1,0 +1,90 @@
+"""`armscan runs stop` of studies, trials and what is none."""
+
+from functools import partial
+
+import optuna
+import pytest
+
+from armscan.sweeps.storage.storage import open_storage
+from armscan.tracking import open_store
+
+
+@pytest.fixture
+def answer(armscan):
+    """Runs the command in an empty folder; returns its exit code and what it printed."""
+    return partial(armscan, "runs", "stop")
+
+
+@pytest.fixture
+def study(tmp_path):
+    """A study with a trial that runs, and one that has ended."""
+    study = optuna.create_study(study_name="a", storage=open_storage(str(tmp_path / "optuna.journal")).optuna)
+    for name in ("objectives", "space", "fixed_config"):
+        study.set_user_attr(name, {"x": "minimize"} if name == "objectives" else {})
+    study.ask()
+    study.tell(study.ask(), 1.0)
+    return study
+
+
+@pytest.fixture
+def run_with(tmp_path):
+    """Makes a run with tags; returns its ID."""
+
+    def make(status=None, **tags):
+        settings = {"experiment": "a", "artifacts": str(tmp_path / "artifacts"), "wait_s": 10.0}
+        client, experiment_id = open_store(f"sqlite:///{tmp_path}/mlruns.db", **settings)
+        run_id = client.create_run(experiment_id, name="any", tags=tags).info.run_id
+        if status:
+            client.set_terminated(run_id, status)
+        return run_id
+
+    return make
+
+
+def stops_of(study):
+    return [trial.user_attrs.get("stop", "") for trial in study.get_trials()], study.user_attrs.get("stop", "")
+
+
+def test_study_is_stopped_by_its_name_and_by_its_run(answer, study, run_with):
+    line = "study a: 1 running trial will be requeued at the next report; the same command resumes it\n"
+    assert answer("a") == (0, line, "")
+    assert stops_of(study)[1]
+    study.set_user_attr("stop", "")
+    assert answer(run_with(study="a")[:12]) == (0, line, "")
+    assert stops_of(study)[1]
+
+
+def test_trial_is_stopped_by_its_run(answer, study, run_with):
+    printed = "trial 0 of study a will end at its next report, as pruned; it counts as finished\n"
+    assert answer(run_with(study="a", trial="0")) == (0, printed, "")
+    (of_trial, of_other), of_study = stops_of(study)
+    assert of_trial
+    assert (of_other, of_study) == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("tags", "line"),
+    [
+        ({"study": "a", "trial": "1"}, "trial 1 of study a has ended already (complete)"),
+        ({"study": "a", "trial": "7"}, "the trial is 7, but study a has 2 trials"),
+        ({"study": "b", "trial": "0"}, "the study is 'b', but it is not in 'optuna.journal': give --storage URI"),
+        ({"study": "b"}, "the study is 'b', but it is not in 'optuna.journal': give --storage URI"),
+        ({"study": "a", "trial": "-1"}, "run {}: its tag trial is '-1', but it must be a number"),
+        ({}, "run {} is of no study, and no process of it is known on this machine"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_stopped_is_said_in_one_line(answer, study, run_with, tags, line):
+    run_id = run_with(**tags)
+    assert answer(run_id) == (2, "", f"error: {line.format(run_id)}")
+    assert stops_of(study) == (["", ""], "")
+
+
+def test_run_that_has_ended_is_not_interrupted(answer, run_with):
+    run_id = run_with(status="FINISHED")
+    assert answer(run_id) == (2, "", f"error: run {run_id} has ended already (FINISHED)")
+
+
+def test_nothing_is_made_where_there_is_no_study(answer, run_with, tmp_path):
+    assert answer(run_with(study="a"))[0] == 2
+    assert not (tmp_path / "optuna.journal").exists()
