@@ -58,10 +58,13 @@ def work_with(study, folder):
 
 
 def test_every_attribute_is_checked():
-    ours = {getattr(names, name) for name in ("LEASE", "ENV_STEPS", "METRICS", "FAILURE", "RETRIED", "RETRY_OF")}
+    ours = {
+        getattr(names, name) for name in ("LEASE", "ENV_STEPS", "METRICS", "FAILURE", "RETRIED", "RETRY_OF", "STOP")
+    }
     ours |= {names.ATTEMPT, names.SEEDS, FINALIST, FINAL_SEED, attempt.RUN, attempt.FOLDER, attempt.CONFIG_SHA256}
     assert set(OF_TRIAL) == ours
-    assert set(StudyAttributes.model_fields) == {SPACE, FIXED, DASHBOARD_OBJECTIVES, STUDY_RUN, names.RESET_FAILURES}
+    of_study = {SPACE, FIXED, DASHBOARD_OBJECTIVES, STUDY_RUN, names.RESET_FAILURES, names.STOP}
+    assert set(StudyAttributes.model_fields) == of_study
 
 
 @pytest.mark.parametrize("value", ODD, ids=lambda value: repr(value)[:10])
@@ -81,7 +84,7 @@ def test_attribute_of_a_study_of_any_type_is_refused_in_one_line_or_harmless(tmp
         study.set_user_attr(name, value)
         # At most one of them is what it was.
         was_refused = is_refused(lambda storage=storage: make_study(storage, settings(), {}))
-        assert was_refused or name in (STUDY_RUN, names.RESET_FAILURES) or (name, value) == (FIXED, {})
+        assert was_refused or name in (STUDY_RUN, names.RESET_FAILURES, names.STOP) or (name, value) == (FIXED, {})
 
 
 @pytest.mark.parametrize(
