@@ -1,7 +1,12 @@
 """The compiled update of SAC, held to Tianshou's own."""
 
+import hashlib
 import math
+import os
+import subprocess
+import sys
 from copy import deepcopy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -151,6 +156,64 @@ def test_updates_at_once_are_those_one_by_one_to_the_bit(at_once):
         means = np.mean([each[name] for each in single[:at_once]])
         np.testing.assert_allclose(several[0][name], means, rtol=1e-12)
     assert_same_state(one_by_one, at_once_too, 0.0)
+
+
+# Takes updates with as many threads as it is told, and writes the sum of all weights and of Adam's state.
+THREADS = """
+import sys, torch
+from tests.agents.test_compiled_sac import *
+# The weights to begin with come from LAPACK, which a learner has on one thread.
+torch.set_num_threads(1)
+replay = filled_replay(14, 1)
+ours = compiled(replay, hidden_sizes=[64, 64], n_obs=14, n_free=1)
+torch.set_num_threads(int(sys.argv[1]))
+updated(ours, replay, 20, batch_size=256, at_once=4)
+print(digest(ours))
+"""
+
+
+def digest(each):
+    state = b"".join(part.numpy().tobytes() for part in tensors([each.state_dict(), entropy_state(each)]))
+    return hashlib.sha256(state).hexdigest()
+
+
+def test_updates_are_the_same_to_the_bit_on_any_number_of_threads():
+    """Products of 256 x 64 x 64 are large enough for BLAS to share them out."""
+    digests = set()
+    for n in ("1", "2"):
+        limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), n)
+        said = subprocess.run(
+            [sys.executable, "-c", THREADS, n],
+            env=os.environ | limits,
+            cwd=Path(__file__).parents[2],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        digests.add(said.split()[-1])
+    assert len(digests) == 1
+
+
+def test_fork_goes_on_with_updates_that_its_parent_has_begun():
+    replay = filled_replay(5, 2)
+    ours = compiled(replay)
+    updated(ours, replay, 4, at_once=2)
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        # Ends without what pytest would do at its end, whatever happens.
+        try:
+            updated(ours, replay, 4, seed=2, at_once=2)
+            os.write(writer, digest(ours).encode())
+        finally:
+            os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as file:
+        of_child = file.read()
+    assert os.waitpid(child, 0)[1] == 0
+    before = digest(ours)
+    updated(ours, replay, 4, seed=2, at_once=2)
+    assert of_child == digest(ours) != before
 
 
 def test_either_update_goes_on_from_the_others_state():
