@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from abc import ABC, abstractmethod
 from typing import Any
@@ -178,7 +179,21 @@ def load_into(module: nn.Module, weights: dict[str, Any]) -> None:
         raise CheckpointError(f"the checkpoint is another agent's or network's: {error}") from error
 
 
+def spare_dynamo() -> None:
+    """Have torch's optimisers be made without torch's compiler, which they load only to be left alone by it.
+
+    That takes one and a half seconds. Whoever compiles loads it before.
+    """
+    if "torch._dynamo" in sys.modules:
+        return
+    for method in vars(torch.optim.Optimizer).values():
+        # `torch._disable_dynamo` looks here for what its compiler has made of the method.
+        if (plain := getattr(method, "__wrapped__", None)) is not None:
+            vars(plain).setdefault("__dynamo_disable", plain)
+
+
 def prepare_torch(seed: int) -> None:
     """Have torch compute on one thread, on which small networks are fastest, and seed the networks made next."""
+    spare_dynamo()
     torch.set_num_threads(1)
     torch.manual_seed(seed)

@@ -1,0 +1,77 @@
+"""Processor time of the trials of `sac_y` in a warm worker, from claim to tell, beside an earlier checkout.
+
+    python -m benchmarks.speed.trials [--before CHECKOUT] [--trials N]
+
+One worker in a process of its own runs N trials (default: 4) without pruning; the first, which imports and compiles, is
+left out. The sampler draws the first trials at random from the study's seed, so that both checkouts have the same ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parents[2]
+PROGRAM = """
+import sys, time
+from armscan.sweeps.workers.worker import Worker
+run = Worker._run
+def timed(self, trial):
+    start_s = time.process_time()
+    try:
+        return run(self, trial)
+    finally:
+        with open("seconds.txt", "a") as file:
+            print(time.process_time() - start_s, file=file)
+Worker._run = timed
+sys.argv = ["armscan", *sys.argv[1:]]
+from armscan.run import main
+main()
+"""
+WORDS = (
+    "-m",
+    "sweep=sac_y",
+    "hydra/launcher=basic",
+    "study.workers=1",
+    "study/pruner=none",
+    "study.final_eval.top_k=0",
+)
+
+
+def trial_seconds(checkout: Path, n_trials: int) -> list[float]:
+    """Return the processor seconds of each trial."""
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run(
+            [sys.executable, "-c", PROGRAM, *WORDS, f"study.n_trials={n_trials}"],
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.DEVNULL,
+            check=True,
+        )
+        return [float(word) for word in (Path(folder) / "seconds.txt").read_text().split()]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--before", type=Path, help="another checkout to compare with")
+    parser.add_argument("--trials", type=int, default=4, help="trials of each (default: 4)")
+    given = parser.parse_args()
+    seconds = [trial_seconds(each.resolve(), given.trials) for each in (HERE, given.before) if each]
+    print("| trial | processor s | before | ratio |\n| --- | --- | --- | --- |")
+    for number, (now, *before) in enumerate(zip(*seconds, strict=True)):
+        first = " (the first)" if number == 0 else ""
+        print(
+            f"| {number}{first} | {now:.1f} | " + " | ".join(f"{each:.1f} | {each / now:.1f}" for each in before) + " |"
+        )
+    warm = [sum(each[1:]) / (given.trials - 1) for each in seconds]
+    print(f"\nwarm, mean: {' and before '.join(f'{each:.1f} s' for each in warm)}")
+    print(f"two quiet cores would finish {2 * 3600 / warm[0]:.0f} an hour")
+
+
+if __name__ == "__main__":
+    main()
