@@ -23,6 +23,9 @@ from armscan.agents.replay import Replay
 from tests.agents.conftest import ENV_FACTORIES, SMALL_SAC, setup_for
 from tests.agents.test_learners import tensors
 
+# One worker compiles the update, which takes ten seconds, and the others find it on disk.
+pytestmark = pytest.mark.xdist_group("compiled_sac")
+
 N_ENVS, N_STEPS = 3, 40
 
 
