@@ -32,9 +32,9 @@ FURTHER_ROWS = (
 )
 # Of agents that say how far off they expect to be.
 BY_DOUBT = tuple(
-    (f"{title} of the {which} sure quarter, median", f"median_distance_{unit}{suffix}", "{:.2f}")
+    (f"{title} of the {which} quarter, median", f"median_distance_{unit}{suffix}", "{:.2f}")
     for unit, title in (("mm", "distance mm"), ("deg", "angle °"))
-    for which, suffix in (("most", SUREST), ("least", LEAST_SURE))
+    for which, suffix in (("surest", SUREST), ("least sure", LEAST_SURE))
 )
 OF_THE_OTHERS = (("success, by reward", "success_rate", "{:.1%}"), ("steps, mean", "mean_steps", "{:.2f}"))
 

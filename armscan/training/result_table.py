@@ -62,7 +62,7 @@ QUANTITIES = (
     Quantity("p90_distance_deg", "angle °, 90th percentile", "{:.1f}"),
     Quantity("median_expected_mm", "expected mm, median", "{:.1f}"),
     Quantity("median_expected_deg", "expected °, median", "{:.1f}"),
-    Quantity("median_nerve_area_error_mm2", "nerve area off mm², median", "{:.1f}"),
+    Quantity("median_nerve_area_error_mm2", "nerve area off mm², median", "{:.2f}"),
     Quantity("median_nerve_area_error_percent", "nerve area off %, median", "{:.1f}"),
     Quantity("success_rate", "success, by reward", "{:.1%}"),
     Quantity("mean_steps", "steps, mean", "{:.2f}"),
