@@ -16,21 +16,31 @@ import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parents[2]
-PROGRAM = """
-import sys, time
-from armscan.sweeps.workers.worker import Worker
-run = Worker._run
-def timed(self, trial):
-    start_s = time.process_time()
-    try:
-        return run(self, trial)
-    finally:
-        with open("seconds.txt", "a") as file:
-            print(time.process_time() - start_s, file=file)
-Worker._run = timed
-sys.argv = ["armscan", *sys.argv[1:]]
-from armscan.run import main
-main()
+# Python imports this at the start of each process, the worker's included, whose module it waits for.
+SITE = """
+import importlib.util, os, sys, time
+NAME = "armscan.sweeps.workers.worker"
+class Timed:
+    def find_spec(self, name, path=None, target=None):
+        if name != NAME:
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        load = spec.loader.exec_module
+        def exec_module(module):
+            load(module)
+            run = module.Worker._run
+            def timed(self, trial):
+                start_s = time.process_time()
+                try:
+                    return run(self, trial)
+                finally:
+                    with open(os.environ["SECONDS_FILE"], "a") as file:
+                        print(time.process_time() - start_s, file=file)
+            module.Worker._run = timed
+        spec.loader.exec_module = exec_module
+        return spec
+sys.meta_path.insert(0, Timed())
 """
 WORDS = (
     "-m",
@@ -45,14 +55,17 @@ WORDS = (
 def trial_seconds(checkout: Path, n_trials: int) -> list[float]:
     """Return the processor seconds of each trial."""
     with tempfile.TemporaryDirectory() as folder:
+        seconds = Path(folder) / "seconds.txt"
+        (Path(folder) / "sitecustomize.py").write_text(SITE)
         subprocess.run(
-            [sys.executable, "-c", PROGRAM, *WORDS, f"study.n_trials={n_trials}"],
+            [sys.executable, "-m", "armscan.run", *WORDS, f"study.n_trials={n_trials}"],
             cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"},
+            env=os.environ
+            | {"PYTHONPATH": f"{folder}:{checkout}", "OMP_NUM_THREADS": "1", "SECONDS_FILE": str(seconds)},
             stdout=subprocess.DEVNULL,
             check=True,
         )
-        return [float(word) for word in (Path(folder) / "seconds.txt").read_text().split()]
+        return [float(word) for word in seconds.read_text().split()]
 
 
 def main() -> None:
