@@ -83,9 +83,9 @@ def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int |
     import optuna
 
     from armscan.sweeps.results.report import write_report
+    from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX, check_trials
     from armscan.sweeps.storage.storage import existing_storage
-    from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX, check_study_name
-    from armscan.sweeps.study.stored import check_trials
+    from armscan.sweeps.study.settings import check_study_name
     from armscan.sweeps.study.study import is_ours
 
     check_study_name("--study", name)

@@ -51,8 +51,15 @@ def resume_command(run_id: str, tracking_uri: str, *, trust: bool = False) -> st
     return run_command([f"{RESUME}={run_id}", *where, *((TRUST,) if trust else ())])
 
 
-def armscan_command(*words: str, tracking: str | None = None, storage: str | None = None) -> str:
-    """Return a command of the program `armscan`, with the stores that are not the default ones."""
+def armscan_command(*words: str, tracking: str | None = None, storage: str | None = None, trust: bool = False) -> str:
+    """Return a command of the program `armscan`.
+
+    Args:
+        words: the command and its arguments.
+        tracking: MLflow tracking URI; named in the command unless it is the default one. Default: None, for none.
+        storage: Optuna storage, likewise.
+        trust: whether the command needs `--trust`. Default: False.
+    """
     stores = ["--storage", storage] if storage is not None and storage != default_storage() else []
     stores += ["--tracking", tracking] if tracking is not None and tracking != default_tracking()["uri"] else []
-    return shlex.join([*typed("armscan"), *words, *stores])
+    return shlex.join([*typed("armscan"), *words, *stores, *((TRUST,) if trust else ())])

@@ -53,18 +53,30 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
         UntrustedError: if it names a class that armscan does not offer, or holds an interpolation.
     """
     config = migrate(config)
-    for key, value in () if trust else _leaves(config):
+    if not trust and (found := _foreign_part(config)):
+        raise UntrustedError(f"{where}: its configuration {found}; {HOW}")
+    return config
+
+
+def needs_trust(config: Mapping[str, Any]) -> bool:
+    """Whether a run of this configuration, or of these MLflow parameters, is read with `--trust` only."""
+    return _foreign_part(migrate(config)) is not None
+
+
+def _foreign_part(config: Mapping[str, Any]) -> str | None:
+    """Return what of a configuration is not armscan's own; None if nothing is."""
+    for key, value in _leaves(config):
         if key.rpartition(".")[2] == TARGET and str(value) not in offered_classes():
-            raise UntrustedError(
-                f"{where}: its configuration builds {key.removesuffix(f'.{TARGET}')} by {value!r}, which is none of "
-                f"armscan's classes and would execute code of others; {HOW}"
+            return (
+                f"builds {key.removesuffix(f'.{TARGET}')} by {value!r}, which is none of armscan's classes and would "
+                "execute code of others"
             )
         if isinstance(value, str) and INTERPOLATION in value:
-            raise UntrustedError(
-                f"{where}: its configuration has {key}={value!r}, but a stored value holds no interpolation, which "
-                f"could read this machine's environment; {HOW}"
+            return (
+                f"has {key}={value!r}, but a stored value holds no interpolation, which could read this machine's "
+                "environment"
             )
-    return config
+    return None
 
 
 def untrusted_word(words: Sequence[str], uri: str) -> str | None:

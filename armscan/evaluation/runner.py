@@ -182,5 +182,5 @@ def _without_checkpoint(run: FoundRun) -> str:
     ended = "is still running, or was killed" if run.status == "RUNNING" else f"ended before its time ({run.status})"
     return (
         f"run {run.run_id} {ended}, and a run keeps its checkpoint in the store at its end: go on with it by "
-        f"{resume_command(run.run_id, run.uri)}"
+        f"{resume_command(run.run_id, run.uri, trust=run.needs_trust)}"
     )

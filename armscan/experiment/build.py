@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from armscan.agents import Agent, AgentSetup, Algorithm, Compute, Learner
 from armscan.config.defaults import CLUSTER, to_plain
+from armscan.config.trust import needs_trust
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError, listed
 from armscan.tracking import check_settings
@@ -52,6 +53,7 @@ class Experiment:
         seed: seed of everything that is drawn.
         smallest_slice_px: shape (across, depth) that the slices of all volumes have at least; images are cropped to it
             by default, in every split.
+        needs_trust: whether its configuration names classes that are not armscan's.
     """
 
     split: Split
@@ -62,6 +64,7 @@ class Experiment:
     on_plane: tuple[OnPlane, ...]
     seed: int
     smallest_slice_px: tuple[int, int]
+    needs_trust: bool
 
     @cached_property
     def training_env(self) -> Env:
@@ -138,6 +141,7 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
         on_plane=on_plane_of(config),
         seed=seed,
         smallest_slice_px=smallest,
+        needs_trust=needs_trust(to_plain(config)),
     )
 
 

@@ -45,11 +45,23 @@ N_PRINT_CHARS = 16
 
 
 def start_tracking(
-    config: DictConfig, invocation: Invocation, setup: Experiment, *, retry_s: float | None = None
+    config: DictConfig,
+    invocation: Invocation,
+    setup: Experiment,
+    *,
+    tags: Mapping[str, str] | None = None,
+    retry_s: float | None = None,
 ) -> TrackedRun:
-    """Write the provenance files, open the tracking store and start a run in it; see `open_store`.
+    """Write the provenance files, open the tracking store and start a run in it.
 
     What an earlier run has made in the folder is replaced; `check_free` has found that it is a run's.
+
+    Args:
+        config: the composed configuration.
+        invocation: how the run was asked for.
+        setup: what is built of the configuration.
+        tags: tags of the run beside the usual ones. Default: none.
+        retry_s: seconds to wait for a store that is away. Default: None, it is not waited for.
     """
     resolved = to_plain(config)
     client, experiment_id = open_store(**resolved["tracking"], retry_s=retry_s)
@@ -80,6 +92,7 @@ def start_tracking(
             "working_folder": str(Path.cwd()),
             **sha256_tags(files),
             **({JOB_TAG: str(job.number)} if job else {}),
+            **(tags or {}),
         },
         folder=invocation.folder,
         parent_id=job.parent_run_id if job else None,

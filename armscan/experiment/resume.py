@@ -118,7 +118,7 @@ def resume_run(
         agent = setup.agent
         earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id)) if isinstance(agent, Learner) else []
         tags = volume_tags(setup.fingerprints) | place_tags(folder)
-        tracked = TrackedRun.reopen(client, run_id, folder=folder, config=config, tags=tags)
+        tracked = TrackedRun.reopen(client, run, folder=folder, config=config, tags=tags)
         return run_tracked(setup, tracked, folder, client.uri, job_label=job_label, earlier=earlier)
 
 

@@ -84,7 +84,9 @@ def run_tracked(
     """
     tell = partial(print, *([f"[{job_label}]"] if job_label else []), flush=True)
     tell(f"run {tracked.run_id}: {tracked.name}")
-    hint = _resume_hint_on_error(tracked.run_id, tracking_uri, folder, is_told=job_label is None)
+    trust = setup.needs_trust
+    again = resume_command(tracked.run_id, tracking_uri, trust=trust)
+    hint = _resume_hint_on_error(again, folder, is_told=job_label is None)
     with hint, tracked, named_if_full(folder):
         result = None
         if isinstance(setup.agent, Learner):
@@ -114,7 +116,8 @@ def run_tracked(
     if job_label is None:
         files = (RESULTS_PAGE, *((LEARNING_CURVE_FILE,) if result else ()), VIDEO_FILE)
         print_where_to_look(folder, tracking_uri, files=files)
-        print(f"evaluate  {armscan_command('evaluate', tracked.run_id, '--data', 'FOLDER', tracking=tracking_uri)}")
+        words = ("evaluate", tracked.run_id, "--data", "FOLDER")
+        print(f"evaluate  {armscan_command(*words, tracking=tracking_uri, trust=trust)}")
     return reached.metrics()
 
 
@@ -167,11 +170,11 @@ def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: Ru
 
 
 @contextlib.contextmanager
-def _resume_hint_on_error(run_id: str, tracking_uri: str, folder: Path, *, is_told: bool) -> Iterator[None]:
-    """Print how to resume the run, if an error ends it and it has a checkpoint."""
+def _resume_hint_on_error(command: str, folder: Path, *, is_told: bool) -> Iterator[None]:
+    """Print the command that resumes the run, if an error ends it and it has a checkpoint."""
     try:
         yield
     except BaseException:
         if is_told and (folder / LAST_CHECKPOINT).exists():
-            print(f"resume with: {resume_command(run_id, tracking_uri)}", file=sys.stderr)
+            print(f"resume with: {command}", file=sys.stderr)
         raise

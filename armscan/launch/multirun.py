@@ -17,7 +17,7 @@ from armscan.config.command_hints import armscan_command, resume_command, run_co
 from armscan.config.credentials import check_address
 from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
-from armscan.config.trust import untrusted_word
+from armscan.config.trust import needs_trust, untrusted_word
 from armscan.errors import InvalidValueError, TrackingError
 from armscan.experiment.job import (
     GRID_TAG,
@@ -138,7 +138,8 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         print(f"  again alone: {run_command([])} {outcome.overrides}", file=sys.stderr)
     for run in runs:
         if run.info.status != "FINISHED" and (Path(run.data.tags["folder"]) / LAST_CHECKPOINT).exists():
-            again = resume_command(run.info.run_id, word["tracking"]["uri"])
+            uri = word["tracking"]["uri"]
+            again = resume_command(run.info.run_id, uri, trust=needs_trust(run.data.params))
             print(f"resume job {run.data.tags[JOB_TAG]} with: {again}", file=sys.stderr)
     if runs and status != "FINISHED":
         again = resume_command(word["run_id"], word["tracking"]["uri"], trust=word["trust"])
@@ -179,7 +180,11 @@ def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Ma
     store, experiment_id = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
     # With what jobs have left because the store was away.
     sync(folder, lambda _: store)
-    children = store.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
+    below = store.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
+    # Others may have put a run of theirs below it.
+    children = [
+        child for child in below if child.data.tags.get(JOB_TAG, "").isdecimal() and "folder" in child.data.tags
+    ]
     for child in children:
         # `sync` has ended those whose processes had no time to do so.
         if child.info.status == "RUNNING" or child.data.tags.get(FAILURE_TAG) == PROCESS_DIED:

@@ -18,6 +18,7 @@ from armscan.experiment.results import LAST_VALIDATION, figures_of
 from armscan.experiment.resume import resume_run
 from armscan.experiment.runner import run_experiment
 from armscan.tracking import TrackingStore, open_store
+from armscan.tracking.run import PARENT_TAG
 from armscan.utils.files import LAST_CHECKPOINT
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
             _adopt(client, run, job)
             return _metrics_of(run)
     for run in earlier:
-        if run.info.status != "RUNNING" and (Path(run.data.tags["folder"]) / LAST_CHECKPOINT).exists():
+        folder = run.data.tags.get("folder")
+        if run.info.status != "RUNNING" and folder is not None and (Path(folder) / LAST_CHECKPOINT).exists():
             _adopt(client, run, job)
             # Its configuration is this job's.
             return resume_run(client, run.info.run_id, job_label=job.label, trust=True)
@@ -50,7 +52,7 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
 
 def _adopt(client: TrackingStore, run: Run, job: Job) -> None:
     """Make a run a child of the grid that is repeated."""
-    client.set_tag(run.info.run_id, "mlflow.parentRunId", job.parent_run_id)
+    client.set_tag(run.info.run_id, PARENT_TAG, job.parent_run_id)
     client.set_tag(run.info.run_id, JOB_TAG, str(job.number))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import html
 from collections.abc import Mapping, Sequence
 from operator import methodcaller
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from armscan.errors import InvalidValueError
+from armscan.utils.csv_file import write_csv
 from armscan.utils.files import atomic_write
 
 if TYPE_CHECKING:
@@ -200,9 +200,7 @@ def _cell(key: str, value: Any) -> str:
 
 def _write_csv(file: Path, rows: Sequence[Row]) -> None:
     with file.open("w", newline="") as opened:
-        writer = csv.DictWriter(opened, _columns(rows))
-        writer.writeheader()
-        writer.writerows(rows)
+        write_csv(opened, _columns(rows), rows)
 
 
 def _columns(rows: Sequence[Row]) -> list[str]:

@@ -10,13 +10,14 @@ from mlflow.entities import Run
 
 from armscan.errors import InvalidValueError, TrackingError, listed
 from armscan.tracking import EVALUATED_TAG, TrackingStore, check_version, find_run
+from armscan.tracking.run import MAX_DEPTH, PARENT_TAG
 from armscan.tracking.store import store_errors
 
 # How a whole experiment of MLflow is named, instead of runs.
 EXPERIMENT = "experiment:"
 # Only a run of `armscan run` or a training of a study has it, not its parents.
 OF_A_TRAINING = "choice.agent"
-PARENT_TAG, PRUNED_TAG, TRIAL_TAG = "mlflow.parentRunId", "pruned", "trial"
+PRUNED_TAG, TRIAL_TAG = "pruned", "trial"
 PAGE_SIZE = 1000
 N_SHOWN = 6
 ID_CHARS = 8
@@ -81,13 +82,14 @@ def _meant(store: TrackingStore, name: str) -> list[Run]:
     return trainings
 
 
-def _below(store: TrackingStore, run: Run) -> Iterator[Run]:
+def _below(store: TrackingStore, run: Run, depth: int = 0) -> Iterator[Run]:
     """Yield a run if it is a training, else those of its jobs, trials and seeds."""
     if OF_A_TRAINING in run.data.tags:
         yield run
+    if OF_A_TRAINING in run.data.tags or depth > MAX_DEPTH:
         return
     for child in _runs(store, run.info.experiment_id, f"tags.`{PARENT_TAG}` = '{run.info.run_id}'"):
-        yield from _below(store, child)
+        yield from _below(store, child, depth + 1)
 
 
 def _in_experiment(store: TrackingStore, name: str) -> list[Run]:

@@ -51,7 +51,7 @@ class Card:
         text = f"The policy of run `{run.run_id}`, {run.name}."
         reports = _reports(run, folder)
         if not reports:
-            command = armscan_command("evaluate", run.run_id, tracking=run.uri)
+            command = armscan_command("evaluate", run.run_id, tracking=run.uri, trust=run.needs_trust)
             text += f"\n\nNothing is known of how good it is: `{command}` says it."
         tags: dict[str, str] = {}
         for title, report in reports.items():

@@ -11,10 +11,10 @@ from mlflow.entities import Run
 
 from armscan.errors import TrackingError
 from armscan.runs.query import experiment_ids, search
-from armscan.runs.rows import PARENT_TAG
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.tracking import TrackingStore, check_version
 from armscan.tracking.notes import forget
+from armscan.tracking.run import PARENT_TAG
 from armscan.tracking.sync import ENDED
 from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 

@@ -137,13 +137,11 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
     choices = {group: run.tags.get(f"choice.{group}", "unknown") for group in CHOICES_IN_TAGS}
     overrides = run.tags.get("overrides", "").split()
     uri = original.config.tracking.uri
-    invocation = Invocation(
-        folder, overrides, armscan_command("runs", "reproduce", run.run_id, tracking=uri), choices, None
-    )
+    command = armscan_command("runs", "reproduce", run.run_id, tracking=uri, trust=original.setup.needs_trust)
+    invocation = Invocation(folder, overrides, command, choices, None)
     try:
         with folder_lock(folder):
-            tracked = start_tracking(original.config, invocation, original.setup)
-            tracked.set_tags({OF_TAG: run.run_id})
+            tracked = start_tracking(original.config, invocation, original.setup, tags={OF_TAG: run.run_id})
             run_tracked(original.setup, tracked, folder, uri)
     except BaseException as error:
         if is_ours:

@@ -16,10 +16,10 @@ from requests import RequestException
 
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.tracking import TrackingStore
+from armscan.tracking.run import MAX_DEPTH, PARENT_TAG
 from armscan.tracking.sync import ENDED
 from armscan.training import ON_PLANE
 
-PARENT_TAG = "mlflow.parentRunId"
 # What rows are sorted by.
 SORTS = {
     "started": "started",
@@ -130,12 +130,22 @@ class RunRow:
 
 
 def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
-    """Return rows of the runs whose parent is not among them, the others folded into them."""
-    ids = {run.info.run_id for run in runs}
+    """Return rows of the runs whose parent is not among them, the others folded into them.
+
+    What is too deep below others stands by itself, as do runs that are above themselves.
+    """
+    parents = {run.info.run_id: run.data.tags.get(PARENT_TAG, "") for run in runs}
+
+    def is_too_deep(run_id: str) -> bool:
+        for _ in range(MAX_DEPTH):
+            run_id = parents.get(run_id, "")
+        return run_id in parents
+
     children: dict[str, list[Run]] = defaultdict(list)
     for run in sorted(runs, key=lambda run: run.info.start_time):
-        parent = run.data.tags.get(PARENT_TAG, "")
-        children[parent if parent in ids and parent != run.info.run_id else ""].append(run)
+        run_id = run.info.run_id
+        is_below = parents[run_id] in parents and not is_too_deep(run_id)
+        children[parents[run_id] if is_below else ""].append(run)
 
     def rows(parent: str) -> tuple[RunRow, ...]:
         return tuple(RunRow(client, run, rows(run.info.run_id)) for run in children[parent])

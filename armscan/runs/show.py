@@ -10,15 +10,16 @@ from rich.filesize import decimal
 from rich.text import Text
 
 from armscan.config.command_hints import armscan_command, resume_command
+from armscan.config.trust import TRUST, needs_trust
 from armscan.errors import printable
 from armscan.experiment.console import ID_CHARS
 from armscan.experiment.results import figures_of, result_table
 from armscan.runs.query import experiment_ids, search
-from armscan.runs.rows import PARENT_TAG, RunRow, artifacts_of
+from armscan.runs.rows import RunRow, artifacts_of
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.runs.tables import format_duration, narrow_table
 from armscan.tracking import EVALUATED_TAG, TrackingStore
-from armscan.tracking.run import FAILURE_TAG
+from armscan.tracking.run import FAILURE_TAG, PARENT_TAG
 from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
 # How a run was started, as far as it has kept it; the first that is there is shown.
@@ -115,14 +116,16 @@ def _print_sizes(console: Console, where: str, files: dict[str, int]) -> None:
 
 def _print_commands(console: Console, uri: str, run: Run, folder: OwnFolder | None, artifacts: Collection[str]) -> None:
     """Print the commands that resume a run, evaluate and record its agent, if it has kept what they need."""
-    run_id = run.info.run_id
+    run_id, trust = run.info.run_id, needs_trust(run.data.params)
     commands = {}
     if folder is not None and (folder.path / LAST_CHECKPOINT).exists() and run.info.status != "FINISHED":
-        commands["resume"] = resume_command(run_id, uri)
+        commands["resume"] = resume_command(run_id, uri, trust=trust)
     if EVALUATED_TAG not in run.data.tags and BEST_CHECKPOINT in artifacts:
-        commands["evaluate"] = armscan_command("evaluate", run_id, tracking=uri)
-        commands["record"] = armscan_command("evaluate", run_id, "--video", tracking=uri)
+        commands["evaluate"] = armscan_command("evaluate", run_id, tracking=uri, trust=trust)
+        commands["record"] = armscan_command("evaluate", run_id, "--video", tracking=uri, trust=trust)
     if commands:
         console.print()
+        if trust:
+            console.print(f"its configuration names classes that are not armscan's: {TRUST} executes their code")
     for what, command in commands.items():
         console.print(Text(f"{what:10}{command}"), soft_wrap=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 from collections.abc import Sequence
@@ -18,8 +17,10 @@ from rich.text import Text
 from armscan.errors import printable
 from armscan.experiment.console import ID_CHARS
 from armscan.runs.prune import PruneItem
-from armscan.runs.rows import PARENT_TAG, RunRow
+from armscan.runs.rows import RunRow
+from armscan.tracking.run import PARENT_TAG
 from armscan.training import ON_PLANE
+from armscan.utils.csv_file import write_csv
 
 MISSING = "-"
 # Of a name, which a multirun's words may be.
@@ -53,9 +54,7 @@ def write_rows(rows: Sequence[RunRow], form: str) -> None:
     if form == "json":
         print(json.dumps(values, indent=1))
         return
-    writer = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(values)
+    write_csv(sys.stdout, COLUMNS, values)
 
 
 def _table(rows: Sequence[RunRow]) -> Table:

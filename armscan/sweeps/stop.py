@@ -11,8 +11,8 @@ from optuna.trial import TrialState
 
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.state import LEASE, STOP
+from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX
 from armscan.sweeps.storage.storage import Storage, existing_storage, open_storage
-from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX
 from armscan.sweeps.study.study import is_ours
 
 STOPPED_BY = "at {:%Y-%m-%d %H:%M:%S} by {}"

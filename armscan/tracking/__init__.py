@@ -11,6 +11,7 @@ from armscan.tracking.lookup import (
     check_version,
     find_run,
     load_run,
+    run_of_study,
 )
 from armscan.tracking.outbox import take_over
 from armscan.tracking.plots import draw_learning_curve
@@ -41,6 +42,7 @@ __all__ = [
     "note_end",
     "open_existing_store",
     "open_store",
+    "run_of_study",
     "source",
     "sync",
     "tags_of",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import yaml
 from packaging.version import InvalidVersion, Version
 
 import armscan
-from armscan.config.trust import stored_config
+from armscan.config.trust import needs_trust, stored_config
 from armscan.errors import TrackingError, listed
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.store import open_existing_store, store_errors
@@ -47,6 +48,7 @@ class FoundRun:
         status: how it ended, or that it is RUNNING.
         tags: its tags.
         files: paths of its artifacts.
+        needs_trust: whether its configuration names classes that are not armscan's, as far as its parameters say.
     """
 
     client: TrackingStore = field(repr=False)
@@ -57,6 +59,7 @@ class FoundRun:
     status: str
     tags: dict[str, str] = field(repr=False)
     files: tuple[str, ...]
+    needs_trust: bool
 
     def config(self, folder: Path, *, trust: bool = False) -> dict[str, Any]:
         """Return the resolved configuration, with the keys of this version.
@@ -135,6 +138,7 @@ def load_run(uri: str, run_id: str) -> FoundRun:
             status=run.info.status,
             tags=dict(run.data.tags),
             files=tuple(artifact.path for artifact in client.list_artifacts(run.info.run_id)),
+            needs_trust=needs_trust(run.data.params),
         )
 
 
@@ -157,6 +161,31 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
         ids = [run.info.run_id for run in found[:N_SHOWN]] + (["others"] if len(found) > N_SHOWN else [])
         raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the id")
     run: Run = found[0]
+    return run
+
+
+def run_of_study(
+    client: TrackingStore, run_id: str, *, experiment_id: str, tags: Mapping[str, str | None], where: str
+) -> Run:
+    """Return a run that the storage of a study names: a stranger may have written there the ID of any run.
+
+    Args:
+        client: the store.
+        run_id: MLflow run ID.
+        experiment_id: MLflow experiment of the study.
+        tags: what the run's own tags must be, by which it is known to be the study's; None for those that it must lack.
+        where: what names it, for the error.
+
+    Raises:
+        TrackingError: if it is another run, or the store does not have it.
+    """
+    with store_errors(client.uri):
+        run: Run = client.get_run(run_id)
+    others = [name for name, value in tags.items() if run.data.tags.get(name) != value]
+    if run.info.experiment_id != experiment_id:
+        others.insert(0, "experiment")
+    if others:
+        raise TrackingError(f"{where} names run {run_id}, which is another's, as its {others[0]} says: left as it is")
     return run
 
 

@@ -21,11 +21,17 @@ from armscan.utils.files import RESULTS, RESUMED_DIFF_FILE, atomic_write
 from armscan.utils.log import log
 
 if TYPE_CHECKING:
+    from mlflow.entities import Run
+
     from armscan.training import EpochReport
 
 MODEL_FILE = "MLmodel"
 # After the name of a run whose trial was pruned.
 PRUNED = " (pruned)"
+# MLflow's own, of the run that a run is shown below.
+PARENT_TAG = "mlflow.parentRunId"
+# No run of armscan has so many runs above it; a stranger's may be above themselves.
+MAX_DEPTH = 8
 # Why a run ended before its end.
 FAILURE_TAG = "failure"
 MAX_REASON_CHARS, MAX_DIGITS = 5000, 9
@@ -71,7 +77,7 @@ class TrackedRun:
         parent_id: str | None = None,
     ) -> Self:
         """Make a new run; the leaves of its resolved configuration become parameters."""
-        parent = {"mlflow.parentRunId": parent_id} if parent_id else {}
+        parent = {PARENT_TAG: parent_id} if parent_id else {}
         run = store.create_run(experiment_id, name=name, tags={**source().tags, **tags, **parent})
         tracked = cls.joined(store, run.info.run_id, name=name, folder=folder)
         tracked._log_config(config)
@@ -84,10 +90,10 @@ class TrackedRun:
 
     @classmethod
     def reopen(
-        cls, store: TrackingStore, run_id: str, *, folder: Path, config: Mapping[str, Any], tags: Mapping[str, str]
+        cls, store: TrackingStore, run: Run, *, folder: Path, config: Mapping[str, Any], tags: Mapping[str, str]
     ) -> Self:
         """Open a run again that was interrupted, as if nothing had happened; parameters that it lacks are logged."""
-        run = store.get_run(run_id)
+        run_id = run.info.run_id
         if not (resumed := run.data.tags.get("resumed", "0")).isdecimal():
             raise TrackingError(f"run {run_id}: its tag resumed is {resumed[:50]!r}, but it must be a whole number")
         n_resumed = int(resumed[:MAX_DIGITS]) + 1

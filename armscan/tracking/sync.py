@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from armscan.config.trust import TRUST
 from armscan.errors import FolderInUseError, TrackingError, UntrustedError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in
 from armscan.tracking.notes import Note, forget, notes
@@ -49,7 +50,8 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
     Args:
         folder: folder of a run, of a study, or above them.
         opened: opens a store by its address; called once for each address.
-        trust: whether files outside of a run's folder are uploaded; default: false.
+        trust: whether runs are written to that were tracked from elsewhere, and files outside of a run's folder are
+            uploaded; default: false.
 
     Returns:
         What became of each run that had something left.
@@ -123,6 +125,12 @@ def _opened(opened: Callable[[str], TrackingStore], uri: str) -> TrackingStore |
 
 def _delivered(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Delivery:
     n_entries, left = 0, None
+    try:
+        if not trust:
+            _check_own(outbox, store)
+    # Whatever a store raises, or that the run is another's.
+    except Exception as error:
+        return Delivery(outbox.folder, outbox.address.run_id, 0, reason_in(error))
     for channel in CHANNELS:
         try:
             n_entries += deliver(outbox, store.mlflow, channel, is_whole=False, trust=trust)
@@ -130,6 +138,20 @@ def _delivered(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Delivery
         except Exception as error:
             left = reason_in(error)
     return Delivery(outbox.folder, outbox.address.run_id, n_entries, left)
+
+
+def _check_own(outbox: Outbox, store: TrackingStore) -> None:
+    """Raise `UntrustedError` if a stranger's folder may name the run, which may be any of this user's."""
+    run_id, folder = outbox.address.run_id, outbox.folder.resolve()
+    note = Note.of(run_id)
+    if note is not None and note.outbox == outbox.file.absolute():
+        return
+    noted = store.mlflow.get_run(run_id).data.tags.get("folder")
+    if noted != str(folder):
+        raise UntrustedError(
+            f"the run was not tracked from here on this machine, and its own folder is {noted or 'not known'}; if you "
+            f"trust the author of {folder}, add {TRUST}"
+        )
 
 
 def deliver_pending(store: TrackingStore) -> None:
@@ -177,6 +199,7 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
 def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
     """Note how a run has ended, for `sync` to deliver, without asking its store."""
     with contextlib.closing(Outbox.begin(folder, Address(run_id, absolute(uri)))) as outbox:
+        outbox.note()
         if tags:
             outbox.add(tags=tags_of(tags))
         outbox.add(status=(status, now_ms()))

@@ -170,3 +170,19 @@ def test_code_in_a_kept_policy_is_not_executed_when_it_is_registered(armscan, tm
     store_of(tmp_path).set_tag(run_id, SUM_TAG, model_sha256(model))
     assert armscan("policy", "register", run_id, "--name=n")[0] == 0
     assert not marker.exists()
+
+
+def test_commands_that_are_suggested_for_a_run_with_a_class_of_ones_own_can_be_typed(armscan, tmp_path):
+    run_id = tracked(tmp_path, agent=GUESSER, kept=("config.yaml", "volumes.json"))
+    client = store_of(tmp_path)
+    client.log_param(run_id, "agent._target_", GUESSER["_target_"])
+    (tmp_path / "best.pt").touch()
+    client.log_artifact(run_id, str(tmp_path / "best.pt"))
+    code, printed, _ = armscan("runs", "show", run_id)
+    assert code == 0
+    suggested = [line for line in printed.splitlines() if line.startswith(("evaluate", "record"))]
+    assert len(suggested) == 2
+    assert all(line.endswith(" --trust") for line in suggested)
+    client.log_param(tracked(tmp_path), "agent._target_", "armscan.agents.sac.SAC")
+    code, printed, _ = armscan("runs", "show", tracked(tmp_path))
+    assert "--trust" not in printed

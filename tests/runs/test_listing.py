@@ -216,3 +216,28 @@ def test_control_characters_of_names_and_tags_do_not_reach_the_terminal(answer, 
         assert (code, errors) == (0, "")
         assert "\\x1b]0;title" in printed
         assert not {each for each in printed if ord(each) < 32} - {"\n"}
+
+
+def test_runs_that_are_above_themselves_are_listed(make_run, store, listed):
+    client, _ = store
+    ids = {name: make_run(name) for name in "abcd"}
+    # Of two in a circle, with one below it, and one that is its own parent.
+    for child, parent in ("ab", "ba", "cb", "dd"):
+        client.set_tag(ids[child], "mlflow.parentRunId", ids[parent])
+    assert set(listed("--children")) == set("abcd")
+    assert set(listed()) == set("abcd")
+
+
+def test_long_line_of_parents_is_listed(make_run, store, listed):
+    client, experiment_id = store
+    parent = make_run("first")
+    for number in range(12):
+        parent = client.create_run(experiment_id, name=str(number), tags={"mlflow.parentRunId": parent}).info.run_id
+    assert set(listed("--children")) == {"first", *map(str, range(12))}
+
+
+def test_name_that_a_spreadsheet_would_compute_is_a_text_in_csv(make_run, answer):
+    make_run("=HYPERLINK(1)", folder=None)
+    code, printed, _ = answer("list", "--format=csv")
+    assert code == 0
+    assert [row["name"] for row in csv.DictReader(io.StringIO(printed))] == ["'=HYPERLINK(1)"]

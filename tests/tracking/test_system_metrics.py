@@ -42,7 +42,7 @@ def test_system_metrics_of_a_run_end_with_its_training_and_go_on_with_it(store, 
     first.on_end()
     assert not threads()
     first.end("KILLED", reason="interrupted")
-    second = TrackedRun.reopen(client, first.run_id, folder=tmp_path, config={}, tags={})
+    second = TrackedRun.reopen(client, client.get_run(first.run_id), folder=tmp_path, config={}, tags={})
     second.on_start(100, ())
     second.on_end()
     second.end("FINISHED")

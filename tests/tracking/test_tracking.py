@@ -130,9 +130,9 @@ def test_folder_that_was_removed_before_it_was_delivered_is_told(store, tmp_path
 @pytest.mark.parametrize("kind", ["above", "absolute", "link"])
 def test_file_outside_of_a_strangers_folder_is_not_uploaded(store, tmp_path, kind):
     client, experiment_id = store
-    run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id
     (tmp_path / "secret").write_text("secret")
     folder = tmp_path / "theirs"
+    run_id = client.create_run(experiment_id, name="n", tags={"folder": str(folder)}).info.run_id
     names = {"above": "../secret", "absolute": str(tmp_path / "secret"), "link": "link"}
     outbox = Outbox.begin(folder, Address(run_id, client.uri))
     (folder / "link").symlink_to(tmp_path / "secret")
@@ -154,6 +154,24 @@ def test_file_outside_of_a_strangers_folder_is_not_uploaded(store, tmp_path, kin
     (delivery,) = sync(tmp_path, lambda _: client, trust=True)
     assert delivery.left is None
     assert len(client.list_artifacts(run_id)) == 1
+
+
+@pytest.mark.parametrize("tags", [{}, {"folder": "/mine"}], ids=["a study's", "a training's"])
+def test_strangers_folder_that_names_a_run_of_mine_writes_nothing_to_it(store, tmp_path, tags):
+    client, experiment_id = store
+    run_id = client.create_run(experiment_id, name="n", tags=tags).info.run_id
+    with contextlib.closing(Outbox.begin(tmp_path / "theirs", Address(run_id, client.uri))) as outbox:
+        outbox.add(tags={"x": "theirs"})
+        outbox.add(metrics=[("x", 1.0, 0, 0)])
+        outbox.add(status=("FAILED", 1))
+    (delivery,) = sync(tmp_path, lambda _: client)
+    assert "the run was not tracked from here" in delivery.left
+    assert "add --trust" in delivery.left
+    run = client.get_run(run_id)
+    assert (run.info.status, run.data.metrics, run.data.tags.get("x")) == ("RUNNING", {}, None)
+    (delivery,) = sync(tmp_path, lambda _: client, trust=True)
+    assert delivery.left is None
+    assert client.get_run(run_id).info.status == "FAILED"
 
 
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt(), "KILLED"), (ValueError("no"), "FAILED")])
@@ -193,7 +211,8 @@ def test_run_that_goes_on_logs_what_is_missing_and_nothing_twice(store, tmp_path
     first.on_epoch(REPORTS[0])
     first.end("KILLED", reason="interrupted")
     config = {"seed": 3, "more": 4}
-    second = TrackedRun.reopen(client, first.run_id, folder=tmp_path, config=config, tags={"folder": "there"})
+    run = client.get_run(first.run_id)
+    second = TrackedRun.reopen(client, run, folder=tmp_path, config=config, tags={"folder": "there"})
     run = eventually(lambda: client.get_run(first.run_id), lambda run: "more" in run.data.params)
     assert run.info.status == "RUNNING"
     assert "failure" not in run.data.tags

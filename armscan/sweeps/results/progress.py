@@ -16,12 +16,13 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.config.command_hints import armscan_command
-from armscan.errors import StorageAwayError
+from armscan.errors import ArmscanError, printable
 from armscan.experiment.console import print_table, print_where_to_look
 from armscan.experiment.results import volume_notes
 from armscan.sweeps.results.summary import final_results, final_table, values_of
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, STOP, StudyState
 from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.attributes import check_trials
 from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.study import best_trials
 from armscan.utils.retry import no_retry
@@ -43,7 +44,7 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
         for key, trial, phase in _ended(opened):
             if key not in shown:
                 shown.add(key)
-                print(_describe(trial, phase.objectives), flush=True)
+                print(printable(_describe(trial, phase.objectives)), flush=True)
 
     def show() -> None:
         # Nothing that is shown is worth waiting for: who leaves would wait for it, too.
@@ -67,22 +68,21 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
 
 
 def repeat(show: Callable[[], None], stopped: threading.Event) -> None:
-    """Show how a study is going again and again; where its storage is away, that it is, and nothing new.
+    """Show how a study is going again and again; where its storage is away or damaged, that it is, and nothing new.
 
     Args:
         show: shows it once.
         stopped: ends the repetition, once it is shown for the last time.
     """
-    is_away, is_last = False, False
+    told, is_last = "", False
     while not is_last:
         is_last = stopped.wait(REFRESH_S)
         try:
             show()
-            is_away = False
-        except StorageAwayError as error:
-            if not is_away:
+            told = ""
+        except ArmscanError as error:
+            if told != (told := str(error)):
                 print(error, flush=True)
-            is_away = True
 
 
 def _ended(opened: OpenedStudy) -> list[tuple[tuple[str, int], FrozenTrial, Phase]]:
@@ -111,7 +111,8 @@ def _table(opened: OpenedStudy) -> Table:
         name = str(trial.number) if finalist is None else f"final evaluation of {finalist}: {trial.number}"
         mean_return = f"{lease['return']:.2f}" if "return" in lease else "-"
         shown = (lease.get("seed", "-"), lease.get(ENV_STEPS, "-"), mean_return)
-        table.add_row(lease.get("worker", "?").rpartition("/")[2], name, *map(str, shown))
+        worker = printable(lease.get("worker", "?").rpartition("/")[2])
+        table.add_row(Text(worker), name, *map(str, shown))
     return table
 
 
@@ -161,7 +162,7 @@ def print_result(opened: OpenedStudy) -> int:
             f"their logs in {opened.folder / 'workers'} say why; the same command resumes the study"
         )
     if wrong:
-        print(f"error: {wrong}", file=sys.stderr)
+        print(printable(f"error: {wrong}"), file=sys.stderr)
         return 1
     table = Table("trial", *settings.objectives, "values", title="best while searching", title_justify="left")
     for trial in best_trials(scheduler.study, max(1, settings.final_eval.top_k)):
@@ -179,10 +180,12 @@ def _print_final_results(opened: OpenedStudy) -> bool:
     """Print the final evaluation; returns whether there is one, if it is asked for."""
     if opened.final_eval is None:
         return True
+    trials = opened.search.scheduler.study.get_trials(deepcopy=False)
+    check_trials(opened.final_eval.scheduler.study, n_searched=len(trials))
     state = opened.final_eval.scheduler.state()
     if state.failed:
         reason = state.failed[0].user_attrs.get(FAILURE)
-        print(f"error: {len(state.failed)} of the final trainings have failed: {reason}", file=sys.stderr)
+        print(printable(f"error: {len(state.failed)} of the final trainings have failed: {reason}"), file=sys.stderr)
     results = final_results(state.finished)
     if not results:
         print("error: no final evaluation, because no trial or no final training has finished", file=sys.stderr)
@@ -190,7 +193,6 @@ def _print_final_results(opened: OpenedStudy) -> bool:
     n_seeds = ", ".join(sorted({str(result.n_seeds) for result in results}))
     title = f"result on the test volumes, with {n_seeds} other seed(s) each"
     print_table(title, final_table(results), volume_notes(results[0].figures))
-    trials = opened.search.scheduler.study.get_trials(deepcopy=False)
     for result in results:
         print(f"trial {result.number}: {' '.join(overrides_of(trials[result.number].params))}")
     return True

@@ -38,6 +38,8 @@ ID_CHARS = 8
 # How people say the states of trials.
 STATES = {"complete": "finished", "fail": "failed"}
 Row = dict[str, Any]
+# How a GIF begins.
+GIF = b"GIF8"
 
 
 def write_report(
@@ -161,6 +163,8 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
     videos: dict[int, str] = {}
     for trial in final_trials:
         files = sorted(Path(trial.user_attrs.get(FOLDER, "nowhere")).glob("seed_*/episode.gif"))
+        # A stranger's folder may have links to any file of this user.
+        files = [file for file in files if file.is_file() and file.read_bytes().startswith(GIF)]
         number = trial.user_attrs[FINALIST]
         if files and number not in videos:
             address = video_address(files[0].read_bytes())

@@ -11,6 +11,7 @@ import optuna
 from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
 
+from armscan.errors import StudyError
 from armscan.stats.aggregation import over_seeds
 from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
 from armscan.sweeps.study.study import best_trials
@@ -102,7 +103,13 @@ def _config_result(number: int, of_seeds: Sequence[FrozenTrial]) -> ConfigResult
 
 def _episodes(trial: FrozenTrial) -> dict[str, Evaluation]:
     kept = trial.system_attrs.get(EPISODES, {})
-    return {name: Evaluation.of_columns(each["episodes"], each["on_plane"]) for name, each in kept.items()}
+    try:
+        found = {name: Evaluation.of_columns(each["episodes"], each["on_plane"]) for name, each in kept.items()}
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise StudyError(f"final training {trial.number}: its {EPISODES} in the storage are damaged") from error
+    if found and (TEST not in found or not found[TEST].episodes):
+        raise StudyError(f"final training {trial.number}: its {EPISODES} in the storage hold none on the {TEST}")
+    return found
 
 
 def _of_means(of_seeds: Sequence[Mapping[str, float]]) -> MetricEstimates:

@@ -10,7 +10,7 @@ from typing import Any, Self, TypeVar
 from optuna.trial import FrozenTrial, Trial, TrialState
 from pydantic import Field
 
-from armscan.sweeps.space.section import Section
+from armscan.utils.section import Section
 
 T = TypeVar("T")
 # User attributes of a trial.

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field
 
 from armscan.config.legacy import renamed
 from armscan.errors import InvalidValueError
-from armscan.sweeps.space.section import Section
+from armscan.utils.section import Section
 
 # Whatever begins with one of these.
 NOT_SEARCHED = ("study", "sweep", "tracking", "hydra", "seed")

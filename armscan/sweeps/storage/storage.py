@@ -12,13 +12,12 @@ from typing import TypeVar
 import optuna
 from filelock import FileLock
 from optuna.exceptions import StorageInternalError
-from optuna.storages import BaseStorage
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.config.credentials import STORAGE_PASSWORD, check_address, database_url, mask_passwords
 from armscan.errors import StorageAwayError, StudyError
 from armscan.sweeps.storage.database import DatabaseStorage, open_database, tables_in
-from armscan.sweeps.storage.journal import open_journal
+from armscan.sweeps.storage.journal import CheckedJournal, open_journal
 from armscan.utils.files import SQLITE_PREFIX, sqlite_file
 
 T = TypeVar("T")
@@ -38,7 +37,7 @@ class Storage:
     """
 
     uri: str
-    optuna: BaseStorage = field(repr=False)
+    optuna: DatabaseStorage | CheckedJournal = field(repr=False)
     lock_file: Path | None
 
     def exclusive(self, decide: Callable[[], T]) -> T:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import optuna
 from hydra.errors import HydraException, InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
@@ -22,6 +23,7 @@ from armscan.errors import ArmscanError, InvalidValueError, StudyError, listed
 from armscan.sweeps.space.parameter import Value, overrides_of
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.arguments import fixed_by
+from armscan.sweeps.study.samplers import CmaEsSampler
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.tasks.attempt import Task, composed, of_run
 
@@ -48,7 +50,12 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
             raise InvalidValueError("nothing is left to search: each key of study.space is given a value")
     settings = StudySettings.read("study", section)
     # What cannot be made is refused here, and not by the first trial.
-    make("sampler", settings.sampler, BaseSampler, seed=settings.seed)
+    sampler = make("sampler", settings.sampler, BaseSampler, seed=settings.seed)
+    if isinstance(sampler, optuna.samplers.CmaEsSampler) and not isinstance(sampler, CmaEsSampler):
+        raise InvalidValueError(
+            f"study.sampler is {settings.sampler['_target_']}, which executes what the storage of the study holds: "
+            "give study/sampler=cmaes"
+        )
     make("pruner", settings.pruner, BasePruner)
     for name, folder in (("folder", settings.folder), ("artifacts", settings.artifacts)):
         path = Path(folder).absolute()

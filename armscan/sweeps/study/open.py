@@ -17,13 +17,13 @@ from armscan.config.defaults import to_plain
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import FINAL_SEED, Limits
 from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import note_run
-from armscan.sweeps.study.settings import FINAL_EVAL_SUFFIX, StudySettings
-from armscan.sweeps.study.stored import check_trials
+from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import STUDY_RUN, make_study, name_objectives
-from armscan.sweeps.tasks.attempt import Attempt, Task, trial_folder
-from armscan.tracking import TrackingStore, abandon, open_store, source
+from armscan.sweeps.tasks.attempt import STORAGE_TAG, STUDY_TAG, TRIAL_TAG, Attempt, Task, trial_folder
+from armscan.tracking import TrackingStore, abandon, open_store, run_of_study, source
 from armscan.tracking.run import FAILURE_TAG
 from armscan.utils.retry import RETRY_S
 
@@ -67,6 +67,10 @@ class Phase:
     experiment_id: str
     run_id: str
 
+    def tags_of(self, trial: FrozenTrial | Trial) -> dict[str, str]:
+        """Return the tags by which tracked runs of a trial are known."""
+        return {STUDY_TAG: self.name, STORAGE_TAG: self.scheduler.storage.uri, TRIAL_TAG: str(trial.number)}
+
     def close_runs_of(self, trial: FrozenTrial) -> None:
         """Close the tracked runs that a dead worker has left open, except those that a retry has resumed."""
         abandon(trial_folder(self.folder, trial.number), self.client, WORKER_DIED)
@@ -74,12 +78,13 @@ class Phase:
     def close_orphaned_runs(self) -> None:
         """Close runs of failed trials whose workers died before they could write the run's ID to its folder."""
         running = self.client.search_runs(
-            [self.experiment_id], f"tags.study = '{self.name}' AND attributes.status = 'RUNNING'"
+            [self.experiment_id], f"tags.{STUDY_TAG} = '{self.name}' AND attributes.status = 'RUNNING'"
         )
         state = self.scheduler.state()
-        failed = {str(trial.number) for trial in (*state.failed, *state.retried)}
+        # A study in another storage may have the same name.
+        failed = [self.tags_of(trial) for trial in (*state.failed, *state.retried)]
         for run in running:
-            if run.data.tags.get("trial") in failed:
+            if any(tags.items() <= run.data.tags.items() for tags in failed):
                 self.client.set_tag(run.info.run_id, FAILURE_TAG, WORKER_DIED)
                 self.client.set_terminated(run.info.run_id, "FAILED")
 
@@ -129,14 +134,22 @@ def open_for_work(
 
     @functools.cache
     def create_run() -> str:
-        tags = {**source().tags, "study": settings.name, "study.storage": storage.uri, "overrides": " ".join(words)}
+        tags = {**source().tags, STUDY_TAG: settings.name, STORAGE_TAG: storage.uri, "overrides": " ".join(words)}
         return str(client.create_run(experiment_id, name=f"study {settings.name}", tags=tags).info.run_id)
 
     def tracked_run() -> str:
         if STUDY_RUN not in study.user_attrs:
             study.set_user_attr(STUDY_RUN, create_run())
             note_run(study, client, experiment_id, create_run(), Path(settings.folder))
-        return str(study.user_attrs[STUDY_RUN])
+            return create_run()
+        run = run_of_study(
+            client,
+            study.user_attrs[STUDY_RUN],
+            experiment_id=experiment_id,
+            tags={STUDY_TAG: settings.name, TRIAL_TAG: None},
+            where=f"{settings.name}.user_attrs.{STUDY_RUN}",
+        )
+        return str(run.info.run_id)
 
     objectives = tuple(settings.objectives)
     search = Phase(

@@ -11,12 +11,11 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.state import Limits
-from armscan.sweeps.space.section import Section
 from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX
+from armscan.utils.section import Section
 from armscan.utils.validation import LARGEST_SEED
 
-# The study of the final trainings is called like the study, with this suffix.
-FINAL_EVAL_SUFFIX = "-judged"
 NAME = re.compile(rf"(?!.*{FINAL_EVAL_SUFFIX}$)\w[\w\-.]{{0,99}}")
 # The first final seed is this much above the largest seed of the search.
 FIRST_SEED_ABOVE, MAX_FINAL_SEEDS = 1000, 1000

@@ -17,10 +17,10 @@ from armscan.config.defaults import NOT_COMPARED
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST
+from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.components import make
 from armscan.sweeps.study.settings import FIRST_SEED_ABOVE, StudySettings
-from armscan.sweeps.study.stored import StudyAttributes, check_trials
 from armscan.tracking import flattened
 
 # User attributes of a study.

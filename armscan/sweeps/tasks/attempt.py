@@ -26,6 +26,8 @@ from armscan.utils.validation import check_float
 
 # User attributes of a trial.
 RUN, FOLDER, CONFIG_SHA256 = "mlflow_run", "folder", "config_sha256"
+# Tags of tracked runs: the study, its storage, and the trial.
+STUDY_TAG, STORAGE_TAG, TRIAL_TAG = "study", "study.storage", "trial"
 TRIAL_DIGITS = 4
 
 
@@ -41,6 +43,7 @@ class Attempt:
         seeds: the seeds that it is run with, one after another.
         study_folder: the folder of the study.
         run_id: the ID of its tracked run.
+        tags: tags of the tracked runs of its trainings, that say of which study and trial they are.
         objective: the metric that it reports to the pruner while it runs; None without pruning.
         report_progress: takes what is known of how far it is.
         opened: takes the tracked run of a training while it goes on, and None when it has ended.
@@ -56,6 +59,7 @@ class Attempt:
     seeds: tuple[int, ...]
     study_folder: Path
     run_id: str
+    tags: Mapping[str, str]
     objective: str | None
     report_progress: Callable[[dict[str, Any]], None]
     opened: Callable[[TrackedRun | None], None]

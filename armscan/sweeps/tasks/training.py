@@ -22,8 +22,9 @@ from armscan.experiment.results import RunResult
 from armscan.experiment.runner import VIDEO_SEED, train_agent
 from armscan.stats.aggregation import interquartile_mean
 from armscan.sweeps.scheduling.state import ENV_STEPS
-from armscan.sweeps.tasks.attempt import Attempt, volumes_of
-from armscan.tracking import TrackedRun, draw_learning_curve, open_store, take_over
+from armscan.sweeps.tasks.attempt import STUDY_TAG, Attempt, volumes_of
+from armscan.tracking import TrackedRun, draw_learning_curve, open_store, run_of_study, take_over
+from armscan.tracking.run import PARENT_TAG
 from armscan.training import (
     TEST,
     Budget,
@@ -176,14 +177,16 @@ def _begun(
             # The trial can always start again, with an untrained agent.
             setup = set_up(config)
         else:
-            client, _ = open_store(**to_plain(config.tracking), retry_s=RETRY_S)
-            tags = volume_tags(setup.fingerprints) | place_tags(folder)
-            tags["mlflow.parentRunId"] = attempt.run_id
-            return setup, TrackedRun.reopen(client, run_id, folder=folder, config=to_plain(config), tags=tags), earlier
+            client, experiment_id = open_store(**to_plain(config.tracking), retry_s=RETRY_S)
+            # An attempt before had another trial's number.
+            known = {STUDY_TAG: attempt.tags[STUDY_TAG], "seed": str(seed)}
+            run = run_of_study(client, run_id, experiment_id=experiment_id, tags=known, where=str(begun))
+            tags = {**volume_tags(setup.fingerprints), **place_tags(folder), **attempt.tags}
+            tags[PARENT_TAG] = attempt.run_id
+            return setup, TrackedRun.reopen(client, run, folder=folder, config=to_plain(config), tags=tags), earlier
     job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
     invocation = Invocation(folder, attempt.overrides, attempt.command, choices, job)
-    tracked = start_tracking(config, invocation, setup, retry_s=RETRY_S)
-    tracked.set_tags({"study": attempt.trial.study.study_name, "trial": str(attempt.trial.number)})
+    tracked = start_tracking(config, invocation, setup, tags=attempt.tags, retry_s=RETRY_S)
     atomic_write(begun, lambda file: file.write(json.dumps({"run_id": tracked.run_id}).encode()))
     return setup, tracked, []
 

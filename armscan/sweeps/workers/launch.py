@@ -17,7 +17,7 @@ from armscan.config.command_hints import armscan_command
 from armscan.config.defaults import TRACKING_URI
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import working_folder
-from armscan.errors import ArmscanError, AwayError, StorageAwayError, StudyError
+from armscan.errors import ArmscanError, StudyError
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, silence_launcher
 from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.results.summary import best_metrics
@@ -138,8 +138,8 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
             signal.signal(each, signal.SIG_IGN)
         (folder / STOP_FILE).touch()
         _end_workers(folder)
-        # If the storage is away, the next start does it.
-        with contextlib.suppress(StorageAwayError), no_retry():
+        # If the storage is away, the next start does it; if it is damaged, the result says so.
+        with contextlib.suppress(ArmscanError), no_retry():
             for phase in opened.phases:
                 for trial in phase.scheduler.reclaim(LivenessCheck().is_dead):
                     phase.close_runs_of(trial)
@@ -157,8 +157,10 @@ def _deliver(opened: OpenedStudy, tracked: TrackedRun, status: str) -> None:
     is_there = tracked.end(status, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
     left = []
     if is_there:
-        left = [each.folder for each in sync(opened.folder, lambda _: opened.search.client) if each.left]
-        with contextlib.suppress(AwayError), no_retry():
+        # Who may write into the folder of a study can execute code in it.
+        deliveries = sync(opened.folder, lambda _: opened.search.client, trust=True)
+        left = [each.folder for each in deliveries if each.left]
+        with contextlib.suppress(ArmscanError), no_retry():
             for phase in opened.phases:
                 phase.close_orphaned_runs()
     if not is_there or left:

@@ -9,7 +9,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 
-from armscan.errors import StorageAwayError
+from armscan.errors import ArmscanError, StorageAwayError
 from armscan.sweeps.study.open import OpenedStudy
 from armscan.sweeps.study.study import missing_final_trials
 from armscan.sweeps.workers.heartbeat import LivenessCheck
@@ -69,7 +69,7 @@ class StudyMonitor:
 
     def wait_for_requeue(self) -> None:
         """Wait until the workers, which have been asked to leave, have requeued their trials."""
-        with contextlib.suppress(StorageAwayError), no_retry():
+        with contextlib.suppress(ArmscanError), no_retry():
             while any(phase.scheduler.state().running for phase in self._opened.phases):
                 time.sleep(1.0)
 
@@ -89,7 +89,7 @@ class StudyMonitor:
                 while over_s < OVER_S:
                     if is_left.wait(LOOK_S):
                         return
-                    with contextlib.suppress(StorageAwayError):
+                    with contextlib.suppress(ArmscanError):
                         over_s = over_s + LOOK_S if self.is_over() else 0.0
             is_over.set()
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)

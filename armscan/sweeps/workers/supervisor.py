@@ -17,15 +17,15 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
-from armscan.errors import AwayError, StudyError
+from armscan.errors import ArmscanError, AwayError, StudyError
 from armscan.sweeps.workers.slurm import SOON, Notice
 from armscan.utils.processes import ProcessInfo, child_command, on_parent_exit
 
 LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
-# Exit codes of a worker that was told to leave, of one whose storage was away for too long, and of all that are not
-# restarted.
-LEFT, AWAY = 130, 75
-ENDS = (0, LEFT, AWAY)
+# Exit codes of a worker that was told to leave, of one whose storage was away for too long, of one that cannot work at
+# the study as it is stored, and of all that are not restarted.
+LEFT, AWAY, REFUSED = 130, 75, 65
+ENDS = (0, LEFT, AWAY, REFUSED)
 GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"
 # A worker that is killed again and again does no work; its trials have failed long before.
 MAX_RESTARTS = 100
@@ -144,6 +144,6 @@ def worker_main() -> None:
     )
     try:
         work(words, make_heartbeat)
-    except AwayError as error:
+    except ArmscanError as error:
         log(str(error))
-        raise SystemExit(AWAY) from error
+        raise SystemExit(AWAY if isinstance(error, AwayError) else REFUSED) from error

@@ -29,6 +29,8 @@ from armscan.sweeps.tasks.attempt import (
     CONFIG_SHA256,
     FOLDER,
     RUN,
+    STUDY_TAG,
+    TRIAL_TAG,
     Attempt,
     check_metrics,
     composed,
@@ -36,8 +38,8 @@ from armscan.sweeps.tasks.attempt import (
     trial_folder,
 )
 from armscan.sweeps.workers.heartbeat import Heartbeat, LimitReachedError
-from armscan.tracking import TrackedRun
-from armscan.tracking.run import SHORT_WAIT_S
+from armscan.tracking import TrackedRun, run_of_study
+from armscan.tracking.run import PARENT_TAG, SHORT_WAIT_S
 from armscan.utils.files import CONFIG_FILE, SHA256_TAGS
 from armscan.utils.log import log, silence_library_warnings
 
@@ -140,6 +142,7 @@ class Worker:
             seeds=phase.seeds_of(trial),
             study_folder=phase.folder,
             run_id=self._tracked.run_id,
+            tags=phase.tags_of(trial),
             objective=phase.reported,
             report_progress=self._heartbeat.report_progress,
             opened=self._opened,
@@ -159,9 +162,7 @@ class Worker:
         """Open the tracked run of a trial, or resume that of a requeued one."""
         phase, attributes = self._phase, trial.user_attrs
         tags = {
-            "study": phase.name,
-            "study.storage": phase.scheduler.storage.uri,
-            "trial": str(trial.number),
+            **phase.tags_of(trial),
             SHA256_TAGS[CONFIG_FILE]: config_sum,
             "folder": str(folder.resolve()),
             "overrides": " ".join(overrides_of(chosen)),
@@ -169,7 +170,14 @@ class Worker:
         if RETRY_OF in attributes:
             tags["trial.retry_of"] = str(attributes[RETRY_OF])
         if RUN in attributes:
-            tracked = TrackedRun.reopen(phase.client, attributes[RUN], folder=folder, config={}, tags=tags)
+            run = run_of_study(
+                phase.client,
+                attributes[RUN],
+                experiment_id=phase.experiment_id,
+                tags={STUDY_TAG: phase.name, TRIAL_TAG: str(trial.number), PARENT_TAG: phase.run_id},
+                where=f"{phase.name}.trials[{trial.number}].user_attrs.{RUN}",
+            )
+            tracked = TrackedRun.reopen(phase.client, run, folder=folder, config={}, tags=tags)
         else:
             tracked = TrackedRun.start(
                 phase.client,

@@ -1,5 +1,6 @@
 """The report of a study: one page without a server, every number as CSV beside it."""
 
+import base64
 import csv
 import json
 import re
@@ -230,3 +231,15 @@ def test_report_answers_mistakes_in_one_line(answer, tmp_path, words, line):
     assert errors.startswith(line)
     assert len(errors.splitlines()) == 1
     assert sorted(tmp_path.iterdir()) == there
+
+
+def test_report_shows_no_file_that_a_strangers_folder_links_to(answer, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    judge(searched(tmp_path, ["mean_steps"]), tmp_path)
+    (tmp_path / "secret").write_text("secret")
+    for film in tmp_path.glob("trials/seed_*/episode.gif"):
+        film.unlink()
+        film.symlink_to(tmp_path / "secret")
+    assert answer("--study=a", f"--storage={tmp_path}/optuna.journal")[0] == 0
+    page = (tmp_path / "reports" / "a" / "report.html").read_text()
+    assert base64.b64encode(b"secret").decode() not in page

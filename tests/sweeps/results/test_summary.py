@@ -9,6 +9,7 @@ from optuna.trial import TrialState, create_trial
 from rliable.library import get_interval_estimates
 from rliable.metrics import aggregate_mean
 
+from armscan.errors import StudyError
 from armscan.sweeps.results.summary import final_results, final_table
 from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
 from armscan.training import Evaluation
@@ -114,3 +115,10 @@ def test_baselines_of_other_rules_are_named_after_their_trials():
     others = tuple(replace(episode, n_steps=50) for episode in ours)
     table = final_table(final_results([trial(0, ours), trial(1, ours), trial(2, others)]))
     assert list(table.results) == ["trial 0", "trial 1", "trial 2", "random of trial 0, trial 1", "random of trial 2"]
+
+
+@pytest.mark.parametrize("kept", [3, {"test volumes": 3}, {"test volumes": {"episodes": {}, "on_plane": []}}], ids=str)
+def test_episodes_that_a_stranger_has_written_are_one_line(kept):
+    trial = create_trial(value=0.0, user_attrs={FINALIST: 0, FINAL_SEED: 1, METRICS: {}}, system_attrs={EPISODES: kept})
+    with pytest.raises(StudyError, match="final training -1: its episodes in the storage"):
+        final_results([trial])

@@ -9,6 +9,7 @@ import numpy as np
 import optuna
 import pytest
 
+from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
@@ -134,6 +135,42 @@ def test_worker_fails_a_trial_that_returns_something_else_than_metrics(work, met
     assert [trial.state.name for trial in study.trials] == ["FAIL"] * 3
     assert reason in study.trials[0].user_attrs["failure"]
     assert best_trials(study, 1) == []
+
+
+OTHERS = {
+    "another study's": {"study": "b", "trial": "0"},
+    "another trial's": {"study": "a", "trial": "7"},
+    "of a study of the same name": {"study": "a", "trial": "0", "mlflow.parentRunId": "0" * 32},
+    "no trial's": {},
+}
+
+
+@pytest.mark.parametrize("tags", OTHERS.values(), ids=OTHERS)
+def test_run_that_a_trial_names_and_that_is_anothers_is_left_as_it_is(work, tmp_path, empty_database, tags):
+    (tmp_path / "a").mkdir()
+    shutil.copy(empty_database, tmp_path / "a" / "a.db")
+    client, experiment_id = open_store(
+        f"sqlite:///{tmp_path}/a/a.db", experiment="a", artifacts=str(tmp_path / "a" / "b"), wait_s=60.0
+    )
+    victim = client.create_run(experiment_id, name="n", tags=tags)
+    study = optuna.create_study(study_name="a", storage=work.storage("a").optuna)
+    study.enqueue_trial({"agent.lr": 1e-3}, user_attrs={"mlflow_run": victim.info.run_id})
+    study = work("a", n_trials=1)
+    line = f"a.trials[0].user_attrs.mlflow_run names run {victim.info.run_id}, which is another's"
+    assert study.trials[0].user_attrs["failure"].startswith(line)
+    now = client.get_run(victim.info.run_id)
+    assert (now.info.status, now.data.tags, now.data.params) == ("RUNNING", victim.data.tags, {})
+
+
+def test_trial_that_a_stranger_damages_while_it_runs_ends_the_worker_in_one_line(work, capfd):
+    def damaged(attempt):
+        stranger = work.storage("a").optuna
+        stranger.set_trial_user_attr(attempt.trial._trial_id, "seeds", "x")
+        return far_from_a_thousandth(attempt)
+
+    with pytest.raises(InvalidValueError, match=r"user_attrs.seeds is 'x', but it must be the metrics of each seed"):
+        work("a", damaged)
+    assert "Traceback" not in "".join(capfd.readouterr())
 
 
 @pytest.mark.parametrize("raised", [SystemExit(0), KeyboardInterrupt()], ids=repr)

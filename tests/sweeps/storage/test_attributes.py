@@ -12,8 +12,8 @@ from armscan.sweeps.results.report import write_report
 from armscan.sweeps.scheduling import state as names
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, LEASE, METRICS, Limits
+from armscan.sweeps.storage.attributes import StudyAttributes, TrialAttributes, check_trials
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.stored import StudyAttributes, TrialAttributes, check_trials
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, FIXED, SPACE, STUDY_RUN, make_study
 from armscan.sweeps.tasks import attempt
 from armscan.sweeps.workers.heartbeat import LivenessCheck
@@ -74,6 +74,30 @@ def test_attribute_of_a_trial_of_any_type_is_refused_in_one_line_or_harmless(tmp
             study = study_with(attributes, state=state)
             if not is_refused(lambda study=study: check_trials(study)):
                 work_with(study, tmp_path)
+
+
+@pytest.mark.parametrize("value", ODD, ids=lambda value: repr(value)[:10])
+def test_attribute_that_a_stranger_writes_while_a_study_runs_is_one_line_or_harmless(tmp_path, value):
+    for number, name in enumerate([*OF_TRIAL, *OF_LEASE]):
+        uri = str(tmp_path / f"{number}.journal")
+        study = make_study(open_storage(uri), settings(storage=uri), {})
+        trial = study.ask()
+        stranger = optuna.load_study(study_name="a", storage=open_storage(uri).optuna)
+        damage = {name: value} if name in OF_TRIAL else {LEASE: {name: value}}
+        for key, damaged in damage.items():
+            stranger._storage.set_trial_user_attr(trial._trial_id, key, damaged)
+        was_refused = is_refused(lambda study=study: work_with(study, tmp_path))
+        # As when it is opened.
+        sound = study_with(damage)
+        assert was_refused == is_refused(lambda sound=sound: check_trials(sound))
+        if was_refused:
+            assert is_refused(lambda study=study, trial=trial: study._storage.get_trial(trial._trial_id))
+
+
+def test_final_training_of_nothing_that_a_stranger_adds_while_a_study_runs_is_refused(tmp_path):
+    study = optuna.create_study(study_name="a-judged", storage=open_storage(str(tmp_path / "a.journal")).optuna)
+    study.add_trial(create_trial(value=1.0, user_attrs={FINALIST: 0}))
+    assert is_refused(lambda: study.get_trials(deepcopy=False))
 
 
 @pytest.mark.parametrize("name", StudyAttributes.model_fields)

@@ -1,0 +1,216 @@
+"""Check the attributes and values of a stored study whenever they are read: a stranger may have written them."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Sequence
+from numbers import Real
+from typing import Annotated, Any
+
+import optuna
+from optuna.storages import BaseStorage
+from optuna.trial import FrozenTrial, TrialState
+from pydantic import ConfigDict, Field
+
+from armscan.errors import ArmscanError, StudyError, few
+from armscan.utils.section import Section
+from armscan.utils.validation import LARGEST_SEED
+
+# The study of the final trainings is called like the study, with this suffix.
+FINAL_EVAL_SUFFIX = "-judged"
+# What each of its trials has, and what those have that are complete.
+OF_FINAL, OF_FINISHED = ("judged", "judged_seed"), "figures"
+# What each study of armscan has.
+OF_STUDY = {"space", "fixed_config", "objectives"}
+# What Optuna's readers raise on what Optuna has not written.
+DAMAGED = (ValueError, TypeError, AttributeError, AssertionError)
+UNREADABLE = (*DAMAGED, LookupError)
+MAX_REASON_CHARS = 300
+# SQLite's largest whole number.
+LARGEST = 2**63 - 1
+Number = Annotated[int, Field(ge=0, le=LARGEST, description="a whole number of at least 0")]
+# Without what no path can have.
+Text = Annotated[str, Field(pattern=r"^[^\x00]*$", description="a text")]
+
+
+class _Attributes(Section):
+    """User attributes; those of others are ignored."""
+
+    model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
+
+
+class StudyAttributes(_Attributes):
+    """User attributes of a study; the names are those of `armscan.sweeps.study.study` and of the scheduler."""
+
+    space: dict[str, str] = Field(description="texts by the names of keys")
+    fixed_config: dict[str, Any] = Field(description="values by the names of keys")
+    objectives: dict[str, str] = Field(description="directions by the names of metrics")
+    mlflow_run: Text = ""
+    stop: Text = ""
+    forgiven: list[Number] = Field(default=[], description="a list of numbers of trials")
+
+
+class _Lease(_Attributes):
+    worker: Text = ""
+    host: Text = ""
+    started: Text = ""
+    directory: Text = ""
+    boot: Text = ""
+    pid_namespace: Text = ""
+    pid: Number = 0
+    beat: Number = 0
+    seed: Number = 0
+    env_steps: Number = 0
+    mean_return: float = Field(default=0.0, alias="return", description="a number")
+
+
+class TrialAttributes(_Attributes):
+    """User attributes of a trial; the names are those of `armscan.sweeps.scheduling.state` and of `Attempt`."""
+
+    lease: _Lease = Field(default=_Lease(), description="what a worker writes")
+    env_steps: Number = 0
+    figures: dict[str, float] = Field(default={}, description="numbers by their names")
+    failure: Text = ""
+    stop: Text = ""
+    retried: bool = Field(default=False, description="true or false")
+    retry_of: Number = 0
+    attempt: Number = 0
+    seeds: dict[Annotated[str, Field(pattern=r"^[0-9]{1,10}$")], dict[str, float]] = Field(
+        default={}, description="the metrics of each seed"
+    )
+    judged: Number = 0
+    judged_seed: int = Field(default=0, ge=0, le=LARGEST_SEED, description=f"a whole number from 0 to {LARGEST_SEED}")
+    mlflow_run: Text = ""
+    folder: Text = ""
+    config_sha256: Text = ""
+
+
+def check_trials(study: optuna.Study, *, n_searched: int | None = None) -> None:
+    """Check that the trials of a study in its storage can be worked with.
+
+    Args:
+        study: the study.
+        n_searched: number of trials of the search, if these are its final trainings. Default: None, the search itself.
+
+    Raises:
+        InvalidValueError: if a user attribute of a trial is of another type than armscan writes.
+        StudyError: if Optuna cannot read the trials, or one lacks what it must have.
+    """
+    try:
+        trials = study.get_trials(deepcopy=False)
+    except ArmscanError:
+        raise
+    # Optuna's readers raise exceptions of many types on rows that Optuna has not written.
+    except Exception as error:
+        raise unreadable(f"study {study.study_name!r}", error) from error
+    for trial in trials:
+        check_trial(trial, study.study_name, len(study.directions))
+        if n_searched is not None:
+            _check_final(trial, place_of(study.study_name, trial), n_searched)
+
+
+def check_trial(trial: FrozenTrial, study_name: str, n_objectives: int) -> None:
+    """Check one trial; see `check_trials`.
+
+    Args:
+        trial: the trial.
+        study_name: name of its study.
+        n_objectives: number of values that it has when it is complete.
+    """
+    where = place_of(study_name, trial)
+    TrialAttributes.read(f"{where}.user_attrs", trial.user_attrs)
+    if wrong := _wrong_numbers(trial, n_objectives):
+        raise StudyError(f"{where} {wrong}")
+    if study_name.endswith(FINAL_EVAL_SUFFIX):
+        _check_final(trial, where)
+
+
+def place_of(study_name: str, trial: FrozenTrial) -> str:
+    """Return the place of a trial in its storage, for messages."""
+    return f"{study_name}.trials[{trial.number}]"
+
+
+def unreadable(what: str, error: Exception) -> StudyError:
+    """Return the error of one line that the trials of `what` cannot be read."""
+    reason = " ".join(str(error).split()) or repr(error)
+    return StudyError(f"the trials of {what} cannot be read: {reason[:MAX_REASON_CHARS]}")
+
+
+class ReadChecks:
+    """Checks of what is read from a storage: others may write to it at any time."""
+
+    def __init__(self) -> None:
+        # Optuna's dashboard shows attributes of any type.
+        self.is_on = True
+        # IDs of finished trials that were found sound: nobody can change them through Optuna.
+        self._sound: set[int] = set()
+
+    def trials(self, storage: BaseStorage, study_id: int, read: Callable[[], list[FrozenTrial]]) -> list[FrozenTrial]:
+        """Return the trials of a study that `read` returns, checked as by `check_trials`."""
+        if not self.is_on:
+            return read()
+        name = storage.get_study_name_from_id(study_id)
+        with _in_one_line(f"study {name!r}"):
+            trials = read()
+        unknown = [trial for trial in trials if trial._trial_id not in self._sound]
+        n_objectives = len(storage.get_study_directions(study_id)) if unknown else 0
+        for trial in unknown:
+            check_trial(trial, name, n_objectives)
+        self._sound.update(trial._trial_id for trial in unknown if trial.state.is_finished())
+        return trials
+
+    def trial(self, read: Callable[[], FrozenTrial]) -> FrozenTrial:
+        """Return the trial that `read` returns, with its attributes checked."""
+        # Not a `KeyError`: by that Optuna says that there is none.
+        with _in_one_line("a study", DAMAGED):
+            trial = read()
+        if self.is_on:
+            TrialAttributes.read(f"trials[{trial.number}].user_attrs", trial.user_attrs)
+        return trial
+
+    def study_attributes(self, read: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Return the user attributes of a study that `read` returns, checked if armscan has written them."""
+        with _in_one_line("a study"):
+            attributes = read()
+        if self.is_on and attributes.keys() >= OF_STUDY:
+            StudyAttributes.read("study.user_attrs", attributes)
+        return attributes
+
+
+@contextlib.contextmanager
+def _in_one_line(what: str, errors: tuple[type[Exception], ...] = UNREADABLE) -> Iterator[None]:
+    try:
+        yield
+    except errors as error:
+        if isinstance(error, ArmscanError):
+            raise
+        raise unreadable(what, error) from error
+
+
+def _wrong_numbers(trial: FrozenTrial, n_objectives: int) -> str | None:
+    """Return what is wrong with the values and reports of a trial; None if nothing is."""
+    values: Sequence[Any] = trial.values or ()
+    if trial.state == TrialState.COMPLETE and (len(values) != n_objectives or not all(map(_is_finite, values))):
+        return f"has the values {few(map(repr, values)) or 'None'}, but it must have {n_objectives} finite numbers"
+    for step, value in trial.intermediate_values.items():
+        if type(step) is not int or not isinstance(value, Real):
+            return f"has the report {step!r}: {value!r}, but it must be a number at a whole number"
+    return None
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
+
+
+def _check_final(trial: FrozenTrial, where: str, n_searched: int | None = None) -> None:
+    attributes = trial.user_attrs
+    needed = [*OF_FINAL, *([OF_FINISHED] if trial.state == TrialState.COMPLETE else [])]
+    if missing := [name for name in needed if name not in attributes]:
+        raise StudyError(f"{where}.user_attrs has no {missing[0]}, as each final training has")
+    finalist = OF_FINAL[0]
+    if n_searched is not None and attributes[finalist] >= n_searched:
+        raise StudyError(
+            f"{where}.user_attrs.{finalist} is {attributes[finalist]}, but it must be the number of one of "
+            f"{n_searched} trials"
+        )

@@ -1,0 +1,80 @@
+"""A study opened for work, and the runs of the tracking store that its storage names."""
+
+import shutil
+from types import SimpleNamespace
+
+import optuna
+import pytest
+from omegaconf import OmegaConf
+from optuna.trial import TrialState
+
+from armscan.errors import TrackingError
+from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.open import open_for_work
+from armscan.sweeps.study.study import STUDY_RUN
+from armscan.tracking import open_store
+from tests.sweeps.study.test_study import settings
+
+TASK = SimpleNamespace(run=None, evaluate=None, final_metric="test/mean_steps")
+
+
+@pytest.fixture
+def opened(tmp_path, empty_database, monkeypatch):
+    """Opens a study of a name in a storage of its own; all are tracked in one store."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(empty_database, tmp_path / "runs.db")
+    tracking = {"uri": "sqlite:///runs.db", "experiment": "a", "artifacts": "artifacts", "wait_s": 60.0}
+
+    def open_study(storage="optuna.journal", name="a"):
+        asked = settings(name=name, storage=storage, folder=f"studies/{name}")
+        return open_for_work(asked, TASK, OmegaConf.create({"tracking": tracking}), ["sweep=a"])
+
+    open_study.store = open_store(**tracking)
+    return open_study
+
+
+@pytest.mark.parametrize("kind", ["another study's", "a trial's", "of another experiment", "nobody's"])
+def test_run_of_a_study_that_is_anothers_is_refused_and_left_as_it_is(opened, kind):
+    phase = opened().search
+    client, experiment_id = opened.store
+    others = client.create_experiment("other")
+    experiment, tags = {
+        "another study's": (experiment_id, {"study": "b"}),
+        "a trial's": (experiment_id, {"study": "a", "trial": "3"}),
+        "of another experiment": (others, {"study": "a"}),
+        "nobody's": (experiment_id, {}),
+    }[kind]
+    victim = client.create_run(experiment, name="n", tags=tags)
+    phase.scheduler.study.set_user_attr(STUDY_RUN, victim.info.run_id)
+    line = f"a.user_attrs.mlflow_run names run {victim.info.run_id}, which is another's"
+    with pytest.raises(TrackingError, match=line):
+        opened()
+    now = client.get_run(victim.info.run_id)
+    assert (now.info.status, now.data.tags) == ("RUNNING", victim.data.tags)
+
+
+def test_study_goes_on_with_its_own_run(opened):
+    assert opened().search.run_id == opened().search.run_id
+
+
+def test_runs_of_a_study_of_the_same_name_in_another_storage_are_not_ended(opened):
+    first, second = opened("first.journal").search, opened("second.journal").search
+    client, experiment_id = opened.store
+    runs = [
+        client.create_run(experiment_id, name="n", tags=phase.tags_of(phase.scheduler.study.ask())).info.run_id
+        for phase in (first, second)
+    ]
+    first.scheduler.study.tell(0, state=TrialState.FAIL)
+    first.close_orphaned_runs()
+    assert [client.get_run(run_id).info.status for run_id in runs] == ["FAILED", "RUNNING"]
+
+
+def test_study_that_is_damaged_while_it_runs_says_so_in_one_line(opened):
+    phase = opened().search
+    other = optuna.load_study(study_name="a", storage=open_storage("optuna.journal").optuna)
+    other.set_user_attr("forgiven", 3)
+    scheduler = phase.scheduler
+    trial = scheduler.study.ask()
+    scheduler.study.tell(trial, state=TrialState.FAIL)
+    with pytest.raises(ValueError, match=r"study.user_attrs.forgiven is 3, but it must be a list of numbers"):
+        scheduler.broken(scheduler.state())
