@@ -217,6 +217,8 @@ def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_pat
     client, tracked = runs_in(tmp_path)
     children = [each for each in tracked if "choice.agent" in each.data.tags]
     assert len(children) == 2
+    (parent,) = [each for each in tracked if each not in children]
+    assert [file.path for file in client.list_artifacts(parent.info.run_id)] == ["results.html"]
     for child in children:
         assert child.info.status == "FINISHED"
         assert child.info.run_name == f"{child.data.tags['choice.agent']}-cluster-zy-phantom-seed0"

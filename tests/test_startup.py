@@ -1,5 +1,6 @@
 """What a command imports before it answers; how long that takes is measured by benchmarks/speed/start.py."""
 
+import shutil
 import subprocess
 import sys
 
@@ -61,6 +62,13 @@ def test_runs_are_listed_and_compared_without_a_library_of_learning(tmp_path):
     assert codes == [2, 2, 2]
     assert said.count("no store of MLflow") == 3
     assert not LEARNING & modules
+
+
+def test_runs_of_a_store_are_listed_without_what_only_trainings_and_reports_need(tmp_path, empty_database):
+    shutil.copy(empty_database, tmp_path / "mlruns.db")
+    codes, _, modules = after(tmp_path, "runs list", "report --runs abcd")
+    assert codes == [0, 2]
+    assert not (LEARNING | {"numba", "plotly", "optuna", "matplotlib", "armscan.training"}) & modules
 
 
 @pytest.mark.parametrize("command", ["runs", "report", "ui", "data", "evaluate", "policy"])

@@ -97,6 +97,11 @@ class TianshouLearner(BaseLearner):
         reason = self._algorithm.why_tianshou
         return "compiled" if reason is None else f"Tianshou, because {reason}"
 
+    @property
+    def validation_note(self) -> str:
+        """How the actions of evaluations are chosen: `deterministic` or `sampled`."""
+        return "deterministic" if self._algorithm.policy.deterministic_eval else "sampled"
+
     def warm_up(self) -> None:
         """Fill the replay buffer with random steps."""
         self._begin_epoch()

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
 from armscan.cli.options import FILE_PATH, CommaSeparated, clustering_option, examples
 from armscan.errors import InvalidValueError
+from armscan.utils.console import WHOLE_CHARS, print_table, wide_console
 
 if TYPE_CHECKING:
     from armscan.anatomy import FoundPlane
@@ -129,15 +129,16 @@ def explore(folder: str | None, volume: str | None, clustering: str | None) -> N
 
 def _print_dataset(dataset: Dataset) -> None:
     """Print a table for each volume, and the excluded volumes."""
-    console = Console()
+    # Broken between words.
+    console = wide_console(WHOLE_CHARS)
     for name, report in dataset.reports.items():
         plane = "a labelled plane" if dataset.volumes[name].optimal_action else "no labelled plane"
         split = f"for {dataset.splits[name]}, " if dataset.splits else ""
-        console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{plane}", style="bold"), soft_wrap=True)
-        console.print(Text(_geometry(report)), soft_wrap=True)
+        console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{plane}", style="bold"))
+        console.print(Text(_geometry(report)))
         console.print(_tissue_table(report))
     for name, reason in dataset.excluded.items():
-        console.print(Text(f"{name}: excluded" + ("" if reason == "True" else f" ({reason})")), soft_wrap=True)
+        console.print(Text(f"{name}: excluded" + ("" if reason == "True" else f" ({reason})")))
 
 
 def _tissue_table(report: VolumeReport) -> Table:
@@ -145,7 +146,8 @@ def _tissue_table(report: VolumeReport) -> Table:
     from armscan.volumes import LABEL_NAMES
     from armscan.volumes.labelmap import shown
 
-    table = Table("tissue", "in the file (voxels)", Column("voxels", justify="right"), Column("mm3", justify="right"))
+    numbers = (Column(name, justify="right", no_wrap=True) for name in ("voxels", "mm3"))
+    table = Table(Column("tissue", no_wrap=True), "in the file (voxels)", *numbers)
     for value, tissue in LABEL_NAMES.items():
         sources = ", ".join(f"{each.source} ({each.n_voxels})" for each in report.stored.found if each.label == value)
         is_there = tissue in report.n_voxels
@@ -180,19 +182,21 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolum
     from armscan.volumes.markups import MARKUP_SUFFIX
 
     headings = ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "as good over\n°, °, mm")
-    columns = (Column("volume", overflow="fold"), *(Column(heading, justify="right") for heading in headings))
-    table = Table(*columns, title="planes written into the manifest", title_justify="left")
-    for volume, plane in labelled:
+    rows = []
+    for _, plane in labelled:
         rz, rx, tx, ty = plane.action.to_array()
-        table.add_row(
-            Text(volume.name),
-            f"{plane.score:.3f}",
-            ", ".join(map(str, plane.counts)),
-            f"{rz:.1f}, {rx:.1f}",
-            f"{tx:.1f}, {ty:.1f}",
-            "-" if plane.spread is None else "{:.0f}, {:.0f}, {:.0f}".format(*plane.spread),
+        rows.append(
+            [
+                f"{plane.score:.3f}",
+                ", ".join(map(str, plane.counts)),
+                f"{rz:.1f}, {rx:.1f}",
+                f"{tx:.1f}, {ty:.1f}",
+                "-" if plane.spread is None else "{:.0f}, {:.0f}, {:.0f}".format(*plane.spread),
+            ]
         )
-    Console().print(table)
+    print("planes written into the manifest")
+    names = [volume.name for volume, _ in labelled]
+    print_table("volume", names, [Column(heading, justify="right") for heading in headings], rows)
     for volume, plane in labelled:
         if plane.score <= -SUCCESS_THRESHOLD:
             wanted = f"an environment wants more than {-SUCCESS_THRESHOLD:g}"

@@ -150,7 +150,8 @@ def evaluate(
             print(f"look at   {from_here(file)}")
         return
     from armscan.evaluation.track import evaluate_and_track
-    from armscan.experiment.console import print_table, print_where_to_look, wide_console
+    from armscan.experiment.console import print_table, print_where_to_look
+    from armscan.utils.console import wide_console
 
     report, file = evaluate_and_track(applied, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
     console = wide_console()

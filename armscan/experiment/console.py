@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console
 from rich.text import Text
 
 from armscan.config.command_hints import armscan_command
@@ -14,11 +12,8 @@ from armscan.experiment.job import INTERRUPTED, JobOutcome
 from armscan.experiment.results import TITLES, RunResult
 from armscan.training import TEST, MetricEstimates, ResultTable
 from armscan.training.result_table import HOW, with_baselines
-
-# Of a run's id, where there is no room for all of it.
-ID_CHARS = 8
-# Of what is no terminal: a log takes longer lines.
-LOG_CHARS = 160
+from armscan.utils.console import wide_console
+from armscan.utils.files import ID_CHARS
 
 
 def print_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, how: bool = True) -> None:
@@ -78,12 +73,6 @@ def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -
     }
     n_baselines = len(results) - len(outcomes)
     return ResultTable(results, {heading: [*values, *[""] * n_baselines] for heading, values in facts.items()})
-
-
-def wide_console() -> Console:
-    """Return a console as wide as the terminal; what is no terminal takes longer lines."""
-    console = Console()
-    return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=LOG_CHARS)
 
 
 def print_where_to_look(

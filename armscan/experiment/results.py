@@ -10,6 +10,7 @@ from functools import cached_property
 from operator import methodcaller
 from pathlib import Path
 
+from armscan.agents.baselines import RandomAgent
 from armscan.experiment.build import Experiment
 from armscan.reports.html import page
 from armscan.training import (
@@ -23,6 +24,7 @@ from armscan.training import (
     evaluate,
     evaluate_baselines,
 )
+from armscan.training.baselines import RANDOM
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE, atomic_write
 
 # First seeds of the final evaluations' episodes; those of the baselines do not depend on the seed of the run.
@@ -50,11 +52,13 @@ class RunResult:
         evaluations: final evaluations of the agent, by the names of their volumes.
         baselines: episodes of the baselines on the test volumes, by their names.
         validation: validation of the best epoch; None for an agent that does not learn.
+        own_baseline: name of the baseline that the agent itself is. Default: None, it is another.
     """
 
     evaluations: Mapping[str, Evaluation]
     baselines: Mapping[str, Evaluation]
     validation: Evaluation | None = None
+    own_baseline: str | None = None
 
     @classmethod
     def of(cls, setup: Experiment, result: TrainingResult | None) -> RunResult:
@@ -72,7 +76,8 @@ class RunResult:
             for name, first in first_seeds.items()
         }
         baselines = evaluate_baselines(setup.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED, on_plane=on_plane)
-        return cls(evaluations, baselines, result.best.evaluation if result else None)
+        own = RANDOM if isinstance(agent, RandomAgent) else None
+        return cls(evaluations, baselines, result.best.evaluation if result else None, own)
 
     @cached_property
     def figures(self) -> dict[str, MetricEstimates]:
@@ -83,7 +88,7 @@ class RunResult:
 
     def table(self) -> ResultTable:
         """Return the agent on the test volumes, the baselines there, then the agent on its other volumes."""
-        return result_table(self.figures)
+        return result_table({name: each for name, each in self.figures.items() if name != self.own_baseline})
 
     def metrics(self) -> dict[str, dict[str, float]]:
         """Return the numbers of the table, and all means, by the names of the volumes and of the baselines."""

@@ -96,7 +96,10 @@ def run_tracked(
                     f"validating every {at_once} environment steps, which the agent takes at once "
                     f"(training.eval_every_env_steps = {every} is less)"
                 )
-            callbacks = [progress_reporter(job_label), tracked]
+            n_validation = setup.budget.validation_episodes
+            how = getattr(setup.agent, "validation_note", None)
+            measured = ", ".join(filter(None, ["validation", f"{n_validation} episodes", how]))
+            callbacks = [progress_reporter(job_label, measured), tracked]
             result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, tell=tell, earlier=earlier)
             if result.is_solved:
                 n_taken = result.reports[-1].n_env_steps

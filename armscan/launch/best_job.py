@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from mlflow.entities import Metric, Run, RunTag
 
+from armscan.stats.on_plane import ON_PLANE, PREFIX
 from armscan.tracking import TrackingStore
 from armscan.tracking.outbox import now_ms
-from armscan.training.on_plane import ON_PLANE, PREFIX
 from armscan.training.titles import leading_among
 
 TESTED = "test_volumes/"

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,10 +31,12 @@ from armscan.experiment.job import (
     remove_run_folder,
 )
 from armscan.launch.launchers import LAUNCHER, check_launcher
-from armscan.utils.files import LAST_CHECKPOINT
+from armscan.utils.files import LAST_CHECKPOINT, RESULTS_PAGE, atomic_write
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
+
+    from armscan.training import ResultTable
 
 # Hydra's own overrides that say that there are several jobs, and where.
 NOT_REPEATED = ("hydra.mode=", "hydra.sweep.dir=", "hydra.sweep.subdir=")
@@ -127,10 +130,11 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     if outcomes:
         from armscan.experiment.console import print_jobs, print_where_to_look
 
-        print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
+        table = print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
         if runs:
+            _keep_page(table, Multirun.folder, word)
             _pool_folds(Multirun.folder, word, outcomes, runs)
-            print_where_to_look(Multirun.folder, word["tracking"]["uri"])
+            print_where_to_look(Multirun.folder, word["tracking"]["uri"], files=(RESULTS_PAGE, ""))
             compare = armscan_command("report", "--runs", word["run_id"], tracking=word["tracking"]["uri"])
             print(f"compare   {compare}")
     for number, outcome in failed.items():
@@ -147,6 +151,17 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     if is_known and not runs:
         remove_run_folder(Multirun.folder)
     return 1 if failed or not outcomes else 0
+
+
+def _keep_page(table: ResultTable, folder: Path, word: Mapping[str, Any]) -> None:
+    """Keep the table of the jobs as a page, in the grid's folder and with its parent run."""
+    from armscan.reports.html import page
+    from armscan.tracking import open_store
+
+    file = folder / RESULTS_PAGE
+    atomic_write(file, methodcaller("write", page(f"multirun {' '.join(word['overrides'])}", table.html()).encode()))
+    store, _ = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
+    store.log_artifact(word["run_id"], str(file))
 
 
 def _pool_folds(folder: Path, word: Mapping[str, Any], outcomes: Mapping[str, JobOutcome], runs: Sequence[Run]) -> None:

@@ -12,7 +12,7 @@ from armscan.reports.csv_tables import all_numbers, run_rows
 from armscan.reports.curves import AXES, curve_of
 from armscan.reports.groups import Group
 from armscan.reports.html import Markup, chart, folded, table, write_page
-from armscan.reports.load import VALIDATION, TrackedTraining
+from armscan.reports.load import TrackedTraining, validation_titles
 from armscan.reports.notes import notes_on
 from armscan.reports.significance import (
     COMPARED_BY,
@@ -84,7 +84,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
         *_final(groups, reached),
         *_better(groups, pairs),
         videos(groups),
-        *_of_the_training(groups, curves, [figure for figure in figures if figure not in VALIDATION]),
+        *_of_the_training(groups, curves, [figure for figure in figures if figure not in validation_titles(figures)]),
         "<h2>Runs</h2>",
         table(run_rows(groups), what="runs"),
     ]
@@ -94,7 +94,8 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
 def _figures(groups: Sequence[Group]) -> list[str]:
     """Return the names of what can be drawn: figures of the validation first."""
     names = {name for group in groups for training in group.trainings for name in training.series}
-    return [*(name for name in VALIDATION if name in names), *sorted(names - VALIDATION.keys())]
+    titles = validation_titles(names)
+    return [*titles, *sorted(names - titles.keys())]
 
 
 def _summary(groups: Sequence[Group]) -> str:
@@ -118,7 +119,7 @@ def _counted(number: int, what: str) -> str:
 
 def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
     yield "<h2>Learning curves</h2>"
-    titles = {name: title for name, title in VALIDATION.items() if any(figure == name for figure, *_ in curves)}
+    titles = validation_titles(figure for figure, *_ in curves)
     if titles:
         yield f"<p>{HOW_CURVES}</p>{chart(learning_curves(groups, curves, titles))}"
     else:

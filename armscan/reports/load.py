@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,20 +14,21 @@ from mlflow.entities import Run
 from armscan.config.legacy import migrate
 from armscan.errors import TrackingError
 from armscan.reports.select import ID_CHARS, SelectedRuns
+from armscan.stats.on_plane import leading_of, limits_among
 from armscan.tracking import TrackingStore
 from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
-from armscan.training import ON_PLANE, TEST, Evaluation
+from armscan.training import TEST, Evaluation
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE, sha256
 from armscan.volumes.plane import FloatArray
 
 WALL = "wall_s"
 VALIDATION = {
-    f"validation/{ON_PLANE[0].metric}": ON_PLANE[0].title,
     "validation/success_rate": "success, by reward",
     "validation/mean_steps": "steps, mean",
     "validation/mean_return": "return, mean",
 }
+OF_VALIDATION = "validation/"
 # The beginnings of what else is drawn.
 OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
 BUDGET = "training.env_steps"
@@ -114,8 +115,16 @@ class TrackedTraining:
         return [name for name, contents in kept.items() if contents is None]
 
     def _last(self, axis: str) -> float:
-        ends = [float(getattr(each, axis)[-1]) for name, each in self.series.items() if name in VALIDATION]
+        ends = [float(getattr(self.series[name], axis)[-1]) for name in validation_titles(self.series)]
         return max(ends, default=float("nan"))
+
+
+def validation_titles(names: Iterable[str]) -> dict[str, str]:
+    """Return the titles of those figures that are of the validation, the on-plane rates first."""
+    known = set(names)
+    rates = limits_among(name.removeprefix(OF_VALIDATION) for name in sorted(known) if name.startswith(OF_VALIDATION))
+    titles = {f"{OF_VALIDATION}{limits.metric}": limits.title for limits in rates}
+    return titles | {name: title for name, title in VALIDATION.items() if name in known}
 
 
 def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> TrackedTraining:
@@ -139,7 +148,7 @@ def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> Tr
         run, files, BASELINES_FILE, lambda contents: {name: Evaluation.of_dict(each) for name, each in contents.items()}
     )
     params = migrate(run.data.params)
-    n_env_steps = max((each.env_steps[-1] for name, each in series.items() if name in VALIDATION), default=0.0)
+    n_env_steps = max((series[name].env_steps[-1] for name in validation_titles(series)), default=0.0)
     is_cut = found.is_pruned and n_env_steps < float(params.get(BUDGET, "inf"))
     return TrackedTraining(
         run_id=run.info.run_id,
@@ -158,7 +167,8 @@ def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> Tr
 
 
 def _series(store: TrackingStore, run: Run) -> dict[str, Series]:
-    wanted = [name for name in run.data.metrics if name in VALIDATION or name.startswith(OF_THE_TRAINING)]
+    shown = {*VALIDATION, f"{OF_VALIDATION}{leading_of(migrate(run.data.params)).metric}"}
+    wanted = [name for name in run.data.metrics if name in shown or name.startswith(OF_THE_TRAINING)]
     wall_s = _history(store, run, WALL) if WALL in run.data.metrics else {}
     series = {}
     for name in sorted(wanted):

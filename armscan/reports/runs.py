@@ -9,9 +9,6 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from armscan.reports.comparison import write_comparison
-from armscan.reports.groups import group_trainings
-from armscan.reports.load import read_training
 from armscan.reports.select import EXPERIMENT, ID_CHARS, find_trainings, read_runs
 from armscan.tracking import open_existing_store
 
@@ -39,6 +36,11 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     store = open_existing_store(uri)
     found = find_trainings(store, named)
+    # Deferred: runs that are not there are answered before these are loaded.
+    from armscan.reports.comparison import write_comparison
+    from armscan.reports.groups import group_trainings
+    from armscan.reports.load import read_training
+
     print(f"reading   {len(found)} run{'s' if len(found) > 1 else ''}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         trainings = [read_training(store, each, Path(folder) / each.run.info.run_id) for each in found]

@@ -15,10 +15,10 @@ from mlflow.store.artifact.artifact_repository_registry import get_artifact_repo
 from requests import RequestException
 
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
+from armscan.stats.on_plane import OnPlane, leading_of
 from armscan.tracking import TrackingStore
 from armscan.tracking.run import MAX_DEPTH, PARENT_TAG
 from armscan.tracking.sync import ENDED
-from armscan.training import ON_PLANE
 
 # What rows are sorted by.
 SORTS = {
@@ -108,9 +108,14 @@ class RunRow:
         return None if end is None else (end - self.run.info.start_time) / 1000
 
     @property
+    def on_plane(self) -> OnPlane:
+        """Leading limits of its on-plane rates, as its configuration says; those by default for older runs."""
+        return leading_of(self.run.data.params)
+
+    @property
     def on_plane_rate(self) -> float | None:
-        """On-plane rate on the test volumes, within the limits by default; None where it was not evaluated by them."""
-        return self.run.data.metrics.get(f"test_volumes/{ON_PLANE[0].metric}")
+        """On-plane rate on the test volumes, within its leading limits; None where it was not evaluated."""
+        return self.run.data.metrics.get(f"test_volumes/{self.on_plane.metric}")
 
     @property
     def success_rate(self) -> float | None:

@@ -12,7 +12,6 @@ from rich.text import Text
 from armscan.config.command_hints import armscan_command, resume_command
 from armscan.config.trust import TRUST, needs_trust
 from armscan.errors import printable
-from armscan.experiment.console import ID_CHARS
 from armscan.experiment.results import figures_of, result_table
 from armscan.runs.query import experiment_ids, search
 from armscan.runs.rows import RunRow, artifacts_of
@@ -20,7 +19,8 @@ from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.runs.tables import format_duration, narrow_table
 from armscan.tracking import EVALUATED_TAG, TrackingStore
 from armscan.tracking.run import FAILURE_TAG, PARENT_TAG
-from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
+from armscan.utils.console import wide_console
+from armscan.utils.files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
 
 # How a run was started, as far as it has kept it; the first that is there is shown.
 STARTED_BY = ("command", "overrides")
@@ -29,7 +29,7 @@ MAX_VALUE_CHARS = 200
 
 def show(client: TrackingStore, run: Run, uri: str) -> None:
     """Print how a run was started and ended, its figures, files, children, and what can be done with it."""
-    console, entry = Console(), RunRow(client, run)
+    console, entry = wide_console(), RunRow(client, run)
     tags = {name: value for name, value in run.data.tags.items() if value}
     _print_pairs(console, "", _facts(run, entry))
     _print_figures(console, run)

@@ -9,18 +9,18 @@ from datetime import datetime
 from typing import Any
 
 from mlflow.entities import Run
-from rich.console import Console
 from rich.filesize import decimal
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from armscan.errors import printable
-from armscan.experiment.console import ID_CHARS
 from armscan.runs.prune import PruneItem
 from armscan.runs.rows import RunRow
+from armscan.stats.on_plane import ON_PLANE
 from armscan.tracking.run import PARENT_TAG
-from armscan.training import ON_PLANE
+from armscan.utils.console import print_table, wide_console
 from armscan.utils.csv_file import write_csv
+from armscan.utils.files import ID_CHARS
 
 MISSING = "-"
 # Of a name, which a multirun's words may be.
@@ -48,7 +48,7 @@ def format_start(run: Run) -> str:
 def write_rows(rows: Sequence[RunRow], form: str) -> None:
     """Print runs, in the order of their rows, as `table`, `csv` or `json`."""
     if form == "table":
-        Console().print(_table(rows))
+        _print_table(rows)
         return
     values = [_values(row) for row in rows]
     if form == "json":
@@ -57,28 +57,32 @@ def write_rows(rows: Sequence[RunRow], form: str) -> None:
     write_csv(sys.stdout, COLUMNS, values)
 
 
-def _table(rows: Sequence[RunRow]) -> Table:
-    """Return a table that fits 80 columns: names have what is left, in as many lines as they need."""
+def _print_table(rows: Sequence[RunRow]) -> None:
+    """Print runs as a table; where names do not fit, each stands in a line above its run."""
+    limits = {row.on_plane for row in rows if row.on_plane_rate is not None} or {ON_PLANE[0]}
     # In lines of its own: names need the columns.
-    plane = "on\nplane,\n{:g} mm\n{:g}°".format(*ON_PLANE[0])
-    table = narrow_table(
-        "id", "name", "status", "started", "took>", f"{plane}>", "success>", "steps,\nmean>", "size>", "below>"
-    )
+    plane = "on\nplane" + (",\n{:g} mm\n{:g}°".format(*min(limits)) if len(limits) == 1 else "")
+    right = [Column(name, justify="right") for name in ("took", plane, "success", "steps,\nmean", "size", "below")]
+    cells = []
     for row in rows:
         on_plane, success, steps = row.on_plane_rate, row.success_rate, row.mean_steps
         size = decimal(row.n_bytes) + ("" if row.in_store is not None else "+?")
-        table.add_row(
-            row.run.info.run_id[:ID_CHARS],
-            Text("  " * row.depth + shortened(row.run.info.run_name)),
-            row.run.info.status.lower(),
-            format_start(row.run),
-            format_duration(row.duration_s),
-            *(MISSING if rate is None else f"{rate:.0%}" for rate in (on_plane, success)),
-            MISSING if steps is None else f"{steps:.1f}",
-            size,
-            str(len(row.below) or ""),
+        within = "" if len(limits) == 1 else " ({:g} mm {:g}°)".format(*row.on_plane)
+        cells.append(
+            [
+                row.run.info.run_id[:ID_CHARS],
+                row.run.info.status.lower(),
+                format_start(row.run),
+                format_duration(row.duration_s),
+                MISSING if on_plane is None else f"{on_plane:.0%}{within}",
+                MISSING if success is None else f"{success:.0%}",
+                MISSING if steps is None else f"{steps:.1f}",
+                size,
+                str(len(row.below) or ""),
+            ]
         )
-    return table
+    names = ["  " * row.depth + shortened(row.run.info.run_name) for row in rows]
+    print_table("name", names, [*map(Column, ("id", "status", "started")), *right], cells)
 
 
 def shortened(name: str) -> str:
@@ -103,7 +107,7 @@ def narrow_table(*headings: str) -> Table:
 
 COLUMNS = (
     *("run_id", "name", "status", "experiment_id", "parent", "started", "duration_s"),
-    *(ON_PLANE[0].metric, "success_rate", "mean_steps"),
+    *("on_plane_rate", "on_plane_mm", "on_plane_deg", "success_rate", "mean_steps"),
     *("size_bytes", "folder_bytes", "artifact_bytes", "below", "agent", "obs", "projection", "folder", "host"),
 )
 
@@ -113,7 +117,7 @@ def _values(row: RunRow) -> dict[str, Any]:
     values = (
         *(info.run_id, info.run_name, info.status, info.experiment_id, tags.get(PARENT_TAG)),
         *(row.started.isoformat(timespec="seconds"), row.duration_s),
-        *(row.on_plane_rate, row.success_rate, row.mean_steps),
+        *(row.on_plane_rate, *row.on_plane, row.success_rate, row.mean_steps),
         *(row.n_bytes, row.in_folder, row.in_store, len(row.below)),
         *(tags.get("choice.agent"), tags.get("choice.obs"), row.run.data.params.get("projection")),
         *(tags.get("folder"), tags.get("host")),
@@ -127,4 +131,4 @@ def print_plan(cases: Sequence[PruneItem]) -> None:
         info = case.run.info
         named = f"{shortened(info.run_name)}, {info.status.lower()}, of {format_start(case.run)}"
         what = f"frees {decimal(case.n_bytes)}: {named}" if case.left is None else f"stays: {case.left}"
-        Console().print(Text(f"{info.run_id[:ID_CHARS]} {what}"), soft_wrap=True)
+        wide_console().print(Text(f"{info.run_id[:ID_CHARS]} {what}"), soft_wrap=True)

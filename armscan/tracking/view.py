@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 
-from armscan.training.on_plane import ON_PLANE
+from armscan.stats.on_plane import ON_PLANE
 
 VIEW_KEY = "armscan"
 VIEW_TAG = f"mlflow.sharedViewState.{VIEW_KEY}"

@@ -1,5 +1,6 @@
 """One training: splits, episodes and what they add up to, checkpoints, callbacks, progress, video."""
 
+from armscan.stats.on_plane import ON_PLANE, OnPlane, check_on_plane
 from armscan.training.baselines import evaluate_baselines
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
@@ -9,7 +10,6 @@ from armscan.training.episodes import evaluate
 from armscan.training.evaluation import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint, fingerprints_in
 from armscan.training.metrics import MetricEstimates
-from armscan.training.on_plane import ON_PLANE, OnPlane, check_on_plane
 from armscan.training.result_table import ResultTable
 from armscan.training.splits import PARTS, Split, mixed_data, nifti_data, phantom_data
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train

@@ -8,19 +8,30 @@ from collections.abc import Sequence
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column
+from rich.text import Text
 
 from armscan.training.callbacks import Callback, EpochReport
 
 
-def progress_reporter(label: str | None = None) -> Callback:
-    """Return a progress bar on a terminal; elsewhere, or with the label of a job, one line an epoch."""
-    return ProgressBar() if label is None and sys.stdout.isatty() else ProgressLines(label)
+def progress_reporter(label: str | None = None, measured: str = "validation") -> Callback:
+    """Return a progress bar on a terminal; elsewhere, or with the label of a job, one line an epoch.
+
+    Args:
+        label: label of the job. Default: None, a single run.
+        measured: what the figures are of, such as `validation, 48 episodes, deterministic`. Default: `validation`.
+    """
+    return ProgressBar(measured) if label is None and sys.stdout.isatty() else ProgressLines(label, measured)
 
 
 class ProgressBar:
-    """A bar with environment steps, on-plane rate, success rate, mean steps of the validation, and time left."""
+    """A bar with environment steps, on-plane rate, success rate, mean steps of the validation, and time left.
 
-    def __init__(self) -> None:
+    Args:
+        measured: what the figures are of; see `progress_reporter`.
+    """
+
+    def __init__(self, measured: str) -> None:
+        self._measured = measured
         # On a narrow terminal the numbers keep their width; the bar shrinks.
         fixed = Column(no_wrap=True)
         self._progress = Progress(
@@ -35,6 +46,7 @@ class ProgressBar:
         self._task = self._progress.add_task("training", total=total_env_steps, metrics="")
         for report in earlier[-1:]:
             self.on_epoch(report)
+        self._progress.console.print(Text(f"training; figures: {self._measured}"))
         self._progress.start()
 
     def on_epoch(self, report: EpochReport) -> None:
@@ -49,15 +61,16 @@ class ProgressBar:
 class ProgressLines:
     """One line per epoch, for logs and for jobs side by side; a label, if there is one, is printed before each."""
 
-    def __init__(self, label: str | None) -> None:
-        self._label = f"[{label}] " if label else ""
+    def __init__(self, label: str | None, measured: str) -> None:
+        self._label, self._measured = f"[{label}] " if label else "", measured
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
         """Print how long the training is."""
         self._total = total_env_steps
         self._start_s = time.perf_counter() - (earlier[-1].wall_s if earlier else 0.0)
         after = f", {earlier[-1].n_env_steps} of them taken" if earlier else ""
-        print(f"{self._label}training for at most {total_env_steps} environment steps{after}", flush=True)
+        at_most = f"training for at most {total_env_steps} environment steps{after}"
+        print(f"{self._label}{at_most}; figures: {self._measured}", flush=True)
 
     def on_epoch(self, report: EpochReport) -> None:
         """Print the epoch's line."""

@@ -169,8 +169,16 @@ class ResultTable:
         # Those that matter most first; sorting leaves the others in their order.
         leading = (next(iter(columns)), *MOST_WANTED)
         by_need = sorted(columns, key=lambda name: leading.index(name) if name in leading else len(leading))
-        fitting = by_need[: _fitting(width, names, [columns[name] for name in by_need])]
-        tables: list[Table | Text] = [_table(names, [columns[name] for name in columns if name in fitting])]
+        wanted = [columns[name] for name in by_need]
+        legend: list[Text] = []
+        if self.facts and _fitting(width, names, wanted) < min(len(leading), len(wanted)):
+            # In lines of their own: figures need the columns.
+            facts = zip(self.results, *self.facts.values(), strict=True)
+            legend = [Text(f"{name}: {', '.join(filter(None, told))}") for name, *told in facts if any(told)]
+            names = names[:1]
+        fitting = by_need[: _fitting(width, names, wanted)]
+        shown = _table(names, [columns[name] for name in columns if name in fitting])
+        tables: list[Table | Text] = [shown, *legend]
         if left := [columns[name][0].replace("\n", " ") for name in columns if name not in fitting]:
             tables.append(Text(f"not shown at {width} characters: {'; '.join(left)}"))
         return tables

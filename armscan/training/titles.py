@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from armscan.training.on_plane import limits_among
+from armscan.stats.on_plane import limits_among
 from armscan.training.result_table import QUANTITIES
 
 TITLES = {

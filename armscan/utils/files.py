@@ -32,6 +32,8 @@ BASELINES_FILE, RESULTS_PAGE = "baselines.json", "results.html"
 LEARNING_CURVE_FILE, VIDEO_FILE = "learning_curve.png", "episode.gif"
 # Whether the same came of it as of the run that it repeats.
 REPRODUCTION_FILE = "reproduction.json"
+# Of a run's ID, where there is no room for all of it.
+ID_CHARS = 8
 RECORDS = (RUN_FILE, REPRODUCTION_FILE)
 POLICY_FOLDER = "policy"
 # All that a run makes in its folder, beside what Hydra and the outbox leave there: before it is tracked, and after.

@@ -135,7 +135,8 @@ def test_sizes_are_those_of_the_folder_and_of_the_artifacts(make_run, answer, tm
     assert small["folder_bytes"] < 10_000
 
 
-def test_table_fits_eighty_columns_and_csv_has_whole_ids(three, answer):
+def test_table_fits_eighty_columns_and_csv_has_whole_ids(three, answer, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
     code, table, _ = answer("list")
     assert code == 0
     assert max(map(len, table.splitlines())) <= 80
@@ -146,12 +147,33 @@ def test_table_fits_eighty_columns_and_csv_has_whole_ids(three, answer):
     assert (rows[0]["success_rate"], rows[2]["success_rate"]) == ("0.5", "")
 
 
-def test_long_names_stay_whole_and_odd_ones_are_no_markup(make_run, answer):
-    make_run("sac-[bold]-cluster_slice_channels-rz+rx+tx+ty-stack4-memory2-phantom-seed0")
+def test_long_names_stay_whole_and_odd_ones_are_no_markup(make_run, answer, monkeypatch):
+    name = "sac-[bold]-cluster_slice_channels-rz+rx+tx+ty-stack4-memory2-phantom-seed0"
+    run_id = make_run(name)
+    monkeypatch.setenv("COLUMNS", "80")
+    *_, above, row = answer("list")[1].splitlines()
+    assert above == name
+    assert row.startswith(run_id[:8])
+    assert len(row) <= 80
+    # A log takes them in one line.
+    monkeypatch.delenv("COLUMNS")
+    assert name in (row := answer("list")[1].splitlines()[-1])
+    assert run_id[:8] in row
+
+
+def test_on_plane_rate_is_within_the_limits_that_each_run_is_configured_with(make_run, store, answer):
+    client, _ = store
+    strict = make_run("strict", figures={"test_volumes/on_plane_3mm_5deg": 0.25})
+    client.log_param(strict, "evaluation.on_plane", "[[3, 5], [1, 2]]")
+    make_run("usual", figures={"test_volumes/on_plane_5mm_10deg": 0.75})
+    rows = {row["name"]: row for row in csv.DictReader(io.StringIO(answer("list", "--format=csv")[1]))}
+    limits = ("on_plane_rate", "on_plane_mm", "on_plane_deg")
+    assert [rows["strict"][name] for name in limits] == ["0.25", "3.0", "5.0"]
+    assert [rows["usual"][name] for name in limits] == ["0.75", "5.0", "10.0"]
     table = answer("list")[1]
-    assert max(map(len, table.splitlines())) <= 80
-    name = "".join(line[9:].split(" ")[0] for line in table.splitlines()[4:])
-    assert name == "sac-[bold]-cluster_slice_channels-rz+rx+tx+ty-stack4-memory2-phantom-seed0"
+    assert "25% (3 mm 5°)" in table
+    assert "75% (5 mm 10°)" in table
+    assert "3 mm" in answer("list", "--limit=1", "--sort=plane")[1]
 
 
 def test_show_tells_everything_of_a_run(make_run, store, answer, tmp_path):

@@ -31,10 +31,11 @@ def test_progress_bar_shows_all_of_its_figures_in_80_columns(narrow):
     report = EpochReport(
         epoch=1, n_env_steps=120_000, wall_s=60.0, metrics={}, evaluation=Evaluation((episode,)), is_best=True
     )
-    bar = ProgressBar()
+    bar = ProgressBar("validation, 48 episodes, deterministic")
     bar.on_start(240_000, [report])
     bar.on_end()
-    (line,) = narrow.export_text().strip().splitlines()
+    heading, line = narrow.export_text().strip().splitlines()
+    assert heading == "training; figures: validation, 48 episodes, deterministic"
     for figure in ("120000/240000", "on plane, 5 mm 10° 100%", "success 100%", "steps 50.00", "-:--:--"):
         assert figure in line
     assert "━" in line

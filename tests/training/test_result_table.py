@@ -146,3 +146,17 @@ def test_equal_baselines_are_shown_once():
     ours, other = (MetricEstimates.of(evaluation_of(steps)) for steps in (2, 3))
     results = {"0": ours, "1": other}
     assert list(with_baselines(results, {"0": {"random": ours}, "1": {"random": ours}})) == ["0", "1", "random"]
+
+
+def test_jobs_keep_the_leading_figures_at_80_columns_and_their_words_stand_below():
+    figures = MetricEstimates.of(Evaluation(made_episodes(0)))
+    words = ["agent=sac network.vector.hidden_sizes=[256,256]", "agent=ppo network.vector.hidden_sizes=[64,64]"]
+    table = ResultTable({"0": figures, "1": figures}, {"run": ["4f2a1b3c", "91c0aaaa"], "overrides": words})
+    lines = text_of(table.lines(80), 80).splitlines()
+    assert max(map(len, lines)) <= 80
+    head = " ".join(lines[:4])
+    for heading in ("on plane", "distance mm", "angle °", "success", "steps"):
+        assert heading in head
+    assert f"1: 91c0aaaa, {words[1]}" in lines
+    # Where there is room, they are columns.
+    assert "1: " not in text_of(table.lines(200), 200)

@@ -10,7 +10,6 @@ from pathlib import Path
 from statistics import fmean
 
 from optuna.trial import FrozenTrial, TrialState
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -25,6 +24,7 @@ from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attributes import check_trials
 from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.study import best_trials
+from armscan.utils.console import WHOLE_CHARS, wide_console
 from armscan.utils.retry import no_retry
 
 REFRESH_S = 2.0
@@ -153,7 +153,7 @@ def print_result(opened: OpenedStudy) -> int:
     state = scheduler.state()
     print(_summary(opened, state))
     if stopped := scheduler.look_for_stop():
-        print(f"the study was stopped {stopped}; the same command resumes it")
+        print(printable(f"the study was stopped {stopped}; the same command resumes it"))
         return 0
     wrong = scheduler.broken(state)
     if wrong is None and scheduler.end(state) is None:
@@ -169,7 +169,7 @@ def print_result(opened: OpenedStudy) -> int:
         table.add_row(
             str(trial.number), *(f"{value:.4g}" for value in trial.values), " ".join(overrides_of(trial.params))
         )
-    Console().print(table)
+    wide_console(WHOLE_CHARS).print(table)
     is_evaluated = _print_final_results(opened)
     print_where_to_look(opened.folder, opened.config.tracking.uri, storage=settings.storage)
     print(f"report    {armscan_command('report', '--study', settings.name, storage=settings.storage)}")

@@ -13,11 +13,11 @@ from optuna.trial import FrozenTrial, TrialState
 
 from armscan.errors import StudyError
 from armscan.stats.aggregation import over_seeds
+from armscan.stats.on_plane import limits_among
 from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
 from armscan.sweeps.study.study import best_trials
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.metrics import COUNTS
-from armscan.training.on_plane import limits_among
 from armscan.training.result_table import with_baselines
 from armscan.training.titles import leading_among
 

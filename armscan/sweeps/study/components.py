@@ -65,10 +65,12 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
     task: Any = make("task", settings.task, object)
     if missing := [name for name in TASK_MEMBERS if not hasattr(task, name)]:
         raise InvalidValueError(f"study.task is {settings.task['_target_']}, which has no {missing[0]}, as a task must")
+    of_trials, _ = of_run(config)
+    returned = task.metrics(of_trials)
     for name in settings.objectives:
-        if name not in task.metrics:
-            raise InvalidValueError(f"study.objectives names {name!r}, but a trial returns only {listed(task.metrics)}")
-    return settings, task, of_run(config)[0]
+        if name not in returned:
+            raise InvalidValueError(f"study.objectives names {name!r}, but a trial returns only {listed(returned)}")
+    return settings, task, of_trials
 
 
 def make(name: str, described: Mapping[str, Any], kind: type[Any], **arguments: Any) -> Any:

@@ -7,22 +7,28 @@ from typing import Any
 
 import optuna
 from optuna.distributions import CategoricalDistribution, IntDistribution
-from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.space.parameter import Parameter
 from armscan.sweeps.study.settings import StudySettings
+from armscan.utils.console import WHOLE_CHARS, wide_console
 
 BYTES_A_MIB = 2**20
 
 
 def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
     """Print the space, how far a study is, if it has been begun, what it has cost, and what the rest will take."""
-    console = Console()
+    console = wide_console(WHOLE_CHARS)
     state = StudyState.of(study.get_trials(deepcopy=False) if study is not None else ())
-    table = Table("key", "values", "where", title=f"study {settings.name}: what is searched", title_justify="left")
+    table = Table(
+        Column("key", no_wrap=True),
+        "values",
+        "where",
+        title=f"study {settings.name}: what is searched",
+        title_justify="left",
+    )
     for parameter in settings.space.parameters:
         needs = ", ".join(f"{name} is {' or '.join(map(str, values))}" for name, values in parameter.when.items())
         table.add_row(*map(Text, (parameter.name, _values(parameter), needs)))

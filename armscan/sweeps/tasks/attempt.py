@@ -156,9 +156,8 @@ class Attempt:
 class Task(Protocol):
     """Work of the trials of a study; `study.task._target_` names its class, which needs no arguments."""
 
-    @property
-    def metrics(self) -> tuple[str, ...]:
-        """The names of the metrics that `run` returns, which a study may have as objectives."""
+    def metrics(self, config: DictConfig) -> tuple[str, ...]:
+        """Return the names of the metrics that `run` returns in this configuration, which may be objectives."""
 
     @property
     def final_metric(self) -> str:

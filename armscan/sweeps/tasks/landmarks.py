@@ -28,9 +28,8 @@ class LandmarksTask:
     What is searched are keys of `env.clustering`, written in full.
     """
 
-    @property
-    def metrics(self) -> tuple[str, ...]:
-        """The means of both rewards over the volumes, their difference, and the worst at a labelled plane."""
+    def metrics(self, config: DictConfig) -> tuple[str, ...]:
+        """Return the means of both rewards over the volumes, their difference, and the worst at a labelled plane."""
         return METRICS
 
     @property

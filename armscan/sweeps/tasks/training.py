@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from armscan.agents import Learner
 from armscan.config.defaults import to_plain
 from armscan.errors import CheckpointError, InvalidValueError
-from armscan.experiment.build import Experiment, build_experiment, check_keys, set_up
+from armscan.experiment.build import Experiment, build_experiment, check_keys, on_plane_of, set_up
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
 from armscan.experiment.results import RunResult
@@ -73,10 +73,9 @@ class _Reporter:
 class TrainingTask:
     """The task of training an agent, with each of a trial's seeds."""
 
-    @property
-    def metrics(self) -> tuple[str, ...]:
-        """Those of the best validation, and those of the training."""
-        return (*Evaluation(()).metrics(), *TRAINING_METRICS)
+    def metrics(self, config: DictConfig) -> tuple[str, ...]:
+        """Return those of the best validation, on-plane rates as configured, and those of the training."""
+        return (*Evaluation((), on_plane_of(config)).metrics(), *TRAINING_METRICS)
 
     @property
     def final_metric(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -25,7 +26,13 @@ def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None, version: 
     with ThreadPoolExecutor() as threads:
         # Those that are there are checked on all cores; held here until they are returned.
         there = list(threads.map(lambda seed: _opened(_path(seed, cache_dir, version)), wanted))
-    volumes = [volume or load_phantom(seed, cache_dir, version) for seed, volume in zip(wanted, there, strict=True)]
+    known: Iterable[tuple[int, LabelVolume | None]] = [*zip(wanted, there, strict=True)]
+    if None in there and sys.stdout.isatty():
+        # Deferred: it is needed once a machine.
+        from rich.progress import track
+
+        known = track(known, "making phantoms", total=len(wanted), transient=True)
+    volumes = [volume or load_phantom(seed, cache_dir, version) for seed, volume in known]
     return {volume.name: volume for volume in volumes}
 
 

@@ -3,7 +3,7 @@
 import optuna
 import pytest
 
-from armscan.errors import StudyError
+from armscan.errors import InvalidValueError, StudyError
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
@@ -124,3 +124,11 @@ def test_space_is_changed_key_by_key_on_the_command_line():
             "network.vector.hidden_sizes": {"choices": [[8]], "when": {"network": "auto"}},
         }
     )
+
+
+def test_objective_may_be_an_on_plane_rate_as_it_is_configured():
+    words = ["sweep=sac_y", "study/pruner=none", "evaluation.on_plane=[[3,5]]"]
+    settings, _, _ = read_settings([*words, "study.objectives=[maximize on_plane_3mm_5deg]"])
+    assert settings.objectives == {"on_plane_3mm_5deg": "maximize"}
+    with pytest.raises(InvalidValueError, match="names 'on_plane_5mm_10deg', but a trial returns"):
+        read_settings([*words, "study.objectives=[maximize on_plane_5mm_10deg]"])

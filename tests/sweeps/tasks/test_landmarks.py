@@ -1,6 +1,7 @@
 """A study that trains nothing: how well clusters tell the labelled planes from the rest of the arm."""
 
 import pytest
+from omegaconf import OmegaConf
 
 from armscan.errors import InvalidValueError
 from armscan.sweeps.tasks.attempt import composed
@@ -25,7 +26,7 @@ def test_landmarks_of_the_published_clusters_are_there_at_labelled_planes_and_no
     task, trial = LandmarksTask(), Trial()
     task.check(trial.config(0)[0])
     metrics = task.run(trial)
-    assert set(metrics) == set(task.metrics)
+    assert set(metrics) == set(task.metrics(OmegaConf.create()))
     assert metrics["labelled_reward"] == metrics["worst_labelled_reward"] == 0.0
     assert metrics["elsewhere_reward"] < -0.2
     assert metrics["separation"] == pytest.approx(-metrics["elsewhere_reward"])

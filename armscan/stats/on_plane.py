@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from armscan.errors import InvalidValueError
@@ -65,3 +66,11 @@ def check_on_plane(name: str, limits: object) -> tuple[OnPlane, ...]:
     if min(min(pair) for pair in pairs) <= 0.0 or len({pair.metric for pair in pairs}) < len(pairs):
         raise InvalidValueError(f"{name} is {limits!r}, but it must be {WANTED}")
     return tuple(pairs)
+
+
+def leading_of(params: Mapping[str, str]) -> OnPlane:
+    """Return the leading limits that a run's MLflow parameters name; those by default for older runs."""
+    try:
+        return check_on_plane("evaluation.on_plane", json.loads(params["evaluation.on_plane"]))[0]
+    except (KeyError, ValueError):
+        return ON_PLANE[0]

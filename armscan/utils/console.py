@@ -1,0 +1,56 @@
+"""Tables in a terminal or a log: no name is broken in its middle."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Column, Table
+from rich.text import Text
+
+# Of what is no terminal: results choose their columns by it, other tables take what they need.
+LOG_CHARS, WHOLE_CHARS = 160, 10_000
+
+
+def wide_console(log_chars: int = LOG_CHARS) -> Console:
+    """Return a console as wide as the terminal; what is no terminal takes longer lines.
+
+    Args:
+        log_chars: longest line where the output is no terminal and `COLUMNS` is not set. Default: 160.
+    """
+    console = Console()
+    return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=log_chars)
+
+
+def print_table(heading: str, names: Sequence[str], columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table with a name for each row: in a column where it fits, else in a line above its row.
+
+    Args:
+        heading: heading of the names.
+        names: names of the rows.
+        columns: the other columns, whose cells are one line each.
+        rows: cells of each row.
+    """
+    console = wide_console(WHOLE_CHARS)
+    beside = _table([Column(heading), *columns], [[name, *row] for name, row in zip(names, rows, strict=True)])
+    natural = Measurement.get(console, console.options.update(max_width=WHOLE_CHARS), beside)
+    if natural.maximum <= console.width:
+        console.print(beside)
+        return
+    lines = console.render_lines(_table(columns, rows), pad=False)
+    n_head = len(lines) - len(rows)
+    for number, line in enumerate(lines):
+        if number >= n_head:
+            console.print(Text(names[number - n_head], style="bold"), soft_wrap=True)
+        console.print(Text.assemble(*((segment.text, segment.style or "") for segment in line)), soft_wrap=True)
+
+
+def _table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Table:
+    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    for column in columns:
+        table.add_column(column.header, justify=column.justify, no_wrap=True)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    return table
