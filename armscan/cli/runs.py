@@ -192,7 +192,7 @@ def sync(folder: Path, tracking: str | None, trust: bool) -> int:
     for delivery in deliveries:
         which = f"run {delivery.run_id}" if delivery.run_id else "a run"
         left = f", the rest is left: {delivery.left}" if delivery.left else ""
-        print(f"{which} in {delivery.folder}: {delivery.n_entries} entries delivered{left}")
+        print(printable(f"{which} in {delivery.folder}: {delivery.n_entries} entries delivered{left}"))
     if not deliveries:
         print(f"{folder}: nothing is left to be delivered")
     return 1 if any(delivery.left for delivery in deliveries) else 0
@@ -224,14 +224,14 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: b
     differences = reproduction.differences(original)
     print(f"run {original.run.run_id}: {printable(original.run.name)}")
     for difference in differences:
-        print(f"differs: {difference}")
+        print(printable(f"differs: {difference}"))
     if not differences:
         print("code, packages, machine and volumes are those that it was made with")
     if dry_run:
         return 1 if differences else 0
     folder = out or REPRODUCTIONS / f"{original.run.run_id[:8]}-{datetime.now():%Y-%m-%d_%H-%M-%S}"
     comparison = reproduction.reproduce(original, folder, differences)
-    print(*comparison.lines(), sep="\n")
+    print(*map(printable, comparison.lines()), sep="\n")
     return 0 if comparison.is_same else 1
 
 

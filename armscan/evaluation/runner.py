@@ -11,7 +11,7 @@ from armscan.agents import Agent, Learner
 from armscan.anatomy import USUAL_PIXEL_MM
 from armscan.config.command_hints import resume_command
 from armscan.envs import EnvFactory
-from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed
+from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed, printable
 from armscan.evaluation.agent_source import TrainedAgent
 from armscan.evaluation.volumes import TrainingVolumes, Volumes, known_volumes, own_split, volume_groups
 from armscan.experiment.build import apply_crop, make_agent, make_env_factory, on_plane_of
@@ -101,7 +101,7 @@ def apply(
     if source.run and source.volumes is None and own.cache_info().currsize:
         notes.append("the run has not kept fingerprints of its volumes: nobody knows whether these are still the same")
     for note in notes:
-        print(f"note: {note}")
+        print(printable(f"note: {note}"))
     return replace(prepared, notes=tuple(notes), data=data)
 
 

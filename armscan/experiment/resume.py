@@ -28,6 +28,8 @@ from armscan.training import Fingerprints, check_unchanged, fingerprints_in, res
 from armscan.utils.files import (
     CONFIG_FILE,
     LAST_CHECKPOINT,
+    OUTBOX_FOLDER,
+    OUTBOX_SUFFIXES,
     SHA256_TAGS,
     VOLUMES_FILE,
     folder_lock,
@@ -154,6 +156,9 @@ def _folder_of(run: Run) -> Path:
             f"run {run_id} cannot be resumed: its folder {folder} is not there; it last ran on the host "
             f"{_tag(run, 'host')}"
         )
+    outboxes = {file.stem for file in (folder / OUTBOX_FOLDER).glob(f"*{OUTBOX_SUFFIXES[-1]}")}
+    if outboxes and run_id not in outboxes:
+        raise ResumeError(f"run {run_id} cannot be resumed: {folder} is the folder of run {min(outboxes)}")
     return folder
 
 

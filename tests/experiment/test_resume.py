@@ -18,6 +18,7 @@ from mlflow import MlflowClient
 import armscan
 from armscan.experiment.job import GRID_TAG
 from armscan.tracking import open_store
+from armscan.tracking.outbox import Address, Outbox
 from armscan.training import load_checkpoint
 from armscan.utils.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, folder_lock, sha256
 from tests.support.killed_at import Moment, commands
@@ -317,6 +318,13 @@ def test_resume_refuses_a_run_whose_folder_is_gone(answer, cut_off):
     client.set_tag(run_id, "folder", str(folder / "gone"))
     printed = refused(answer, f"resume={run_id}")
     assert f"its folder {folder / 'gone'} is not there; it last ran on the host elsewhere" in printed
+
+
+def test_resume_refuses_a_run_that_names_the_folder_of_another(answer, cut_off):
+    client, run_id, folder = cut_off
+    mine = "0" * 32
+    Outbox.begin(folder, Address(mine, client.uri)).close()
+    assert f"cannot be resumed: {folder} is the folder of run {mine}" in refused(answer, f"resume={run_id}")
 
 
 def test_resume_refuses_a_run_that_is_going_on(answer, cut_off):
