@@ -46,6 +46,9 @@ def work(tmp_path, empty_database):
         client, experiment_id = open_store(
             f"sqlite:///{folder}/a.db", experiment="a", artifacts=str(folder / "b"), wait_s=60.0
         )
+        # As each start of a study finds it.
+        there = client.search_runs([experiment_id], "tags.kind = 'study'")
+        own = there[0] if there else client.create_run(experiment_id, name="study", tags={"kind": "study"})
         phase = Phase(
             name="a",
             scheduler=TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits)),
@@ -60,7 +63,7 @@ def work(tmp_path, empty_database):
             artifacts=folder / "artifacts",
             client=client,
             experiment_id=experiment_id,
-            run_id=client.create_run(experiment_id, name="study", tags={}).info.run_id,
+            run_id=own.info.run_id,
         )
         beating = Heartbeat(
             phase.scheduler, "0", is_told_to_leave=lambda: False, leave=lambda: os._exit(1), on_death=lambda _: None
