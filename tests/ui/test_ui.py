@@ -356,8 +356,8 @@ def test_ui_shows_a_study_in_the_browser(small_study, look, browser):
     (page,) = [line.split()[1] for line in looked.printed.splitlines() if line.startswith("runs ")]
     browser.open(page)
     browser.find("a", text="study small")
-    # Of the saved view, with the figures of the best trial.
-    browser.find("[col-id='metrics.`test_volumes/on_plane_5mm_10deg`']")
+    # Of the saved view, with the metrics of the best trial.
+    browser.find("[col-id='metrics.`validation/on_plane_5mm_10deg`']")
     assert not browser.has("a", text="small-0001")
     # The button that shows the children of a run.
     browser.click("[data-component-id*='runnamecellrenderer']")
