@@ -30,7 +30,7 @@ EXAMPLES = [line.split()[1:] for command in COMMANDS.values() for line in comman
 def test_commands_are_those_of_the_documentation():
     assert {" ".join(path) for path in COMMANDS} == {
         *("evaluate", "report", "ui", "policy export", "policy register", "data inspect", "data label", "data explore"),
-        *("runs list", "runs show", "runs prune", "runs sync", "runs reproduce"),
+        *("runs list", "runs show", "runs stop", "runs prune", "runs sync", "runs reproduce"),
     }
 
 
