@@ -13,10 +13,16 @@ by_reinforcement = pytest.mark.parametrize("algorithm", ["sac", "ppo"], indirect
 
 
 def tensors(tree):
-    """Every tensor of nested dicts and lists, in order."""
+    """Every tensor of nested dicts, by their sorted keys, and lists, in order."""
     if isinstance(tree, torch.Tensor):
         return [tree]
-    parts = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list | tuple) else []
+    parts = (
+        [tree[key] for key in sorted(tree, key=str)]
+        if isinstance(tree, dict)
+        else tree
+        if isinstance(tree, list | tuple)
+        else []
+    )
     return [tensor for part in parts for tensor in tensors(part)]
 
 

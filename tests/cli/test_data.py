@@ -6,7 +6,9 @@ import sys
 from armscan.cli.main import main
 
 
-def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, capsys):
+def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, monkeypatch, capsys):
+    # Workers of pytest-xdist have it.
+    monkeypatch.delenv("COLUMNS", raising=False)
     write_labelmap("a.nrrd")
     write_labelmap("b.nrrd")
     write_labelmap("c.nrrd")

@@ -9,7 +9,7 @@ import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, Limits
+from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, METRICS, Limits
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.study import missing_final_trials
 from armscan.sweeps.workers import monitor as module
@@ -63,7 +63,9 @@ def test_study_is_over_when_its_final_evaluation_is(watch):
     ((best, seed),) = missing_final_trials(watch.settings, scheduler.study, final.study)
     final.study.enqueue_trial({}, user_attrs={FINALIST: best.number, FINAL_SEED: seed})
     assert not monitor.is_over()
-    final.study.tell(final.study.ask(), 1.0)
+    trial = final.study.ask()
+    trial.set_user_attr(METRICS, {})
+    final.study.tell(trial, 1.0)
     assert monitor.is_over()
 
 
