@@ -27,7 +27,7 @@ from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
 from armscan.errors import is_interruption
 from armscan.experiment.job import INTERRUPTED, Invocation, remove_if_untracked
-from armscan.launch.folds import with_folds
+from armscan.launch.folds_grid import with_folds
 from armscan.launch.job_process import start_job
 from armscan.launch.multirun import Multirun, end_multirun
 from armscan.utils.log import silence_library_warnings

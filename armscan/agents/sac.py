@@ -90,8 +90,8 @@ class SAC(PolicyParameters):
         from tianshou.trainer import OffPolicyTrainerParams
 
         from armscan.agents.compiled_sac import CompiledSAC
-        from armscan.agents.even_updates import EvenUpdatesTrainer
         from armscan.agents.image_replay import replay_for
+        from armscan.agents.off_policy_trainer import EvenUpdatesTrainer
         from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
 
         envs, device = training_envs(setup, self.num_envs), setup.compute.torch_device

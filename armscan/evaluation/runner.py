@@ -18,7 +18,7 @@ from armscan.experiment.build import apply_crop, make_agent, make_env_factory, o
 from armscan.tracking import FoundRun
 from armscan.training import PARTS, Evaluation, Split, TrainingDomain, evaluate, evaluate_baselines
 from armscan.training.domain import smallest_slice
-from armscan.training.evaluation import Env
+from armscan.training.episode_results import Env
 
 # First seed of an evaluation's episodes: none of them is played by a run, whose seeds lie below.
 FIRST_SEED = 5 * 10**6

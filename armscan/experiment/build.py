@@ -27,7 +27,7 @@ from armscan.training import (
     check_on_plane,
 )
 from armscan.training.domain import smallest_slice, with_crops
-from armscan.training.evaluation import Env
+from armscan.training.episode_results import Env
 from armscan.utils.log import silence_library_warnings
 from armscan.utils.validation import check_int, check_seed
 from armscan.volumes import LabelVolume

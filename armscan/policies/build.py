@@ -23,7 +23,7 @@ from armscan.errors import ExportError, is_interruption
 from armscan.policies.model import ONNX_FILE, Arrays, arrays_of, model_sha256, write_model
 from armscan.tracking import TrackedRun
 from armscan.tracking.client import reason_in
-from armscan.training.evaluation import Env
+from armscan.training.episode_results import Env
 from armscan.utils.files import CONFIG_FILE, POLICY_FOLDER
 from armscan.volumes.plane import FloatArray
 

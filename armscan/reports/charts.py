@@ -12,9 +12,9 @@ from plotly.colors import hex_to_rgb, qualitative
 from plotly.graph_objects import Figure
 from plotly.subplots import make_subplots
 
+from armscan.reports.chart_style import mode
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
-from armscan.reports.look import mode
 from armscan.training import MetricEstimates
 from armscan.training.titles import is_rate, title_of
 

@@ -177,7 +177,7 @@ def chart(figure: graph_objects.Figure, *, is_wide: bool = False) -> str:
         figure: the chart.
         is_wide: whether a phone scrolls it, because it cannot be narrow. Default: false.
     """
-    from armscan.reports.look import look
+    from armscan.reports.chart_style import look
 
     figure.update_layout(title=None, template=look())
     drawn = figure.to_html(full_html=False, include_plotlyjs=False, config=CHART_CONFIG)

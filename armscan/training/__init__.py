@@ -6,8 +6,8 @@ from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from armscan.training.checkpointing import CheckpointProvenance, resume_from_checkpoint
 from armscan.training.domain import TrainingDomain
+from armscan.training.episode_results import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation
 from armscan.training.episodes import evaluate
-from armscan.training.evaluation import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint, fingerprints_in
 from armscan.training.metrics import MetricEstimates
 from armscan.training.result_table import ResultTable

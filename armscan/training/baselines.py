@@ -18,8 +18,8 @@ from armscan.agents.protocols import Agent
 from armscan.envs.actions import COMPONENTS
 from armscan.envs.rules import Rules
 from armscan.stats.on_plane import ON_PLANE, OnPlane
+from armscan.training.episode_results import Env, Evaluation
 from armscan.training.episodes import evaluate
-from armscan.training.evaluation import Env, Evaluation
 from armscan.training.fingerprints import fingerprint
 from armscan.utils.files import atomic_write, cache_folder
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from armscan.training.evaluation import Evaluation
+from armscan.training.episode_results import Evaluation
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from armscan.errors import CheckpointError
 from armscan.stats.on_plane import ON_PLANE
 from armscan.training.callbacks import EpochReport
 from armscan.training.checkpoint import load_checkpoint, save_checkpoint
-from armscan.training.evaluation import Evaluation
+from armscan.training.episode_results import Evaluation
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprints_in
 from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 

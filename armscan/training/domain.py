@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from armscan.envs.observation_registry import NAMED_OBSERVATIONS
 from armscan.errors import InvalidValueError
-from armscan.training.evaluation import Env
+from armscan.training.episode_results import Env
 from armscan.volumes import LabelVolume
 
 # By which share a size may lie outside the range of the training volumes without a word about it.

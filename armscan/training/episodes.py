@@ -20,7 +20,7 @@ from armscan.envs.factory import side_by_side
 from armscan.envs.history import rows_of
 from armscan.envs.vector_env import reset_each, step_each
 from armscan.stats.on_plane import ON_PLANE, OnPlane
-from armscan.training.evaluation import Env, EpisodeResult, Evaluation
+from armscan.training.episode_results import Env, EpisodeResult, Evaluation
 from armscan.utils.validation import check_int
 
 # Episodes that are played side by side; more would hardly be faster, and each holds what it observes.

@@ -12,7 +12,7 @@ import numpy as np
 
 from armscan.stats.bootstrap import Estimate, Statistic, estimates, interquartile_mean, mean, quantile, wilson
 from armscan.stats.on_plane import OnPlane, limits_among
-from armscan.training.evaluation import MEANS, EpisodeResult, Evaluation
+from armscan.training.episode_results import MEANS, EpisodeResult, Evaluation
 
 # Suffix of metrics over the episodes that did not start solved, and of rates with Wilson's interval.
 NOT_STARTED_SOLVED, WILSON = "_not_started_solved", "_wilson"

@@ -12,7 +12,7 @@ from armscan.errors import InvalidValueError
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint
 from armscan.training.checkpointing import CheckpointProvenance, save_checkpoints
-from armscan.training.evaluation import BEST_BY, SUCCESS, Evaluation
+from armscan.training.episode_results import BEST_BY, SUCCESS, Evaluation
 from armscan.utils.files import BEST_CHECKPOINT
 from armscan.utils.validation import check_choice, check_float, check_int
 

@@ -13,8 +13,8 @@ from PIL import GifImagePlugin, Image, ImageChops, ImageDraw
 
 from armscan.agents.protocols import Agent
 from armscan.envs.panels import INK, font
+from armscan.training.episode_results import Env, EpisodeResult
 from armscan.training.episodes import play
-from armscan.training.evaluation import Env, EpisodeResult
 
 FRAME_MS = 600
 LAST_FRAME_MS = 2400

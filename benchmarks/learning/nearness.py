@@ -22,7 +22,7 @@ from armscan.evaluation.agent_source import agent_of_run
 from armscan.evaluation.runner import FIRST_SEED, apply
 from armscan.tracking import find_run, open_existing_store
 from armscan.training import TEST, evaluate
-from armscan.training.evaluation import EpisodeResult
+from armscan.training.episode_results import EpisodeResult
 
 N_PHANTOMS, N_QUINTILES = 12, 5
 NEAR_MM, NEAR_DEG = 1.5, 4.0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from armscan.errors import ChangedVolumesError, CheckpointError
 from armscan.training import CheckpointProvenance, load_checkpoint, resume_from_checkpoint, save_checkpoint
-from armscan.training.evaluation import EPISODE_FIELDS
+from armscan.training.episode_results import EPISODE_FIELDS
 
 
 def test_checkpoint_gives_back_what_was_saved(tmp_path):

@@ -14,8 +14,8 @@ from optuna.trial import FrozenTrial, TrialState
 from optuna.visualization import plot_parallel_coordinate, plot_pareto_front
 from plotly.graph_objects import Figure, Scatter
 
+from armscan.reports.chart_style import BLUE, GREY, ORANGE, RED, mode
 from armscan.reports.html import chart
-from armscan.reports.look import BLUE, GREY, ORANGE, RED, mode
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.training.titles import is_rate, title_of
 

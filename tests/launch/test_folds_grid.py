@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from armscan.errors import InvalidValueError, VolumeError
-from armscan.launch.folds import with_folds
+from armscan.launch.folds_grid import with_folds
 from armscan.launch.folds_table import AGENT, folds_table
 from armscan.training import TEST, Evaluation, MetricEstimates
 from tests.training.test_train import evaluation_of
