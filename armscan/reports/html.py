@@ -30,8 +30,9 @@ td, th {{ border-bottom: 1px solid #ddd; padding: .25rem .6rem; text-align: left
 th {{ border-bottom: 2px solid #999; vertical-align: bottom; overflow-wrap: normal; }}
 td.number {{ text-align: right; white-space: nowrap; }}
 small {{ color: #555; }}
-.results td, .results th {{ padding: .2rem; font-size: 12px; text-align: right; }}
+.results td, .results th {{ padding: .2rem .1rem; font-size: 12px; text-align: right; }}
 .results td {{ white-space: nowrap; }}
+.results td small {{ white-space: normal; }}
 .results td:first-child {{ text-align: left; white-space: normal; min-width: 8rem; overflow-wrap: break-word; }}
 summary {{ cursor: pointer; font-weight: bold; margin: 1rem 0; }}
 .matrices {{ display: flex; flex-wrap: wrap; gap: 0 2rem; }}
