@@ -11,7 +11,7 @@ from typing import Any
 
 import optuna
 from omegaconf import DictConfig
-from optuna.trial import FrozenTrial, Trial
+from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.config.defaults import to_plain
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
@@ -22,7 +22,7 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import STUDY_RUN, make_study, name_objectives
-from armscan.sweeps.tasks.attempt import STORAGE_TAG, STUDY_TAG, TRIAL_TAG, Attempt, Task, trial_folder
+from armscan.sweeps.tasks.attempt import RUN, STORAGE_TAG, STUDY_TAG, TRIAL_TAG, Attempt, Task, trial_folder
 from armscan.tracking import TrackingStore, abandon, open_store, run_of_study, source
 from armscan.tracking.run import FAILURE_TAG
 from armscan.utils.retry import RETRY_S
@@ -76,17 +76,21 @@ class Phase:
         abandon(trial_folder(self.folder, trial.number), self.client, WORKER_DIED)
 
     def close_orphaned_runs(self) -> None:
-        """Close runs of failed trials whose workers died before they could write the run's ID to its folder."""
+        """Close runs whose workers ended before the trial, or the run's folder, knew the run's ID."""
         running = self.client.search_runs(
             [self.experiment_id], f"tags.{STUDY_TAG} = '{self.name}' AND attributes.status = 'RUNNING'"
         )
         state = self.scheduler.state()
-        # A study in another storage may have the same name.
-        failed = [self.tags_of(trial) for trial in (*state.failed, *state.retried)]
+        failed = [*state.failed, *state.retried]
+        requeued = self.scheduler.study.get_trials(deepcopy=False, states=(TrialState.WAITING,))
         for run in running:
-            if any(tags.items() <= run.data.tags.items() for tags in failed):
-                self.client.set_tag(run.info.run_id, FAILURE_TAG, WORKER_DIED)
-                self.client.set_terminated(run.info.run_id, "FAILED")
+            run_id, tags = run.info.run_id, run.data.tags.items()
+            # A study in another storage may have the same name.
+            if any(self.tags_of(trial).items() <= tags for trial in failed):
+                self.client.set_tag(run_id, FAILURE_TAG, WORKER_DIED)
+                self.client.set_terminated(run_id, "FAILED")
+            elif any(self.tags_of(trial).items() <= tags and trial.user_attrs.get(RUN) != run_id for trial in requeued):
+                self.client.set_terminated(run_id, "KILLED")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,6 +69,20 @@ def test_runs_of_a_study_of_the_same_name_in_another_storage_are_not_ended(opene
     assert [client.get_run(run_id).info.status for run_id in runs] == ["FAILED", "RUNNING"]
 
 
+def test_run_that_a_requeued_trial_does_not_know_is_ended(opened):
+    phase = opened().search
+    client, experiment_id = opened.store
+    study = phase.scheduler.study
+    study.enqueue_trial({"agent.lr": 1e-3})
+    (requeued,) = study.get_trials(deepcopy=False)
+    unknown, known = (
+        client.create_run(experiment_id, name="n", tags=phase.tags_of(requeued)).info.run_id for _ in range(2)
+    )
+    study._storage.set_trial_user_attr(requeued._trial_id, "mlflow_run", known)
+    phase.close_orphaned_runs()
+    assert [client.get_run(run_id).info.status for run_id in (unknown, known)] == ["KILLED", "RUNNING"]
+
+
 def test_study_that_is_damaged_while_it_runs_says_so_in_one_line(opened):
     phase = opened().search
     other = optuna.load_study(study_name="a", storage=open_storage("optuna.journal").optuna)
