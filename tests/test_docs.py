@@ -117,7 +117,9 @@ def write_files(page, folder):
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "environment.md"], ids=lambda page: page.name)
 def test_code_of_pages_runs(page):
-    exec(compile("\n".join(blocks(page, "python")), str(page), "exec"), {"__name__": page.stem})
+    names = {"__name__": page.stem}
+    exec(compile("\n".join(blocks(page, "python")), str(page), "exec"), names)
+    assert names["env"].observation_space.contains(names["observation"])
 
 
 def test_tutorial_runs_as_it_stands(data_folder, tmp_path, monkeypatch, capsys):

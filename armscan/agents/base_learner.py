@@ -1,4 +1,4 @@
-"""What learners share: weights and their checks, and epochs that draw everything from the seed and their number."""
+"""Base classes of learners: checked weights, and epochs whose random numbers follow from seed and epoch."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class BaseLearner(ABC):
         return None
 
     def weights(self) -> dict[str, Any]:
-        """Return the network's weights, and whatever else it computes with."""
+        """Return the network's weights and buffers."""
         return dict(self._network.state_dict())
 
     def load_weights(self, weights: dict[str, Any]) -> None:
@@ -115,7 +115,7 @@ class SupervisedLearner(BaseLearner):
         Args:
             n_env_steps: number of environment steps.
             seeds: seed of the first episode of each environment.
-            rng: whatever else is drawn.
+            rng: NumPy generator of all other random numbers.
 
         Returns:
             The loss of each gradient step.
@@ -182,7 +182,7 @@ def load_into(module: nn.Module, weights: dict[str, Any]) -> None:
 def spare_dynamo() -> None:
     """Have torch's optimisers be made without torch's compiler, which they load only to be left alone by it.
 
-    That takes one and a half seconds. Whoever compiles loads it before.
+    That takes one and a half seconds. Code that compiles must load it first.
     """
     if "torch._dynamo" in sys.modules:
         return

@@ -58,8 +58,8 @@ def start_tracking(
 
     Args:
         config: the composed configuration.
-        invocation: how the run was asked for.
-        setup: what is built of the configuration.
+        invocation: command line, overrides and folder of the run.
+        setup: objects built from the configuration.
         tags: tags of the run beside the usual ones. Default: none.
         retry_s: seconds to wait for a store that is away. Default: None, it is not waited for.
     """

@@ -1,4 +1,4 @@
-"""What a run is that is to be stopped: of a trial, of a study, or of a process of this machine."""
+"""Stop a run: a trial's, a study's, or that of a process on this machine."""
 
 from __future__ import annotations
 

@@ -174,7 +174,7 @@ def run_of_study(
         run_id: MLflow run ID.
         experiment_id: MLflow experiment of the study.
         tags: what the run's own tags must be, by which it is known to be the study's; None for those that it must lack.
-        where: what names it, for the error.
+        where: attribute that names the run, such as `a.user_attrs.mlflow_run`, for the error.
 
     Raises:
         TrackingError: if it is another run, or the store does not have it.

@@ -128,7 +128,7 @@ def _delivered(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Delivery
     try:
         if not trust:
             _check_own(outbox, store)
-    # Whatever a store raises, or that the run is another's.
+    # Any error of the store, or a run that is another's.
     except Exception as error:
         return Delivery(outbox.folder, outbox.address.run_id, 0, reason_in(error))
     for channel in CHANNELS:

@@ -152,10 +152,10 @@ def deliver(
 
 
 def dataset_input(part: str, prints: Mapping[str, str]) -> DatasetInput:
-    """Return volumes as a dataset of MLflow; whose digest is that of their fingerprints.
+    """Return volumes as a dataset of MLflow; its digest follows from their fingerprints.
 
     Args:
-        part: what the volumes are for, such as `training`.
+        part: split of the volumes: `training`, `validation` or `test`.
         prints: fingerprint of each volume by its name.
     """
     from mlflow.entities import Dataset, DatasetInput, InputTag

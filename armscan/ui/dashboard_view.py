@@ -1,4 +1,4 @@
-"""What Optuna's dashboard shows of armscan's studies: what people look for, not what workers keep for each other."""
+"""Optuna's dashboard without the attributes that workers keep for each other."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def read_kept(
 
     Args:
         path: file of the volume.
-        options: how it is read.
+        options: reading options, such as crop and orientation; the cache's key holds them.
         optimal_action: labelled plane, in the volume's frame.
     """
     from pydantic import TypeAdapter

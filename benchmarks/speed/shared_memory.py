@@ -31,6 +31,7 @@ def pss_bytes() -> int:
 
 def work(n_phantoms: int, together: Barrier, answers: Any) -> None:
     """Train for a moment; report bytes and the seconds until the phantoms were there."""
+    # Imported for the memory that it takes in each worker.
     import mlflow  # noqa: F401
 
     from armscan.agents import MLP, SAC, AgentSetup, Compute

@@ -113,7 +113,7 @@ class TrialScheduler:
         return self.limits.broken(state, reset)
 
     def look_for_stop(self) -> str:
-        """Return who has asked the study to stop; an empty text where nobody has."""
+        """Return who asked the study to stop; an empty string if nobody has."""
         self.stopped = str(self.study.user_attrs.get(STOP, ""))
         return self.stopped
 

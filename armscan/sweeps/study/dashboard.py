@@ -1,4 +1,4 @@
-"""What Optuna's dashboard shows of a study and its trials: notes, figures, pictures."""
+"""Notes, metrics and pictures of a study and its trials in Optuna's dashboard."""
 
 from __future__ import annotations
 

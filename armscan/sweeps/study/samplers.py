@@ -25,7 +25,7 @@ PICKLED = {
 class CmaEsSampler(optuna.samplers.CmaEsSampler):
     """Optuna's CMA-ES sampler, which keeps its state in the storage.
 
-    Optuna's own unpickles whatever the storage holds, which may execute any code; this one takes numbers alone.
+    Optuna's own unpickles its state from the storage, which can execute any code. This one unpickles numbers only.
     """
 
     def _restore_optimizer(self, completed_trials: Sequence[FrozenTrial]) -> Any:
