@@ -124,7 +124,7 @@ def table() -> str:
     """Return all that is kept, as a Markdown table: the figures of each seed, and whether each is as wanted."""
     kept = json.loads(FIGURES.read_text())
     lines = [
-        "| | wanted | success, % | mean steps | not started solved | median distance | training, s |",
+        "| | goal | success, % | mean steps | not started solved | median distance | training, s |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name, row in ROWS.items():
