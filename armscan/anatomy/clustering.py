@@ -26,9 +26,9 @@ def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -
     """Return for each row distance d = 0, 1, .. the largest w with (d row_step)^2 + (w col_step)^2 <= eps^2.
 
     Args:
-        eps: radius, in the unit of the steps.
-        row_step: distance of neighbouring rows.
-        col_step: distance of neighbouring columns.
+        eps: Radius, in the unit of the steps.
+        row_step: Distance of neighbouring rows.
+        col_step: Distance of neighbouring columns.
     """
     rows, columns = np.arange(int(eps / row_step) + 2), np.arange(int(eps / col_step) + 2)
     with np.errstate(over="ignore"):
@@ -230,10 +230,10 @@ def cluster_label(
     """Clusters the pixels of a label as scikit-learn's DBSCAN does their coordinates in row-major order.
 
     Args:
-        slice_xz: labels, indexed [across, depth].
-        label: whose pixels.
-        half_widths: half widths of the disc of neighbours, in pixels, as `disc_half_widths` returns them.
-        min_samples: neighbours, the pixel itself included, that make a core pixel.
+        slice_xz: Labels of the slice, indexed [across, depth].
+        label: Label to cluster.
+        half_widths: Half widths of the disc of neighbours, in pixels, as `disc_half_widths` returns them.
+        min_samples: Number of neighbours, the pixel itself included, that make a core pixel.
 
     Returns:
         The cluster image (numbered from 1 in the order of the clusters' first core pixels; a border pixel belongs to
@@ -264,13 +264,13 @@ def summarise_label(
     """Clusters the pixels of a label, and keeps of it only what rewards and observations need.
 
     Args:
-        slice_xz: labels, indexed [across, depth].
-        label: whose pixels.
-        box: box about them, a row of `bounding_boxes`.
-        half_widths: half widths of the disc of neighbours, in pixels, as in `cluster_label`.
-        min_samples: neighbours that make a core pixel, as in `cluster_label`.
-        summary: filled with the number of clusters, the number of pixels in them, and the mean of their centres,
-            (across, depth) in pixels, 0 where there is none; shape (4,).
+        slice_xz: Labels of the slice, indexed [across, depth].
+        label: Label to cluster.
+        box: Box around its pixels, a row of `bounding_boxes`.
+        half_widths: Half widths of the disc of neighbours, in pixels; see `cluster_label`.
+        min_samples: Number of neighbours that make a core pixel; see `cluster_label`.
+        summary: Array to fill, shape (4,): number of clusters, number of their pixels, and mean of their centres,
+            (across, depth) in pixels, 0 if there are none.
     """
     sums = _cluster(slice_xz, label, box, half_widths, min_samples)[2][:-1]
     summary[:] = 0.0

@@ -24,9 +24,9 @@ class Clusters:
     """The clusters of one tissue in one slice.
 
     Args:
-        image: cluster number of each pixel, from 1; 0 for noise and background. Shape of the slice.
-        centres: mean pixel coordinate of each cluster, shape (n, 2), (across, depth).
-        sizes: pixels of each cluster, shape (n,).
+        image: Cluster number of each pixel, from 1; 0 for noise and background. Has the shape of the slice.
+        centres: Mean pixel coordinates of each cluster, (across, depth), shape (n, 2).
+        sizes: Number of pixels of each cluster, shape (n,).
     """
 
     image: NDArray[np.int32]
@@ -65,12 +65,12 @@ class TissueClusters:
         """Clusters a slice of labels, indexed [across, depth].
 
         Args:
-            slice_xz: integer labels.
-            tissues: `pixels`, `metric`, or how each tissue is clustered.
-            pixel_mm: size of a pixel, (across, depth), for tissues that are clustered by millimetres.
+            slice_xz: Integer labels of the slice, indexed [across, depth].
+            tissues: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
+            pixel_mm: Pixel size (across, depth) in mm, for tissues that are clustered by millimetres.
 
         Raises:
-            InvalidValueError: if the slice is not a 2-D array of integers, or the tissues or the size are none.
+            InvalidValueError: If the slice is not a 2-D array of integers, or the tissues or the size are none.
         """
         slice_xz = _checked_slice(slice_xz)
         rules = [(tissue.label, *tissue.neighbourhood(pixel_mm)) for tissue in check_tissues(tissues)]
@@ -98,8 +98,8 @@ def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) ->
     where none is shared. Where neither slice shows the tissue, they agree: 1.
 
     Args:
-        slice_xz: labels, indexed [across, depth].
-        reference_xz: likewise.
+        slice_xz: Labels of the slice, indexed [across, depth].
+        reference_xz: Labels of the reference slice, indexed [across, depth].
     """
     dice = {}
     for label in LANDMARK_LABELS:
@@ -115,9 +115,9 @@ def nerve_area_error(
     """Return how far the median nerve's area is from that on a reference slice: in mm2, and in per cent of the latter.
 
     Args:
-        slice_xz: labels, indexed [across, depth].
-        reference_xz: likewise.
-        pixel_mm: size (across, depth) of a pixel of both, in mm.
+        slice_xz: Labels of the slice, indexed [across, depth].
+        reference_xz: Labels of the reference slice, indexed [across, depth].
+        pixel_mm: Pixel size of both slices, (across, depth) in mm.
 
     Returns:
         The two, at least 0; None and None where the reference shows no nerve.

@@ -36,11 +36,11 @@ class FoundPlane:
     """Result of a search.
 
     Args:
-        action: the plane, its origin (tx, ty) within the volume.
-        score: its reward, in [-1, 0].
-        counts: clusters of bones, tendons and artery that it shows.
-        spread: how far the planes that score best reach, end to end: (rz, rx) in degrees, along the arm in mm;
-            None for a plane that a person drew.
+        action: Plane that was found; its origin (tx, ty) lies within the volume.
+        score: Reward of the plane, in [-1, 0].
+        counts: Number of clusters of bones, tendons and artery in its slice.
+        spread: Extent of the planes with the best score, end to end: (rz, rx) in degrees and along the arm in mm; None
+            for a plane that a person drew.
     """
 
     action: ManipulatorAction
@@ -54,9 +54,9 @@ class PlaneGrid:
     """Planes at even steps; a pose (rz, rx, along) is two rotations in degrees and the slice centre's y in mm.
 
     Args:
-        lowest: pose of the first plane, shape (3,).
-        steps: from one plane to the next, shape (3,).
-        shape: number of planes along each component.
+        lowest: Pose of the first plane, shape (3,).
+        steps: Step from one plane to the next, shape (3,).
+        shape: Number of planes along each component.
     """
 
     lowest: FloatArray
@@ -129,21 +129,22 @@ def find_optimal_plane(
     rotations, the middle is that of the part within.
 
     Args:
-        volume: volume to search, over its whole length.
-        rz_deg: planes turned about Z by up to +- this are tried, at most 80.
-        rx_deg: the same about X.
-        step_deg: between the rotations tried at first; half of it about the region that scores best.
-        step_mm: between the places along the arm, likewise.
-        success_threshold: a plane counts as found only if it scores above -success_threshold.
-        targets: target counts of the reward.
-        clustering: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
+        volume: Volume to search, over its whole length.
+        rz_deg: Largest rotation about Z to try, in degrees, in both directions, at most 80.
+        rx_deg: Largest rotation about X to try, in degrees, in both directions, at most 80.
+        step_deg: Step between rotations in the first search, in degrees; half of it around the region with the best
+            score.
+        step_mm: Step along the arm in the first search, in mm; half of it around the region with the best score.
+        success_threshold: Threshold of success: a plane counts as found if it scores above -success_threshold.
+        targets: Target counts of the reward.
+        clustering: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
 
     Returns:
         The plane with its score.
 
     Raises:
-        InvalidValueError: if an argument is out of bounds, or more than a million planes would be tried.
-        OptimalPlaneError: naming the volume and the best score, if no plane scores above -success_threshold.
+        InvalidValueError: If an argument is out of bounds, or more than a million planes would be tried.
+        OptimalPlaneError: Naming the volume and the best score, if no plane scores above -success_threshold.
     """
     if not isinstance(volume, LabelVolume):
         raise InvalidValueError(f"volume is {volume!r}, but it must be a LabelVolume")

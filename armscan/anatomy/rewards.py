@@ -40,11 +40,11 @@ class LandmarkReward:
     depth.
 
     Args:
-        targets: how many clusters of bones, tendons and artery the wanted plane shows; (4, 3, 1), or (7, 5, 1), the
-            other published description.
+        targets: Target counts: clusters of bones, tendons and artery that the wanted plane shows. (4, 3, 1), or (7, 5,
+            1) in the other published description.
 
     Raises:
-        InvalidValueError: if `targets` is not three whole numbers from 1 to 1000.
+        InvalidValueError: If `targets` is not three whole numbers from 1 to 1000.
     """
 
     def __init__(self, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
@@ -77,12 +77,12 @@ class AgreementReward(LandmarkReward):
     change when the picture is shifted.
 
     Args:
-        targets: target counts of the published reward.
-        area_tolerance: how far outside its range an area has its full cost, as a share of the nearer end.
-        distance_tolerance_mm: tolerance of a distance outside its range, in mm.
-        slack: by which share of an area's ends its range is widened: the pixels of the same plane differ a little from
-            one motion of the volume to another.
-        slack_mm: by how much the range of a distance is widened.
+        targets: Target counts of the published reward.
+        area_tolerance: Distance outside its range at which an area has its full cost, as a share of the nearer end.
+        distance_tolerance_mm: Distance outside its range, in mm, at which a distance has its full cost.
+        slack: Share of each end by which the range of an area is widened, because the pixels of the same plane differ
+            a little from one motion of the volume to another.
+        slack_mm: Width in mm by which the range of a distance is widened at both ends.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class AgreementReward(LandmarkReward):
         """See `Reward.fit`.
 
         Raises:
-            OptimalPlaneError: if a volume has no labelled plane, or a tissue has no cluster on it.
+            OptimalPlaneError: If a volume has no labelled plane, or a tissue has no cluster on it.
         """
         if self._ranges is not None:
             return self
@@ -129,7 +129,7 @@ class AgreementReward(LandmarkReward):
         """See `Reward.score`.
 
         Raises:
-            InvalidValueError: if the reward has not been fitted to volumes.
+            InvalidValueError: If the reward has not been fitted to volumes.
         """
         if self._ranges is None:
             raise InvalidValueError("the reward has no ranges yet: call fit(volumes) with the training volumes")
@@ -199,11 +199,11 @@ def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED
     """Return the published reward, `LandmarkReward`, of what a slice shows.
 
     Args:
-        clusters: clusters in the slice.
-        targets: how many clusters of bones, tendons and artery the wanted plane shows.
+        clusters: Clusters in the slice.
+        targets: Target counts: clusters of bones, tendons and artery that the wanted plane shows.
 
     Raises:
-        InvalidValueError: if `targets` is not three whole numbers from 1 to 1000, or `clusters` none.
+        InvalidValueError: If `targets` is not three whole numbers from 1 to 1000, or `clusters` none.
     """
     if not isinstance(clusters, TissueClusters):
         raise InvalidValueError(f"clusters is {clusters!r}, but it must be a TissueClusters")

@@ -79,8 +79,8 @@ class Scanner:
     """Looks at planes of some volumes.
 
     Args:
-        volumes: volumes, which are named by their index in this sequence.
-        tissues: clustering rule of each tissue.
+        volumes: Volumes; planes name them by their index in this sequence.
+        tissues: Clustering rule of each tissue.
     """
 
     def __init__(self, volumes: Sequence[LabelVolume], tissues: Tissues) -> None:
@@ -104,9 +104,9 @@ class Scanner:
         """Look at one plane.
 
         Args:
-            which: index of the volume.
-            matrix: rotation from the plane's frame into the volume's, shape (3, 3).
-            offset_mm: the plane's origin in the volume, in mm, shape (3,).
+            which: Index of the volume.
+            matrix: Rotation from the plane's frame into the volume's, shape (3, 3).
+            offset_mm: Origin of the plane in the volume, in mm, shape (3,).
 
         Returns:
             The slice, indexed [across, depth], and the summary of its clusters.
@@ -122,9 +122,9 @@ class Scanner:
         """Look at n planes on as many threads as NUMBA_NUM_THREADS says, default: one for each core.
 
         Args:
-            which: index of each plane's volume, shape (n,).
-            matrices: rotation of each plane, shape (n, 3, 3).
-            offsets_mm: origin of each plane in its volume, in mm, shape (n, 3).
+            which: Index of each plane's volume, shape (n,).
+            matrices: Rotation of each plane, shape (n, 3, 3).
+            offsets_mm: Origin of each plane in its volume, in mm, shape (n, 3).
 
         Returns:
             The slices, and the summaries of their clusters, shape (n, 3, 4): bit for bit what `look` gives.

@@ -42,9 +42,9 @@ class PixelTissue:
     """A tissue clustered by pixels of any size; DBSCAN on the pixel coordinates.
 
     Args:
-        label: its value in a labelmap.
-        eps_px: neighbourhood radius in pixels.
-        min_samples: neighbours, the pixel itself included, that make a core pixel.
+        label: Label of the tissue in a labelmap.
+        eps_px: Neighbourhood radius in pixels.
+        min_samples: Number of neighbours, the pixel itself included, that make a core pixel.
     """
 
     label: int
@@ -66,10 +66,10 @@ class MetricTissue:
     """A tissue clustered by millimetres, so that one setting serves every spacing; DBSCAN on coordinates in mm.
 
     Args:
-        label: its value in a labelmap.
-        eps_mm: neighbourhood radius in mm.
-        density: tissue in mm2 for each mm2 of the neighbourhood that makes a core pixel, in (0, 1]: the share of the
-            pixels within `eps_mm` that must be of this tissue, the pixel itself included.
+        label: Label of the tissue in a labelmap.
+        eps_mm: Neighbourhood radius in mm.
+        density: Share of the pixels within `eps_mm` that must be of this tissue (mm² of tissue per mm²), in (0, 1], to
+            make a core pixel. The pixel itself counts.
     """
 
     label: int

@@ -45,7 +45,7 @@ def resume_command(run_id: str, tracking_uri: str, *, trust: bool = False) -> st
     Args:
         run_id: MLflow run ID.
         tracking_uri: MLflow tracking URI of its store.
-        trust: whether it needs `--trust`. Default: False.
+        trust: Whether the command needs `--trust`. Default: False.
     """
     where = () if tracking_uri == default_tracking()["uri"] else (f"{TRACKING_URI}={tracking_uri}",)
     return run_command([f"{RESUME}={run_id}", *where, *((TRUST,) if trust else ())])
@@ -55,10 +55,10 @@ def armscan_command(*words: str, tracking: str | None = None, storage: str | Non
     """Return a command of the program `armscan`.
 
     Args:
-        words: the command and its arguments.
-        tracking: MLflow tracking URI; named in the command unless it is the default one. Default: None, for none.
-        storage: Optuna storage, likewise.
-        trust: whether the command needs `--trust`. Default: False.
+        words: The command and its arguments.
+        tracking: MLflow tracking URI; named in the command unless it is the default one. Default: None, no URI.
+        storage: Optuna storage; named in the command unless it is the default one. Default: None, no storage.
+        trust: Whether the command needs `--trust`. Default: False.
     """
     stores = ["--storage", storage] if storage is not None and storage != default_storage() else []
     stores += ["--tracking", tracking] if tracking is not None and tracking != default_tracking()["uri"] else []

@@ -103,8 +103,8 @@ def compose(overrides: Sequence[str] = (), *, return_hydra_config: bool = False)
     """Return the configuration that `python -m armscan.run` composes of these overrides.
 
     Args:
-        overrides: as on the command line.
-        return_hydra_config: whether to keep the section `hydra`; default: false.
+        overrides: Overrides in the syntax of the command line, such as `["agent=ppo", "seed=1"]`.
+        return_hydra_config: Whether to keep the section `hydra`. Default: False.
     """
     register()
     GlobalHydra.instance().clear()

@@ -42,7 +42,8 @@ def migrate(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return a stored configuration with the keys and classes of this version.
 
     Args:
-        config: resolved; nested, or its leaves by their dotted keys. One of this version is returned as it is.
+        config: Resolved configuration, nested or as leaves by their dotted keys. A configuration of this version is
+            returned unchanged.
     """
     env = config.get("env")
     target = env.get("_target_") if isinstance(env, Mapping) else config.get("env._target_")
@@ -60,8 +61,8 @@ def renamed(config: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     """Return all or some values of an earlier version's configuration under their names of this version.
 
     Args:
-        config: nested, or its leaves by their dotted keys.
-        path: of the section, ending with a dot; empty for the whole configuration.
+        config: Configuration, nested or as leaves by their dotted keys.
+        path: Dotted path of the section, ending with a dot; empty for the whole configuration.
     """
     result = {}
     for name, value in config.items():

@@ -31,11 +31,11 @@ def address_of(name: str, default: str | None = None) -> str:
     """Return the address of a service. Environment variables take precedence.
 
     Args:
-        name: `storage`, where studies are kept, or `tracking_uri`, where runs are tracked.
-        default: the address where no variable is set; None to require one, there or in `services_file`.
+        name: Name of the service: `storage`, where studies are kept, or `tracking_uri`, where runs are tracked.
+        default: Address to use if no variable is set; None requires one, in a variable or in `services_file`.
 
     Raises:
-        InvalidValueError: if there is no address, it has a password, or the file is damaged.
+        InvalidValueError: If there is no address, it has a password, or the file is damaged.
     """
     variable = VARIABLES[name]
     if address := os.environ.get(variable):

@@ -45,12 +45,12 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
     """Return a stored configuration with the keys and classes of this version.
 
     Args:
-        config: configuration as it was stored, resolved.
-        where: owner of the configuration, such as `run 3bf2`, for the error.
-        trust: whether the configuration may name classes that armscan does not offer, as `--trust` says.
+        config: Resolved configuration, as it was stored.
+        where: Owner of the configuration, such as `run 3bf2`, for the error.
+        trust: Whether the configuration may name classes that armscan does not offer, as `--trust` says.
 
     Raises:
-        UntrustedError: if it names a class that armscan does not offer, or holds an interpolation.
+        UntrustedError: If it names a class that armscan does not offer, or holds an interpolation.
     """
     config = migrate(config)
     if not trust and (found := _foreign_part(config)):
@@ -83,8 +83,8 @@ def untrusted_word(words: Sequence[str], uri: str) -> str | None:
     """Return the first override of a command line that could execute code, or send results elsewhere; None if none.
 
     Args:
-        words: overrides of the command line.
-        uri: address of the store that keeps them.
+        words: Overrides of the command line.
+        uri: Address of the store that keeps them.
     """
     for word in words:
         key, _, value = word.lstrip("+~").partition("=")
@@ -102,9 +102,9 @@ def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
     """Raise `UntrustedError` where a stored command line could execute code, or send results elsewhere.
 
     Args:
-        words: overrides of the command line.
-        uri: address of the store that they were read from.
-        where: owner of the command line, such as `run 3bf2`, for the error.
+        words: Overrides of the command line.
+        uri: Address of the store that they were read from.
+        where: Owner of the command line, such as `run 3bf2`, for the error.
     """
     if (word := untrusted_word(words, uri)) is not None:
         raise UntrustedError(

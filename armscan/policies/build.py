@@ -69,7 +69,7 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
     """Write an agent's policy as a model, in the place of what is there; one that fails a check is not written.
 
     Raises:
-        ExportError: if the policy cannot be written down, or the model does not answer as the agent does.
+        ExportError: If the policy cannot be written down, or the model does not answer as the agent does.
     """
     policy, played = agent.policy(), _played(agent, env)
     batch = batch_of([observation for observation, _ in played])

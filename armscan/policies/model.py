@@ -43,13 +43,14 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
     """Write a policy as a model, with an ONNX file beside it.
 
     Args:
-        folder: folder of the model, which is not there yet.
-        policy: policy of a learner.
-        batch: two observations or more, which show their shapes; two of them stay with the model as its example.
-        facts: facts about the policy, which stay with the model; plain values.
+        folder: Folder of the model, which must not exist yet.
+        policy: Policy of a learner.
+        batch: Batch of two or more observations, which gives their shapes; two of them stay with the model as its
+            example.
+        facts: Facts about the policy, as plain values, which stay with the model.
 
     Raises:
-        ExportError: if torch.export or ONNX cannot take the policy.
+        ExportError: If torch.export or ONNX cannot take the policy.
     """
     program = export_program(policy, batch)
     example = {name: part[:2] for name, part in batch.items()} if isinstance(batch, dict) else batch[:2]

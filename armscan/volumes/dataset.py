@@ -29,11 +29,12 @@ class Dataset:
     """The volumes of a folder, and what its manifest says about them.
 
     Args:
-        volumes: by file name, without the excluded ones.
-        reports: summary of the file of each volume, and of the volume made of it.
-        subjects: whose arm each of them is, by file name; a volume without a subject is its own.
-        splits: `train`, `validation` or `test` by file name, None where the manifest has no splits.
-        excluded: why a volume of the folder was left out, by file name.
+        volumes: Volumes by file name, without the excluded ones.
+        reports: Summary of each file, and of the volume made from it, by file name.
+        subjects: Subject of each volume, by file name; a volume without one is its own subject.
+        splits: Split of each volume (`train`, `validation` or `test`), by file name; None if the manifest has no
+            splits.
+        excluded: Reason why a volume of the folder was left out, by file name.
     """
 
     volumes: dict[str, LabelVolume]
@@ -57,16 +58,17 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
     """Read every volume of a folder as its manifest says.
 
     Args:
-        path: the folder. Its manifest, `manifest.yaml`, `manifest.yml` or `manifest.json`, is described in
-            `docs/manifest.md`; `optimal_actions.json`, an object of nothing but the volumes' entries, is read too.
-        require_manifest: whether a folder without a manifest is refused, rather than read as if it had an empty one.
+        path: Folder of the volumes. `docs/manifest.md` describes its manifest: `manifest.yaml`, `manifest.yml` or
+            `manifest.json`. `optimal_actions.json`, an object with the volumes' entries only, is read too.
+        require_manifest: Whether to refuse a folder without a manifest, instead of reading it as if its manifest were
+            empty.
 
     Returns:
         The volumes in the order of their names, and what is known of them.
 
     Raises:
-        VolumeError: if the folder or a file cannot be used.
-        ManifestError: if the manifest is missing or damaged, or does not name the folder's volumes.
+        VolumeError: If the folder or a file cannot be used.
+        ManifestError: If the manifest is missing or damaged, or does not name the folder's volumes.
     """
     from armscan.volumes.manifest_schema import Manifest
 
@@ -105,12 +107,12 @@ def subjects_in(path: str | Path, n_volumes: int | None = None) -> list[str]:
     """Return whose arm each volume of a folder is, as its manifest says, without reading a volume.
 
     Args:
-        path: the folder.
-        n_volumes: number of its volumes that count, the first by name. Default: None, all.
+        path: Folder of the volumes.
+        n_volumes: Number of volumes to count, the first by name. Default: None, all.
 
     Raises:
-        VolumeError: if the folder cannot be read.
-        ManifestError: if it has no manifest, or a damaged one.
+        VolumeError: If the folder cannot be read.
+        ManifestError: If it has no manifest, or a damaged one.
     """
     folder = check_path("the folder of volumes", path)
     found = find_manifest(folder)

@@ -20,12 +20,12 @@ class DeformingTransform(RigidTransform):
     `inverse_plane` holds for this plane: that another one is bent away by the shears along the arm is left out.
 
     Args:
-        plane: the plane that is kept.
-        about_mm: the point of the plane that stays in place, (across, depth) in its frame.
-        deformation: F, shape (3, 3); its second row is zero but for the stretch along the normal.
+        plane: Plane that the deformation keeps.
+        about_mm: Fixed point of the plane, (across, depth) in its frame, in mm.
+        deformation: Matrix F, shape (3, 3); its second row is zero but for the stretch along the normal.
 
     Raises:
-        InvalidValueError: if `deformation` moves the plane, or squeezes the volume flat.
+        InvalidValueError: If `deformation` moves the plane, or squeezes the volume flat.
     """
 
     plane: ManipulatorAction

@@ -38,15 +38,15 @@ class LabelMap:
     no tissue names it.
 
     Args:
-        bones: whole numbers and names of segments, in a list or tuple.
-        tendons: likewise; the flexor tendons.
-        artery: likewise; the ulnar artery.
-        nerve: likewise; the median nerve.
-        background: likewise; what is in the file but of no interest.
-        others: `background` makes everything else background; None refuses a file that holds anything else.
+        bones: Values and segment names of the bones, in a list or tuple.
+        tendons: Values and segment names of the flexor tendons.
+        artery: Values and segment names of the ulnar artery.
+        nerve: Values and segment names of the median nerve.
+        background: Values and segment names to ignore.
+        others: `background` makes every other value background; None refuses a file with other values.
 
     Raises:
-        InvalidValueError: if a source is neither a whole number nor a text, stands twice, or a landmark (bones,
+        InvalidValueError: If a source is neither a whole number nor a text, stands twice, or a landmark (bones,
             tendons, artery) has none.
     """
 
@@ -99,9 +99,9 @@ class Found:
     """Contents of a file.
 
     Args:
-        source: a value, or the name of a segment.
-        label: label that it was mapped to, 0 to 4.
-        n_voxels: number of its voxels in the file; a segment may have none.
+        source: Value, or name of the segment.
+        label: Label that it is mapped to, 0 to 4.
+        n_voxels: Number of its voxels in the file; 0 for an empty segment.
     """
 
     source: Source
@@ -115,15 +115,15 @@ def map_values(
     """Map a file's values to the labels 0 to 4.
 
     Args:
-        values: of the voxels, any shape that is not empty, whole numbers of any type.
-        labels: which value is what; None where the file already holds the labels 0 to 4.
-        where: the file, for errors.
+        values: Whole numbers of any type, in a non-empty array of any shape.
+        labels: Mapping from values to labels; None if the values are already the labels 0 to 4.
+        where: Name of the file, for errors.
 
     Returns:
         The labels, of the same shape, and what was found, in the order of the values.
 
     Raises:
-        VolumeError: if the values are not whole numbers, or the label map does not name one of them.
+        VolumeError: If the values are not whole numbers, or the label map does not name one of them.
     """
     whole = check_whole(values, where)
     counts = count_values(whole)

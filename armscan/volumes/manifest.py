@@ -82,16 +82,17 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
     A folder without a manifest gets `manifest.yaml`. The file is written atomically; comments in YAML are kept.
 
     Args:
-        folder: the folder of volumes.
-        planes: by file name, the plane in the frame of the volume as `open_dataset` returns it, and its reward.
+        folder: Folder of the volumes.
+        planes: Labelled plane and its reward, by file name; the plane is in the frame of the volume that `open_dataset`
+            returns.
 
     Returns:
         The manifest.
 
     Raises:
-        InvalidValueError: if `planes` is something else, or a score is not in [-1, 0].
-        ManifestError: if the manifest is damaged, or the folder holds no such volume.
-        VolumeError: if the folder cannot be used.
+        InvalidValueError: If `planes` is something else, or a score is not in [-1, 0].
+        ManifestError: If the manifest is damaged, or the folder holds no such volume.
+        VolumeError: If the folder cannot be used.
     """
     folder = check_path("the folder of volumes", folder)
     recorded = _checked_planes(planes)

@@ -44,11 +44,11 @@ def mapped_volume(path: Path, make: Callable[[], Made]) -> Made:
     """Return a volume from its file, made and kept there where there is no sound one.
 
     Args:
-        path: place of the file; its name says all that the volume depends on.
-        make: makes the volume, and what else is to be kept of it.
+        path: Place of the file; its name must hold everything that the volume depends on.
+        make: Function that makes the volume, and the facts to keep beside it.
 
     Raises:
-        OSError: if the file cannot be written.
+        OSError: If the file cannot be written.
     """
     if (found := open_mapped(path)) is not None:
         return found
@@ -68,7 +68,7 @@ def open_mapped(path: Path) -> Made | None:
     """Return a volume whose voxels are those of the file itself, and what else was kept; None if there is no sound one.
 
     Args:
-        path: place of the file.
+        path: Place of the file.
     """
     try:
         with path.open("rb") as file:
@@ -146,7 +146,7 @@ def limit_bytes() -> float:
     """Return how large a folder of volumes may become: `$ARMSCAN_CACHE_GIB`, default: 16.
 
     Raises:
-        InvalidValueError: if that is no number of 0 or more.
+        InvalidValueError: If that is no number of 0 or more.
     """
     word = os.environ.get(LIMIT_VARIABLE) or str(DEFAULT_GIB)
     try:

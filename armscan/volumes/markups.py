@@ -38,14 +38,14 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
     The rectangle's x axis runs across and its y axis in depth; the normal makes them right-handed.
 
     Args:
-        path: the file, ending in `.mrk.json`; its folder exists.
-        volume: the volume that the plane is for.
-        action: the plane, in the volume's frame.
-        name: name of the plane in Slicer.
+        path: File to write, ending in `.mrk.json`, in an existing folder.
+        volume: Volume that the plane belongs to.
+        action: Plane in the volume's frame.
+        name: Name of the plane in Slicer.
 
     Raises:
-        InvalidValueError: if an argument is of another type.
-        MarkupError: if the file cannot be written.
+        InvalidValueError: If an argument is of another type.
+        MarkupError: If the file cannot be written.
     """
     path = check_path("the markups file", path)
     if not isinstance(volume, LabelVolume) or not isinstance(action, ManipulatorAction) or not isinstance(name, str):
@@ -70,15 +70,15 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     plane, and where it lies in depth, is left out: an action has no such components.
 
     Args:
-        path: the file; it holds one plane and any other markups.
-        volume: the volume that the plane is for.
+        path: File with one plane; it may hold other markups.
+        volume: Volume that the plane belongs to.
 
     Returns:
         The plane in the volume's frame, rz and rx within +-90 degrees, its origin (tx, ty) within the volume.
 
     Raises:
-        InvalidValueError: if an argument is of another type.
-        MarkupError: naming the file and the key, if the file does not say which plane, or no action is this plane.
+        InvalidValueError: If an argument is of another type.
+        MarkupError: Naming the file and the key, if the file does not say which plane, or no action is this plane.
     """
     path = check_path("the markups file", path)
     if not isinstance(volume, LabelVolume):

@@ -60,7 +60,7 @@ def orientation_of(direction: FloatArray) -> str:
     """Return what the axes run towards, such as 'LPS', by their largest components where they are oblique.
 
     Args:
-        direction: 3 x 3, the columns are the axes' directions in the world (left, posterior, superior).
+        direction: Directions of the axes in the world (left, posterior, superior), as columns, shape (3, 3).
     """
     largest = np.abs(direction).argmax(axis=0)
     return "".join(WORLD_AXES[world][int(direction[world, axis] > 0)] for axis, world in enumerate(largest))

@@ -52,11 +52,11 @@ class ManipulatorAction:
     A point p of the plane's frame, X across and Z in depth, lies at Rz(rz) Rx(rx) p + (tx, ty, 0) in the volume.
 
     Args:
-        rotation: (rz, rx) in degrees.
-        translation: (tx, ty) in mm.
+        rotation: Angles (rz, rx) in degrees.
+        translation: Offsets (tx, ty) in mm.
 
     Raises:
-        InvalidValueError: if a component is not a finite number.
+        InvalidValueError: If a component is not a finite number.
     """
 
     rotation: tuple[float, float]
@@ -99,12 +99,12 @@ class RigidTransform:
     """A rigid motion T(q) = R (q - c) + c + t of the volume's frame; the moved volume is V'(q) = V(T(q)).
 
     Args:
-        rotation: (rz, rx) in degrees, R = Rz(rz) Rx(rx).
-        translation: t = (tx, ty) in mm; nothing moves in depth.
-        centre_mm: c, the point that the rotation leaves in place.
+        rotation: Angles (rz, rx) in degrees; R = Rz(rz) Rx(rx).
+        translation: Offsets t = (tx, ty) in mm; the depth does not change.
+        centre_mm: Fixed point c of the rotation, in mm.
 
     Raises:
-        InvalidValueError: if a component is not a finite number, or one in mm is beyond 1e6.
+        InvalidValueError: If a component is not a finite number, or one in mm is beyond 1e6.
     """
 
     rotation: tuple[float, float] = (0.0, 0.0)
@@ -145,7 +145,7 @@ class RigidTransform:
         shifted within the plane, because a `ManipulatorAction` has neither a rotation about Y nor a shift in depth.
 
         Raises:
-            InvalidValueError: if the moved plane never meets the volume's floor z = 0, where every plane begins.
+            InvalidValueError: If the moved plane never meets the volume's floor z = 0, where every plane begins.
         """
         n_x, n_y, n_z = (self.matrix.T @ action.normal).tolist()
         x_mm, y_mm, z_mm = (self.matrix.T @ (action.offset_mm - self.offset_mm)).tolist()
@@ -198,9 +198,9 @@ def plane_distance(
     """Measure how far a plane is from the optimal one.
 
     Args:
-        action: the plane.
-        optimum: the optimal plane, in the same frame.
-        centre_mm: centre of the slice in the plane's frame, (across, depth).
+        action: Plane to measure.
+        optimum: Optimal plane, in the same frame.
+        centre_mm: Centre of the slice in the plane's frame, (across, depth) in mm.
 
     Returns:
         The offset in mm of the slice's centre from the optimal plane along its normal, and the angle in degrees, in

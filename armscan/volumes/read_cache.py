@@ -51,9 +51,9 @@ def read_kept(
     is read anew.
 
     Args:
-        path: file of the volume.
-        options: reading options, such as crop and orientation; the cache's key holds them.
-        optimal_action: labelled plane, in the volume's frame.
+        path: File of the volume.
+        options: Reading options, such as crop and orientation; the cache's key holds them.
+        optimal_action: Labelled plane, in the volume's frame.
     """
     from pydantic import TypeAdapter
 

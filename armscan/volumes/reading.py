@@ -61,24 +61,25 @@ def read_volume(
     Where a voxel lies in the world stays as the file says, however the array is turned and cropped.
 
     Args:
-        path: the file.
-        name: the volume's name; the file's where it is None.
-        optimal_action: the labelled plane, in the frame of the volume as returned.
-        labels: which values or segments are which tissue; None where the values are those of `LabelVolume`, and where
-            the segments are called bones, tendons, artery, nerve or background.
-        orientation: first, the file's axes are turned so that they run towards these, such as 'LPS'; None leaves them.
-        axes: then, which of the arm's axes the first, second and third axis are; 'xyz' where X runs across the palm,
-            Y along the arm and Z through the depth.
-        crop_mm: then, what is kept: for some of the axes x, y and z a range in mm from the first voxel's centre. Voxels
-            whose centres lie in it stay, and the first of them is where the volume's frame begins.
-        overlap: of segments of different tissues: `refuse`, or whose tissue a shared voxel gets, that of the `first` or
-            the `last` segment, in the order of the file.
+        path: File to read.
+        name: Name of the volume. None: that of the file.
+        optimal_action: Labelled plane, in the frame of the volume as returned.
+        labels: Mapping from values or segments to tissues. None: values are the labels of `LabelVolume`, and segments
+            are named bones, tendons, artery, nerve or background.
+        orientation: Directions that the file's axes are turned towards first, such as 'LPS'; None leaves them as they
+            are.
+        axes: Axes of the arm that the first, second and third axis are then; in 'xyz', X runs across the palm, Y along
+            the arm and Z through the depth.
+        crop_mm: Part of the volume to keep at last: a range in mm from the first voxel's centre, for any of the axes x,
+            y and z. Voxels whose centres lie in it stay; the first of them is the origin of the volume's frame.
+        overlap: Rule for voxels in segments of different tissues: `refuse` raises, `first` and `last` take the tissue
+            of the first or last segment in the file.
 
     Returns:
         The volume, its array in the order x, y, z.
 
     Raises:
-        VolumeError: naming the file, if it is missing, damaged, truncated, no 3-D scalar image, no labelmap, or has a
+        VolumeError: Naming the file, if it is missing, damaged, truncated, no 3-D scalar image, no labelmap, or has a
             spacing that is not finite and positive, and if an argument is not as above.
     """
     path = check_path("the volume's file", path)

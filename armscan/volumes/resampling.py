@@ -28,14 +28,14 @@ def resample(volume: LabelVolume, spacing: Spacing) -> LabelVolume:
     The first voxel's centre stays where it is, so that the volume's frame, and with it every plane, stays the same.
 
     Args:
-        volume: to resample; it is returned as it is where it already has the spacing.
-        spacing: (sx, sy, sz) in mm, each above 0.
+        volume: Volume to resample; returned unchanged if it already has the spacing.
+        spacing: Voxel spacing (sx, sy, sz) in mm, each above 0.
 
     Returns:
         The volume with as many voxels of that spacing as have their centres in it.
 
     Raises:
-        VolumeError: if the volume would have more than 2^30 voxels.
+        VolumeError: If the volume would have more than 2^30 voxels.
     """
     # Files keep spacings with some six digits.
     if np.allclose(volume.spacing, spacing, rtol=1e-5, atol=0.0):

@@ -36,18 +36,18 @@ def read_segmentation(
     tissues share a voxel, `overlap` decides.
 
     Args:
-        path: the file.
-        labels: which segment is what; None where their names are the tissues' (bones, tendons, artery, nerve,
-            background; upper or lower case).
-        overlap: `refuse`, or the tissue that a shared voxel gets: that of the `first` or of the `last` segment, in the
-            order of the file.
+        path: File to read.
+        labels: Mapping from segments to tissues. None: segments are named after the tissues (bones, tendons, artery,
+            nerve, background; upper or lower case).
+        overlap: Rule for voxels in segments of different tissues: `refuse` raises, `first` and `last` take the tissue
+            of the first or last segment in the file.
 
     Returns:
         The labels over the file's axes, the 4 x 4 matrix from their indices to world coordinates (left, posterior,
         superior) in mm, and what was found.
 
     Raises:
-        VolumeError: naming the file, if it is damaged, a segment is not mapped, or segments overlap.
+        VolumeError: Naming the file, if it is damaged, a segment is not mapped, or segments overlap.
     """
     contents = _contents(path)
     layers = contents["voxels"]

@@ -40,9 +40,9 @@ class SlicerPlane:
     """A plane in the world, in LPS.
 
     Args:
-        point_mm: a point of it, shape (3,): the rectangle's middle where the file was saved with a point and a normal.
-        normal: one of its two unit normals, shape (3,).
-        size_mm: the rectangle's width and height, None where the file has no size.
+        point_mm: Point of the plane, in mm, shape (3,): the rectangle's middle if the file has a point and a normal.
+        normal: Unit normal, one of two, shape (3,).
+        size_mm: Width and height of the rectangle in mm; None if the file has no size.
     """
 
     point_mm: FloatArray
@@ -54,7 +54,7 @@ def read_slicer_plane(path: Path) -> SlicerPlane:
     """Read the one plane of a markups file.
 
     Raises:
-        MarkupError: naming the file and the key, if the file cannot be read, holds no plane or several, is in other
+        MarkupError: Naming the file and the key, if the file cannot be read, holds no plane or several, is in other
             units than mm, or does not say where the plane lies, or says so twice and differently.
     """
     markup = _only_plane(_load(path), path)

@@ -25,11 +25,11 @@ def sample_plane(
     Pixel (i, k) is p = (i sx, 0, k sz) and takes the voxel floor(q / s + 0.5) of q = matrix p + offset, 0 outside.
 
     Args:
-        labels_xyz: the volume's labels, C-contiguous.
-        spacing_mm: (sx, sy, sz).
-        matrix: 3 x 3, from the plane's frame into the volume's.
-        offset_mm: the plane's origin in the volume, shape (3,).
-        slice_xz: the slice to fill, indexed [across, depth], C-contiguous.
+        labels_xyz: Labels of the volume, C-contiguous.
+        spacing_mm: Voxel spacing (sx, sy, sz) in mm.
+        matrix: Rotation from the plane's frame into the volume's, shape (3, 3).
+        offset_mm: Origin of the plane in the volume, in mm, shape (3,).
+        slice_xz: Slice to fill, indexed [across, depth], C-contiguous.
 
     Returns:
         Nothing of use: something that depends on every voxel fetched ahead, so that no compiler leaves them out.

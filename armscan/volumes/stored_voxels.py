@@ -30,12 +30,12 @@ class StoredVoxels:
     """Where voxels are stored.
 
     Args:
-        file: file that holds the voxels.
-        n_bytes: number of inflated bytes that the header declares, including `n_before`.
-        offset: bytes of the file before them, or before the stream that they are compressed in.
-        compression: `GZIP` or `GZIP_OR_ZLIB`, None where they are not compressed.
-        n_before: bytes between the offset, inflated, and the first voxel.
-        finite: the type of the voxels, such as '<f4', where a NaN or an infinity among them is looked for.
+        file: File that holds the voxels.
+        n_bytes: Number of uncompressed bytes that the header declares, including `n_before`.
+        offset: Number of bytes in the file before the voxels, or before their compressed stream.
+        compression: `GZIP` or `GZIP_OR_ZLIB`; None if the voxels are not compressed.
+        n_before: Number of uncompressed bytes between the offset and the first voxel.
+        finite: Data type of the voxels, such as '<f4', to check for NaN and infinity; None for no check.
     """
 
     file: Path
@@ -79,7 +79,7 @@ def pieces(path: Path, file: BinaryIO, compression: int | None) -> Iterator[byte
     """Yield the rest of a file piece by piece, inflated where it is compressed.
 
     Raises:
-        VolumeError: naming the image `path`, where what is compressed is damaged or ends too early.
+        VolumeError: Naming the image `path`, where what is compressed is damaged or ends too early.
     """
     if compression is None:
         yield from iter(lambda: file.read(PIECE_BYTES), b"")

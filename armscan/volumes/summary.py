@@ -16,12 +16,12 @@ class StoredFile:
     """The file of a volume.
 
     Args:
-        shape: voxels along the file's own axes.
-        spacing: likewise, in mm.
-        orientation: directions that the file's axes run towards, such as 'LPS'.
-        found: every value or segment, what it was mapped to, and its voxels in the file.
-        missing: values and segments of the label map that the file does not hold.
-        crop_mm: part of the volume that was kept, in mm, None for all.
+        shape: Number of voxels along the file's own axes.
+        spacing: Voxel spacing along the file's own axes, in mm.
+        orientation: Directions that the file's axes run towards, such as 'LPS'.
+        found: Every value or segment, its label and the number of its voxels in the file.
+        missing: Values and segments of the label map that the file does not hold.
+        crop_mm: Part of the volume that is kept, in mm; None for all.
     """
 
     shape: tuple[int, ...]

@@ -30,16 +30,16 @@ class LabelVolume:
     It may be one voxel thick along an axis; a plane beside it shows background, as beside any volume.
 
     Args:
-        labels: integers over (x, y, z), shape (nx, ny, nz): X across the palm, Y along the arm, Z through the depth;
-            0 background, 1 bones, 2 flexor tendons, 3 ulnar artery, 4 median nerve. Kept as C-contiguous uint8.
-        spacing: (sx, sy, sz) in mm.
-        name: name of the volume in errors, `info` and tables.
-        optimal_action: the labelled plane, in the volume's own frame.
-        origin: world coordinates of voxel (0, 0, 0) in mm, for the way back.
-        direction: 3 x 3 direction cosines, columns are the world directions of the array's axes, for the way back.
+        labels: Integers over (x, y, z), shape (nx, ny, nz): X across the palm, Y along the arm, Z through the depth; 0
+            background, 1 bones, 2 flexor tendons, 3 ulnar artery, 4 median nerve. Kept as C-contiguous uint8.
+        spacing: Voxel spacing (sx, sy, sz) in mm.
+        name: Name of the volume in errors, `info` and tables.
+        optimal_action: Labelled plane, in the volume's own frame.
+        origin: World coordinates of voxel (0, 0, 0) in mm, to return to the world.
+        direction: Directions of the array's axes in the world, as columns (direction cosines), shape (3, 3).
 
     Raises:
-        VolumeError: naming the volume, if the labels are not a 3-D array of the labels above, a landmark is missing,
+        VolumeError: Naming the volume, if the labels are not a 3-D array of the labels above, a landmark is missing,
             the spacing is not finite and positive, or the way back is no position and axes at right angles.
     """
 
@@ -71,10 +71,10 @@ class LabelVolume:
         """Return a volume of what an earlier one has checked; its labels are not copied.
 
         Args:
-            labels: labels of the earlier volume, C-contiguous and not writeable.
-            direction: direction cosines of the earlier volume.
+            labels: Labels of the earlier volume, C-contiguous and not writeable.
+            direction: Direction cosines of the earlier volume.
             fingerprint: `fingerprint` of the earlier volume.
-            **rest: its other arguments.
+            **rest: Other arguments of `LabelVolume`.
         """
         volume = cls.__new__(cls)
         direction.flags.writeable = False
@@ -145,15 +145,15 @@ class LabelVolume:
         """Look up the labels on a plane; nothing is resampled.
 
         Args:
-            action: the plane.
-            shape: pixels (across, depth); (nx, nz) where it is None.
-            transform: slice the volume moved by it, V'(q) = V(T(q)), instead of the volume as it is.
+            action: Plane to slice.
+            shape: Number of pixels (across, depth). None: (nx, nz).
+            transform: Motion of the volume, which slices V'(q) = V(T(q)). None: the volume as it is.
 
         Returns:
             The slice, indexed [across, depth], uint8; 0 where the plane is outside the volume.
 
         Raises:
-            InvalidValueError: if `shape` is not two whole numbers from 1 to 65536, or another argument of another type.
+            InvalidValueError: If `shape` is not two whole numbers from 1 to 65536, or another argument of another type.
         """
         if not isinstance(action, ManipulatorAction):
             raise InvalidValueError(f"action is {action!r}, but it must be a ManipulatorAction")

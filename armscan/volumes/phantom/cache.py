@@ -40,9 +40,9 @@ def load_phantom(seed: int, cache_dir: Path | None = None, version: int = 1) -> 
     """Return the phantom of a seed, from the cache where it is there, made and kept otherwise.
 
     Args:
-        seed: as in `make_phantom`.
-        cache_dir: where phantoms are kept; `$ARMSCAN_CACHE`, or else the user's cache folder, where it is None.
-        version: as in `make_phantom`. Default: 1.
+        seed: Seed of everything drawn; see `make_phantom`.
+        cache_dir: Folder that keeps phantoms. None: `$ARMSCAN_CACHE`, or else the user's cache folder.
+        version: Version of the anatomy; see `make_phantom`. Default: 1.
 
     Returns:
         The same volume as `make_phantom(seed, version)`, its voxels in memory once for all processes.

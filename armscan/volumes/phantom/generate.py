@@ -67,15 +67,15 @@ def make_phantom(seed: int, version: int = 1) -> LabelVolume:
     """Make the phantom wrist of a seed, 360 x 800 x 80 voxels of 0.27 x 0.27 x 0.55 mm.
 
     Args:
-        seed: of everything drawn: anatomy, size, pose, left or right, stray voxels.
-        version: version of the anatomy, one of `VERSIONS`: 1, where the labelled plane lies at one place among bones
-            and tendons, or 2, where its place varies. Default: 1.
+        seed: Seed of everything drawn: anatomy, size, pose, side (left or right), stray voxels.
+        version: Version of the anatomy, one of `VERSIONS`. In version 1 the labelled plane lies at one place among
+            bones and tendons; in version 2 its place varies. Default: 1.
 
     Returns:
         The volume, named `phantom-SEED`, or `phantom-v2-SEED` in version 2, with its optimal plane.
 
     Raises:
-        InvalidValueError: if the seed is not a whole number from 0 to 2^31 - 1, or there is no such version.
+        InvalidValueError: If the seed is not a whole number from 0 to 2^31 - 1, or there is no such version.
     """
     name = phantom_name(seed, version)
     rng = np.random.default_rng(seed)
@@ -93,7 +93,7 @@ def phantom_name(seed: int, version: int) -> str:
     """Return the name of a phantom.
 
     Raises:
-        InvalidValueError: if the seed is not a whole number from 0 to 2^31 - 1, or there is no such version.
+        InvalidValueError: If the seed is not a whole number from 0 to 2^31 - 1, or there is no such version.
     """
     check_choice("version", version, tuple(VERSIONS))
     check_seed("seed", seed)

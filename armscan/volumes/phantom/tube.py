@@ -20,8 +20,8 @@ class Tube:
     """A stack of ellipses in the wrist's own frame, interpolated linearly between its nodes.
 
     Args:
-        label: label of its voxels.
-        nodes: shape (n, 5), each row (y, x, z, radius_x, radius_z) in mm, ordered by y.
+        label: Label of its voxels.
+        nodes: Nodes of the centre line, shape (n, 5), each (y, x, z, radius_x, radius_z) in mm, ordered by y.
     """
 
     label: int
@@ -99,12 +99,12 @@ def fill_tube(
     """Label the background voxels of a volume that lie in a tube.
 
     Args:
-        labels_xyz: the volume, changed in place; only voxels that are 0 are labelled.
-        spacing_mm: (sx, sy, sz).
-        matrix: 3 x 3 rotation from the wrist's frame into the volume's.
-        origin_mm: position of the wrist's origin in the volume, shape (3,).
-        nodes: as in `Tube`.
-        label: the label to write.
+        labels_xyz: Labels of the volume, changed in place; only voxels with 0 are labelled.
+        spacing_mm: Voxel spacing (sx, sy, sz) in mm.
+        matrix: Rotation from the wrist's frame into the volume's, shape (3, 3).
+        origin_mm: Position of the wrist's origin in the volume, in mm, shape (3,).
+        nodes: Nodes of the centre line, shape (n, 5); see `Tube`.
+        label: Label to write.
     """
     corner = np.empty(3)
     for segment in range(nodes.shape[0] - 1):
