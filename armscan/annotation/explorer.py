@@ -37,18 +37,18 @@ class Explorer:
     """A figure with the picture of a plane, a slider for each of its components, and buttons.
 
     Args:
-        volumes: volumes to explore, by name; at least one.
-        name: the volume to begin with.
-        tissues: clustering rule of each tissue.
+        volumes: Volumes to explore, by name, one or more.
+        name: Name of the first volume to show.
+        tissues: Clustering rule of each tissue.
 
     Attributes:
-        figure: Matplotlib's.
-        sliders: sliders of rz and rx in degrees, tx and ty in mm, by name.
-        volume: volume that is shown.
-        optimum: its optimal plane within the sliders' bounds, None where none is known.
-        plane: the current plane.
-        view: slice at the current plane, with its clusters.
-        rewards: rewards of the planes shown in this volume, the current one last.
+        figure: Matplotlib figure.
+        sliders: Sliders of rz and rx in degrees, tx and ty in mm, by name.
+        volume: Volume that is shown.
+        optimum: Optimal plane of the volume within the sliders' bounds; None if it is not known.
+        plane: The current plane.
+        view: Slice at the current plane, with its clusters.
+        rewards: Rewards of the planes shown in this volume, the current one last.
     """
 
     volume: LabelVolume
@@ -171,19 +171,19 @@ def explore(
     closed.
 
     Args:
-        volumes: a volume, several by name or in a sequence, or a folder, with a manifest or without; four phantoms
-            where it is None. They need no labelled plane.
-        volume: the name of the one to begin with; the first where it is None.
-        clustering: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
+        volumes: A volume, several volumes by name or in a sequence, or a folder with or without a manifest. They
+            require no labelled plane. None: four phantoms.
+        volume: Name of the first volume to show. None: the first one.
+        clustering: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
 
     Returns:
         The figure with its widgets; the figure keeps it for as long as it is open.
 
     Raises:
-        DisplayError: if no window can be opened.
-        InvalidValueError: if an argument is outside what is allowed.
-        VolumeError: if the folder or a file cannot be used.
-        ManifestError: if the folder's manifest is damaged.
+        DisplayError: If no window can be opened.
+        InvalidValueError: If an argument is outside what is allowed.
+        VolumeError: If the folder or a file cannot be used.
+        ManifestError: If the folder's manifest is damaged.
     """
     check_display()
     tissues = check_tissues(clustering)

@@ -31,14 +31,14 @@ class LabellingOptions:
     """Volumes to label, and options of the search.
 
     Args:
-        data: the folder of volumes.
-        tissues: clustering rule of each tissue.
-        volumes: only these, by file name; None for all.
-        overwrite: whether volumes that have a plane are labelled as well.
-        pictures: the folder for pictures, made where it is not there.
-        markups: whether a markups file for 3D Slicer is written beside each picture.
-        markup: a markups file with the plane of `volume`, to be taken instead of a search.
-        volume: the one volume to label, whether it has a plane or not.
+        data: Folder of the volumes.
+        tissues: Clustering rule of each tissue.
+        volumes: File names of the volumes to label. None: all.
+        overwrite: Whether to label volumes that already have a plane.
+        pictures: Folder for the pictures; created if it does not exist.
+        markups: Whether to write a markups file for 3D Slicer beside each picture.
+        markup: Markups file with the plane of `volume`, which is used instead of a search.
+        volume: Name of the only volume to label, even if it already has a plane.
     """
 
     data: Path

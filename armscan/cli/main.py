@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; a mistake of its user is answered in one line.
 
     Args:
-        arguments: of the command line. Default: those of this process.
+        arguments: Arguments of the command line. Default: those of this process.
 
     Returns:
         The exit code: 2 for a mistake, 130 for an interrupt, else the command's own.

@@ -55,8 +55,8 @@ class CommaSeparated(click.ParamType[tuple[str, ...]]):
     """Values separated by commas.
 
     Args:
-        metavar: placeholder of the value in the help text.
-        choices: the values allowed. Default: any but an empty one.
+        metavar: Placeholder of the value in the help text.
+        choices: Allowed values. Default: any but an empty one.
     """
 
     name = "list"

@@ -26,13 +26,13 @@ class TrainedAgent:
     """An agent to evaluate.
 
     Args:
-        name: name of the agent in tables and files.
-        config: resolved configuration, with the changes that were asked for.
-        run: run that it was trained in, None for an agent that no run is of.
-        weights: weights of a learner, None where it has kept none.
-        n_env_steps: environment steps that it was trained for.
-        domain: training domain, None for a run that has not kept it.
-        volumes: the fingerprints of its run's volumes, None where these were not kept.
+        name: Name of the agent in tables and files.
+        config: Resolved configuration, with the requested changes.
+        run: Run that trained it; None for an agent without a run.
+        weights: Weights of a learner; None if its run has kept none.
+        n_env_steps: Environment steps that it was trained for.
+        domain: Training domain; None if its run has not kept it.
+        volumes: Fingerprints of its run's volumes; None if the run has not kept them.
     """
 
     name: str
@@ -50,11 +50,11 @@ def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trus
     Args:
         tracking: MLflow tracking URI.
         run_id: MLflow run ID, or its first characters.
-        changes: changed rules, by the names in `CHANGES`.
-        trust: whether its configuration may name classes that are not armscan's; default: false.
+        changes: Changed rules, by the names in `CHANGES`.
+        trust: Whether its configuration may name classes that are not armscan's. Default: False.
 
     Raises:
-        ArmscanError: if there is no such run, it has kept too little, or what it has kept is damaged.
+        ArmscanError: If there is no such run, it has kept too little, or what it has kept is damaged.
     """
     run = load_run(tracking, run_id)
     if EVALUATED_TAG in run.tags:
@@ -72,9 +72,10 @@ def agent_of_overrides(words: Sequence[str], folder: str | None, changes: Mappin
     """Return the agent of a configuration, composed as `python -m armscan.run` composes it.
 
     Args:
-        words: overrides `key=value`, `agent=NAME` among them, and `data=nifti` where there is a folder.
-        folder: folder of the volumes that it is evaluated on, which are its own then; None: those of the configuration.
-        changes: changed rules, by the names in `CHANGES`.
+        words: Overrides `key=value`, with `agent=NAME`, and with `data=nifti` if there is a folder.
+        folder: Folder of the volumes to evaluate on, which also count as its own. None: the volumes of the
+            configuration.
+        changes: Changed rules, by the names in `CHANGES`.
     """
     config = compose(words)
     if folder:
@@ -88,7 +89,7 @@ def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
     """Return the configuration with changed rules, by the names in `CHANGES`.
 
     Raises:
-        InvalidValueError: if the configuration has no place for one, or lacks a section.
+        InvalidValueError: If the configuration has no place for one, or lacks a section.
     """
     check_sections(config)
     for name, value in changes.items():

@@ -44,10 +44,10 @@ class EvaluationReport:
     """An evaluation that has been played.
 
     Args:
-        evaluations: evaluations by what their volumes are called.
-        has_total: whether all of them are put together too; not where some volumes were trained on and others not.
-        facts: agent, data and settings of the evaluation, as plain values for the JSON file.
-        baselines: episodes of the baselines, by their names, then by what the volumes are called. Default: none.
+        evaluations: Evaluations by the name of their volumes, such as `test volumes`.
+        has_total: Whether to add up all evaluations too; False if the agent was trained on some of the volumes.
+        facts: Agent, data and settings of the evaluation, as plain values for the JSON file.
+        baselines: Episodes of the baselines, by their names, then by the name of the volumes. Default: none.
     """
 
     evaluations: Mapping[str, Evaluation]
@@ -135,8 +135,8 @@ def report_tables(report: EvaluationReport, width: int) -> list[Table | Text]:
     """Return what stands beside the tables of results: each volume of each group, and further figures.
 
     Args:
-        report: the report.
-        width: width of the terminal, in characters.
+        report: Report to show.
+        width: Width of the terminal, in characters.
     """
     parts: list[Table | Text] = []
     for label, volumes in report.by_volume.items():

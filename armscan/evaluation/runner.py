@@ -31,11 +31,11 @@ class PreparedAgent:
     """An agent that is ready to play on volumes.
 
     Args:
-        source: the agent's configuration and weights.
-        agent: the agent with its weights.
-        envs: its environments, by what their volumes are called.
-        notes: differences from its training, one sentence each.
-        data: the folder of the volumes, `phantom`, or None for the volumes of the agent's own configuration.
+        source: Configuration and weights of the agent.
+        agent: Agent with its weights.
+        envs: Environments by the name of their volumes.
+        notes: Differences from its training, one sentence each.
+        data: Folder of the volumes, `phantom`, or None for the volumes of the agent's own configuration.
     """
 
     source: TrainedAgent
@@ -50,9 +50,9 @@ class PreparedAgent:
         """Play episodes, `n_episodes` for each environment, in turn on its volumes.
 
         Args:
-            n_episodes: number of episodes.
-            seed: seed of the first episode; the others follow from it.
-            tell: hears how it goes. Default: nobody does.
+            n_episodes: Number of episodes.
+            seed: Seed of the first episode; the others follow from it.
+            tell: Function that receives the progress. Default: none.
 
         Returns:
             The episodes by what their volumes are called, and those of each baseline by its name.
@@ -80,14 +80,14 @@ def apply(
     """Bring an agent to volumes, and print what differs from its training.
 
     Args:
-        source: the agent.
-        data: a folder of volumes, `phantom`, or None for the volumes of the agent's own configuration.
-        n_phantoms: number of phantoms, at least 1; used for `phantom` only.
-        check: raises an error if the volumes, by their labels, do not suit the caller.
-        render_mode: Gymnasium render mode of the environments; default: None.
+        source: Agent to apply.
+        data: Folder of volumes, `phantom`, or None for the volumes of the agent's own configuration.
+        n_phantoms: Number of phantoms, 1 or more; used for `phantom` only.
+        check: Function that raises an error if the volumes, by their labels, do not suit the caller.
+        render_mode: Gymnasium render mode of the environments. Default: None.
 
     Raises:
-        ArmscanError: if volumes are missing or damaged, or the agent cannot be applied to them.
+        ArmscanError: If volumes are missing or damaged, or the agent cannot be applied to them.
     """
     # Elsewhere, of an agent's own volumes only those matter that its reward is fitted to.
     parts = ("training",) if data else PARTS
@@ -111,13 +111,13 @@ def prepare(
     """Make the agent and its environments on the volumes that it is evaluated on.
 
     Args:
-        source: the agent's configuration and weights.
-        groups: the volumes, by what they are called.
-        own: reads the agent's own volumes; called only where its reward is fitted to those that it was trained on.
-        render_mode: Gymnasium render mode of the environments; default: None.
+        source: Configuration and weights of the agent.
+        groups: Volumes by the name of their group.
+        own: Function that reads the agent's own volumes; called only if its reward is fitted to its training volumes.
+        render_mode: Gymnasium render mode of the environments. Default: None.
 
     Raises:
-        ArmscanError: if the agent cannot be applied to the volumes; the reason is said.
+        ArmscanError: If the agent cannot be applied to the volumes; the reason is said.
     """
     envs: dict[str, Env] = {}
     notes: list[str] = []

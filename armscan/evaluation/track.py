@@ -35,18 +35,18 @@ def evaluate_and_track(
     """Evaluate an agent, write the report as JSON, and track it.
 
     Args:
-        applied: the agent on its volumes.
-        store: the config section `tracking`; used for an agent without a run.
-        n_episodes: number of episodes for each group of volumes.
-        seed: seed of the first episode; the others follow from it.
-        changes: rules of the episodes that differ from the agent's configuration.
-        out: the JSON file. Default: a new one in `evaluations`.
+        applied: Agent on its volumes.
+        store: Config section `tracking`; used for an agent without a run.
+        n_episodes: Number of episodes for each group of volumes.
+        seed: Seed of the first episode; the others follow from it.
+        changes: Rules of the episodes that differ from the agent's configuration.
+        out: JSON file to write. Default: a new one in `evaluations`.
 
     Returns:
         The report, and its JSON file.
 
     Raises:
-        ArmscanError: if the report cannot be written or tracked.
+        ArmscanError: If the report cannot be written or tracked.
     """
     source = applied.source
     _check_out(out)

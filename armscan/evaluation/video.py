@@ -20,10 +20,10 @@ def record_video(applied: PreparedAgent, *, n_episodes: int, seed: int, out: Pat
     """Record the episodes that an evaluation with the same seed plays, and print how each went.
 
     Args:
-        applied: the agent on its volumes; of its own volumes, only the test volumes are shown.
-        n_episodes: number of episodes for each group of volumes.
-        seed: seed of the first episode; the others follow from it.
-        out: the folder of the files. Default: `videos`.
+        applied: Agent on its volumes; of its own volumes, only the test volumes are shown.
+        n_episodes: Number of episodes for each group of volumes.
+        seed: Seed of the first episode; the others follow from it.
+        out: Folder of the files. Default: `videos`.
 
     Returns:
         The GIF and the MP4.

@@ -27,12 +27,12 @@ def own_split(source: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
     """Read an agent's own volumes: those that its configuration describes.
 
     Args:
-        source: the agent.
-        parts: parts of the split that matter: in these the volumes of a run must be those that it was started with.
+        source: Agent whose volumes are read.
+        parts: Parts of the split in which the volumes must be those that the run was started with.
 
     Raises:
-        ChangedVolumesError: if they are not.
-        InvalidValueError: if they cannot be read.
+        ChangedVolumesError: If they are not.
+        InvalidValueError: If they cannot be read.
     """
     run = source.run
     try:
@@ -56,9 +56,9 @@ def volume_groups(data: str | None, n_phantoms: int, own: Callable[[], Split]) -
     """Return the volumes to evaluate on, by group name.
 
     Args:
-        data: a folder, `phantom` for phantoms that no run trains on, None for the agent's own volumes.
-        n_phantoms: number of phantoms.
-        own: reads the agent's own volumes.
+        data: Folder, `phantom` for phantoms that no run trains on, or None for the agent's own volumes.
+        n_phantoms: Number of phantoms.
+        own: Function that reads the agent's own volumes.
     """
     if data is None:
         split = own()
@@ -84,7 +84,7 @@ def check_out(file: Path, out: Path | None, what: str) -> None:
     """Write where a file will lie, before the agent plays for hours.
 
     Raises:
-        InvalidValueError: if none can be written there; it names `--out` and `what` would be written.
+        InvalidValueError: If none can be written there; it names `--out` and `what` would be written.
     """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -98,8 +98,8 @@ def known_volumes(source: TrainedAgent, groups: Mapping[str, Volumes]) -> list[s
     """Return a sentence for each purpose that an agent's run has had these volumes for, or others of these names.
 
     Args:
-        source: the agent of a run.
-        groups: the volumes, by what they are called.
+        source: Agent of a run.
+        groups: Volumes by the name of their group.
     """
     assert source.run is not None
     volumes = {name: volume for group in groups.values() for name, volume in group.items()}

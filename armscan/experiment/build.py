@@ -44,16 +44,16 @@ class Experiment:
     """An experiment, built from its configuration.
 
     Args:
-        split: the volumes.
-        env_factory: makes environments, with the reward fitted to the training volumes.
-        agent: the agent, which may be a learner.
-        budget: the training's budget.
-        n_episodes: number of episodes of each final evaluation.
-        on_plane: limits within which a plane counts as the labelled one.
-        seed: seed of everything that is drawn.
-        smallest_slice_px: shape (across, depth) that the slices of all volumes have at least; images are cropped to it
-            by default, in every split.
-        needs_trust: whether its configuration names classes that are not armscan's.
+        split: Volumes by split.
+        env_factory: Factory of environments, with the reward fitted to the training volumes.
+        agent: Agent, which may be a learner.
+        budget: Budget of the training.
+        n_episodes: Number of episodes of each final evaluation.
+        on_plane: Limits within which a plane counts as the labelled one.
+        seed: Seed of all random numbers.
+        smallest_slice_px: Smallest slice (across, depth) of all volumes in pixels; images of every split are cropped to
+            it by default.
+        needs_trust: Whether its configuration names classes that are not armscan's.
     """
 
     split: Split
@@ -100,7 +100,7 @@ def set_up(config: DictConfig) -> Experiment:
     """Build an experiment with the environments of its evaluations, and check them, before tracking starts.
 
     Raises:
-        InvalidValueError: if something in it is not allowed, or the agent cannot act in one of the environments.
+        InvalidValueError: If something in it is not allowed, or the agent cannot act in one of the environments.
     """
     silence_library_warnings()
     experiment = build_experiment(config)
@@ -149,8 +149,8 @@ def check_words(config: DictConfig) -> None:
     """Check all that can be checked before a volume is read or a library of learning is loaded.
 
     Raises:
-        InvalidValueError: if a value is not allowed.
-        MissingMandatoryValue: if one that must be given is not.
+        InvalidValueError: If a value is not allowed.
+        MissingMandatoryValue: If one that must be given is not.
     """
     check_sections(config)
     to_plain(config)
@@ -204,12 +204,12 @@ def make_agent(
     """Return the agent, which has learned nothing yet, for environments on these volumes.
 
     Args:
-        config: the composed configuration.
-        env_factory: makes its environments.
-        volumes: the volumes that it learns on.
-        total_env_steps: budget of its training in environment steps.
-        seed: seed of everything that it draws.
-        validation: validation volumes of its training; None, the default, where it learns nothing.
+        config: Composed configuration.
+        env_factory: Factory of its environments.
+        volumes: Volumes to learn on.
+        total_env_steps: Budget of its training, in environment steps.
+        seed: Seed of all its random numbers.
+        validation: Validation volumes of its training. Default: None, for an agent that does not learn.
     """
     algorithm = make_algorithm(config)
     env = env_factory.make_env(dict(volumes))
@@ -241,7 +241,7 @@ def make_algorithm(config: DictConfig) -> Algorithm:
     """Return the algorithm that makes the agent.
 
     Raises:
-        InvalidValueError: if the section `agent` describes none, or a hyperparameter is not allowed.
+        InvalidValueError: If the section `agent` describes none, or a hyperparameter is not allowed.
     """
     algorithm: Algorithm = instantiate(config.agent, _convert_="object")
     if not callable(getattr(algorithm, "agent", None)):

@@ -20,10 +20,10 @@ def print_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, ho
     """Print a table of results, as it fits the terminal.
 
     Args:
-        title: line above it.
-        table: the table.
-        notes: what has to be said of it, a sentence each. Default: nothing.
-        how: whether to say how its figures are made. Default: true.
+        title: Line above the table.
+        table: Table to print.
+        notes: Notes below the table, one sentence each. Default: none.
+        how: Whether to explain how its figures are computed. Default: True.
     """
     console = wide_console()
     console.print(Text(title, style="italic"))
@@ -44,7 +44,7 @@ def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -
     """Print the table of a multirun's jobs, and return it.
 
     Args:
-        outcomes: outcome of each job, by its number.
+        outcomes: Outcome of each job, by its number.
         run_ids: MLflow run ID of each job that started a run, by its number.
     """
     table = jobs_table(outcomes, run_ids)
@@ -81,10 +81,10 @@ def print_where_to_look(
     """Print where the results lie, and the command that opens the UI over all runs.
 
     Args:
-        folder: folder of the run or multirun.
+        folder: Folder of the run or multirun.
         tracking_uri: MLflow tracking URI.
-        storage: Optuna storage of the study; default: None, no study.
-        files: what is worth looking at in the folder; the folder itself where none is named.
+        storage: Optuna storage of the study. Default: None, no study.
+        files: Files worth looking at, relative to the folder; the folder itself if there are none.
     """
     for file in files:
         print(f"look at   {from_here(folder / file)}")

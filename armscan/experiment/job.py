@@ -34,10 +34,10 @@ class JobOutcome:
     """The outcome of a job.
 
     Args:
-        overrides: all of its overrides.
-        varied: overrides that differ from those of the other jobs.
-        failure: why it failed, None where it did not.
-        metrics: of its evaluations, by the name of their volumes.
+        overrides: All overrides of the job.
+        varied: Overrides that differ from those of the other jobs.
+        failure: Reason of its failure; None if it succeeded.
+        metrics: Metrics of its evaluations, by the name of their volumes.
     """
 
     overrides: str
@@ -51,12 +51,12 @@ class Job:
     """One job of a multirun, as its own process sees it.
 
     Args:
-        number: its number, from 0.
-        overrides: all of its overrides, as one would write them to run it alone.
-        varied: overrides that differ from those of the other jobs.
-        parent_run_id: MLflow run ID of the run that its run is a child of.
-        folder: the multirun's folder.
-        is_repeated: whether it need not run if it has finished before. Default: False.
+        number: Number of the job, from 0.
+        overrides: All overrides of the job, as one would type them to run it alone.
+        varied: Overrides that differ from those of the other jobs.
+        parent_run_id: MLflow run ID of its parent run.
+        folder: Folder of the multirun.
+        is_repeated: Whether to skip it if it has finished before. Default: False.
     """
 
     number: int
@@ -98,11 +98,11 @@ class Invocation:
     """How a run was asked for.
 
     Args:
-        folder: where it leaves its files.
-        overrides: overrides on the command line.
-        command: the command line; of a job, that which repeats it alone.
-        choices: what was chosen of each configuration group.
-        job: which job of a multirun it is; None for a single run.
+        folder: Folder that takes the run's files.
+        overrides: Overrides on the command line.
+        command: Command line; for a job, the one that repeats it alone.
+        choices: Choice of each configuration group.
+        job: Job of a multirun; None for a single run.
     """
 
     folder: Path

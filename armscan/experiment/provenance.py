@@ -57,11 +57,11 @@ def start_tracking(
     What an earlier run has made in the folder is replaced; `check_free` has found that it is a run's.
 
     Args:
-        config: the composed configuration.
-        invocation: command line, overrides and folder of the run.
-        setup: objects built from the configuration.
-        tags: tags of the run beside the usual ones. Default: none.
-        retry_s: seconds to wait for a store that is away. Default: None, it is not waited for.
+        config: Composed configuration.
+        invocation: Command line, overrides and folder of the run.
+        setup: Objects built from the configuration.
+        tags: Further tags of the run. Default: none.
+        retry_s: Seconds to wait for an unavailable store. Default: None, no waiting.
     """
     resolved = to_plain(config)
     client, experiment_id = open_store(**resolved["tracking"], retry_s=retry_s)

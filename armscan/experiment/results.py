@@ -49,10 +49,10 @@ class RunResult:
     """Results of a run.
 
     Args:
-        evaluations: final evaluations of the agent, by the names of their volumes.
-        baselines: episodes of the baselines on the test volumes, by their names.
-        validation: validation of the best epoch; None for an agent that does not learn.
-        own_baseline: name of the baseline that the agent itself is. Default: None, it is another.
+        evaluations: Final evaluations of the agent, by the names of their volumes.
+        baselines: Episodes of the baselines on the test volumes, by their names.
+        validation: Validation of the best epoch; None for an agent that does not learn.
+        own_baseline: Name of the baseline that equals the agent. Default: None, no baseline does.
     """
 
     evaluations: Mapping[str, Evaluation]
@@ -65,8 +65,8 @@ class RunResult:
         """Play the final evaluations of a setup's agent, and the baselines on its test volumes.
 
         Args:
-            setup: the experiment, its agent with the weights that are judged.
-            result: result of the training; None for an agent that does not learn.
+            setup: Experiment, whose agent has the weights to evaluate.
+            result: Result of the training; None for an agent that does not learn.
         """
         agent, seed, n_episodes, on_plane = setup.agent, setup.seed, setup.n_episodes, setup.on_plane
         first_seeds = {TRAINING: TRAINING_VOLUMES_SEED + seed, TEST: TEST_VOLUMES_SEED + seed}
@@ -124,7 +124,7 @@ def figures_of(metrics: Mapping[str, float]) -> dict[str, MetricEstimates]:
     """Return the figures that a run has tracked, by the names of the agent's volumes and of the baselines.
 
     Args:
-        metrics: metrics of the run; of evaluated groups, those of single volumes are left out.
+        metrics: Metrics of the run, by name; those of single volumes are left out.
     """
     evaluated = (name.removesuffix(EVALUATED) for name in metrics if name.endswith(EVALUATED))
     return {
@@ -140,8 +140,8 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
     """Return what has to be said of a result's volumes: intervals that do not overlap, or too few volumes.
 
     Args:
-        test: figures on the test volumes.
-        validation: those on the validation volumes. Default: None, nothing was validated.
+        test: Metrics on the test volumes.
+        validation: Metrics on the validation volumes. Default: None, not validated.
     """
     if validation is not None:
         leading = test.on_plane[0]

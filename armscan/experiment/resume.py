@@ -46,13 +46,13 @@ def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -
     """Resume the run that a command line names.
 
     Args:
-        words: overrides on the command line.
-        repeat_grid: runs what has not finished of the grid that its words describe.
+        words: Overrides on the command line.
+        repeat_grid: Function that runs the unfinished jobs of the grid that its words describe.
 
     Raises:
-        InvalidValueError: if the words say anything else.
-        UntrustedError: if it would execute code of others, and the words have no `--trust`.
-        ArmscanError: if there is no such run, it is still going on, or its checkpoint or volumes are not its own.
+        InvalidValueError: If the words say anything else.
+        UntrustedError: If it would execute code of others, and the words have no `--trust`.
+        ArmscanError: If there is no such run, it is still going on, or its checkpoint or volumes are not its own.
     """
     trust = TRUST in words
     wanted, uri = _read([word for word in words if word != TRUST])

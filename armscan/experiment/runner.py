@@ -72,12 +72,12 @@ def run_tracked(
     """Train, evaluate and print results in a tracked run.
 
     Args:
-        setup: the experiment.
-        tracked: its run.
-        folder: where it leaves its files.
+        setup: Experiment to run.
+        tracked: Run that tracks it.
+        folder: Folder that takes the run's files.
         tracking_uri: MLflow tracking URI.
-        job_label: prefix of the printed lines of a multirun's job. Default: None, a single run.
-        earlier: epochs before the interruption of a resumed training. Default: none.
+        job_label: Prefix of the printed lines of a multirun's job. Default: None, a single run.
+        earlier: Epochs before the interruption of a resumed training. Default: none.
 
     Returns:
         The metrics of the final evaluations, by the name of their volumes.
@@ -154,11 +154,11 @@ def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: Ru
     """Log the final figures, and keep what the run has made in its folder.
 
     Args:
-        tracked: the run.
-        result: the training's; figures are logged at its best epoch, whose weights they judge. None where there was
-            nothing to learn.
-        reached: the final evaluations, and the baselines.
-        folder: the run's folder; the learning curve's picture, the episodes and the table are added to it.
+        tracked: Run to log to.
+        result: Result of the training. Figures are logged at its best epoch, whose weights they evaluate. None if there
+            was nothing to learn.
+        reached: Final evaluations, and the baselines.
+        folder: Folder of the run, which gets the picture of the learning curve, the episodes and the table.
     """
     for name, metrics in reached.metrics().items():
         figures = {f"{name.replace(' ', '_')}/{figure}": value for figure, value in metrics.items()}

@@ -22,8 +22,8 @@ def with_folds(words: Sequence[str]) -> list[str]:
     What else a grid varies, such as `seed=0,1,2`, stays.
 
     Raises:
-        InvalidValueError: if there are no such folds.
-        ArmscanError: if the folder of the volumes cannot be read.
+        InvalidValueError: If there are no such folds.
+        ArmscanError: If the folder of the volumes cannot be read.
     """
     overrides = [word for word in words if not word.startswith("-")]
     options = [word for word in words if word.startswith("-")]

@@ -30,7 +30,7 @@ def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
     Every subject is tested on once for each seed, so that intervals draw wrists, as those of one run do.
 
     Args:
-        runs: folder of each run, and the overrides in which it differs from the others.
+        runs: Folder of each run, and its overrides that differ from those of the others.
     """
     tested: dict[str, dict[str, list[Evaluation]]] = {}
     for folder, varied in runs:
@@ -65,7 +65,7 @@ def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: s
     """Keep the table of all folds in the grid's folder, and with its figures in the grid's run.
 
     Raises:
-        TrackingError: if the store is away.
+        TrackingError: If the store is away.
     """
     from mlflow.entities import Metric
 

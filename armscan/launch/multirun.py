@@ -106,7 +106,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     """Close the parent run and print the outcomes of the jobs.
 
     Args:
-        is_interrupted: whether somebody stopped the multirun.
+        is_interrupted: Whether the multirun was interrupted.
 
     Returns:
         The exit code: 0 where every job succeeded, or where this was no multirun; 1 otherwise.

@@ -20,14 +20,14 @@ class Difference:
     """How one metric differs between two runs.
 
     Args:
-        metric: its name.
-        n_points: number of steps at which both runs have it.
-        n_missing: number of steps at which only the first has it.
-        n_new: number of steps at which only the second has it; the first may have been interrupted.
-        largest: largest absolute difference, 0 if all points are equal. Default: None, no points in common.
-        at_step: environment step of the largest difference. Default: None.
-        then: value there in the first run. Default: None.
-        now: value there in the second run. Default: None.
+        metric: Name of the metric.
+        n_points: Number of steps at which both runs have it.
+        n_missing: Number of steps at which only the first has it.
+        n_new: Number of steps at which only the second has it; the first may have been interrupted.
+        largest: Largest absolute difference, 0 if all points are equal. Default: None, no points in common.
+        at_step: Environment step of the largest difference. Default: None.
+        then: Value at that step in the first run. Default: None.
+        now: Value at that step in the second run. Default: None.
     """
 
     metric: str

@@ -30,8 +30,8 @@ class Card:
     """Model card of a policy.
 
     Args:
-        text: Markdown.
-        tags: figures by their names.
+        text: Text of the card, in Markdown.
+        tags: Figures by their names.
     """
 
     text: str
@@ -42,11 +42,11 @@ class Card:
         """Return the card of a run's policy, of its own evaluation and the latest by `armscan evaluate` with a JSON.
 
         Args:
-            run: the run.
-            folder: takes the files.
+            run: Run to describe.
+            folder: Folder that takes the files.
 
         Raises:
-            TrackingError: if an evaluation cannot be read.
+            TrackingError: If an evaluation cannot be read.
         """
         text = f"The policy of run `{run.run_id}`, {run.name}."
         reports = _reports(run, folder)

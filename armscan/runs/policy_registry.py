@@ -37,11 +37,11 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
     Args:
         tracking: MLflow tracking URI.
         run_id: MLflow run ID, or its first characters.
-        folder: folder of the model.
-        trust: whether its configuration may name classes that are not armscan's; default: false.
+        folder: Folder of the model.
+        trust: Whether its configuration may name classes that are not armscan's. Default: False.
 
     Raises:
-        ArmscanError: if there is no such run, its agent does not learn, or its checkpoint or volumes are missing.
+        ArmscanError: If there is no such run, its agent does not learn, or its checkpoint or volumes are missing.
     """
     source = agent_of_run(tracking, run_id, {}, trust=trust)
     assert source.run is not None
@@ -64,15 +64,15 @@ def register_policy(tracking: str, run_id: str, name: str, *, trust: bool = Fals
     Args:
         tracking: MLflow tracking URI, whose model registry is used.
         run_id: MLflow run ID, or its first characters.
-        name: name of the registered model, which is created if it does not exist.
-        trust: whether its configuration may name classes that are not armscan's, if its policy is exported; default:
-            false.
+        name: Name of the registered model; created if it does not exist.
+        trust: Whether its configuration may name classes that are not armscan's, if the policy must be exported.
+            Default: False.
 
     Returns:
         The URI of the new version, `models:/NAME/VERSION`.
 
     Raises:
-        ArmscanError: if the name is not allowed, or the run's policy is missing, damaged or has been replaced.
+        ArmscanError: If the name is not allowed, or the run's policy is missing, damaged or has been replaced.
     """
     _check_name(name)
     run = load_run(tracking, run_id)

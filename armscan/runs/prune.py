@@ -26,9 +26,9 @@ class PruneItem:
     """Files of a run that are to be removed, or the reason why they stay.
 
     Args:
-        run: the run.
-        n_bytes: disk space that their removal frees, in bytes.
-        left: why they stay; None if they do not.
+        run: Run whose files would be removed.
+        n_bytes: Disk space that their removal frees, in bytes.
+        left: Reason why they stay; None if they do not.
     """
 
     run: Run
@@ -60,8 +60,8 @@ def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
         Why the folder stays; None if it is gone, or was to stay.
 
     Raises:
-        RunSkippedError: if the files must be left as they are now; nothing has been touched.
-        OSError: if a file cannot be removed.
+        RunSkippedError: If the files must be left as they are now; nothing has been touched.
+        OSError: If a file cannot be removed.
     """
     run_id, parent_id = item.run.info.run_id, item.run.data.tags.get(PARENT_TAG, "")
     folder = OwnFolder.of(item.run)

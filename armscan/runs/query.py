@@ -33,20 +33,20 @@ def find(
     """Return the runs of a store that fit all that is given, in no order. Default: all runs.
 
     Args:
-        client: the store.
-        experiment: name of their MLflow experiment.
-        parent: MLflow run ID of the run that they are children of, or its first characters.
-        status: allowed statuses, in lower case.
-        agent: names of allowed agents.
-        obs: names of allowed observations.
-        projection: allowed projections, names separated by commas or a list of components in brackets.
-        since: earliest start.
-        before: time before which they were started.
+        client: Client of the store.
+        experiment: Name of the MLflow experiment.
+        parent: MLflow run ID of the parent run, or its first characters.
+        status: Allowed statuses, in lower case.
+        agent: Names of allowed agents.
+        obs: Names of allowed observations.
+        projection: Allowed projections: names separated by commas, or a list of components in brackets.
+        since: Earliest start, inclusive.
+        before: Latest start, exclusive.
         where: MLflow filter string.
 
     Raises:
-        InvalidValueError: if there is no such experiment, or MLflow does not take the filter.
-        TrackingError: if there is no such parent.
+        InvalidValueError: If there is no such experiment, or MLflow does not take the filter.
+        TrackingError: If there is no such parent.
     """
     experiments = experiment_ids(client, experiment)
     conditions = [

@@ -36,10 +36,10 @@ class Original:
     """A run that is to be made again.
 
     Args:
-        run: the run, as it is tracked.
-        config: the configuration that it was started with, its files named from anywhere.
-        setup: the experiment that it describes, on the volumes that it was started with.
-        environment: versions of what it was computed with; None if they were not kept.
+        run: Tracked run.
+        config: Configuration that it was started with, with absolute paths of files.
+        setup: Experiment that the configuration describes, on the volumes that the run was started with.
+        environment: Versions that it was computed with; None if they were not kept.
     """
 
     run: FoundRun
@@ -52,7 +52,7 @@ def load_original(tracking: str, run_id: str, *, trust: bool = False) -> Origina
     """Return a tracked run, ready to be made again.
 
     Raises:
-        ArmscanError: if there is no such run, it is none of `armscan run`, it has not ended, what it has kept is gone
+        ArmscanError: If there is no such run, it is none of `armscan run`, it has not ended, what it has kept is gone
             or was changed, or its volumes are not those any more that it was started with.
     """
     run = load_run(tracking, run_id)
@@ -120,9 +120,9 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
     """Make a run again, and compare what came of it.
 
     Args:
-        original: the run.
-        folder: takes the files of the new one; made where there is none.
-        differing: see `differences`; kept with the new run.
+        original: Run to reproduce.
+        folder: Folder of the new run; created if it does not exist.
+        differing: Differences that `differences` found; kept with the new run.
 
     Returns:
         All metrics but those of time and machine, compared.

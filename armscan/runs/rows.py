@@ -54,12 +54,11 @@ class RunRow:
     """A run of a list.
 
     Args:
-        client: the run's store, asked for sizes when they are needed.
-        run: the run.
-        children: rows of the runs that it has called forth, as far as they are meant, the earliest first. Default:
-            none.
-        depth: 0 where it stands by itself, 1 for a child that is shown below its parent, and so on. Default: 0.
-        is_folded: whether its sizes include those of the runs below it. Default: true.
+        client: Client of the run's store, which gives sizes when they are needed.
+        run: Run of the row.
+        children: Rows of the selected runs that it started, the earliest first. Default: none.
+        depth: Level below the topmost run, 0 or more; 1 for a child shown below its parent. Default: 0.
+        is_folded: Whether its sizes include those of the runs below it. Default: True.
     """
 
     client: TrackingStore = field(repr=False)

@@ -50,7 +50,7 @@ class OwnFolder:
         """Return the folder of a run.
 
         Raises:
-            RunSkippedError: if there is none on this machine, or it is not certain that it is the run's.
+            RunSkippedError: If there is none on this machine, or it is not certain that it is the run's.
         """
         path = _noted(run)
         config = path / CONFIG_FILE
@@ -98,10 +98,10 @@ class OwnFolder:
         """Context in which no other process works in the folder or delivers from it.
 
         Args:
-            is_planned: whether nothing is touched yet: what nobody has ever locked is not locked.
+            is_planned: Whether the removal is only planned: a folder that was never locked is not locked then.
 
         Raises:
-            RunSkippedError: if another process is at work there, or something is not delivered.
+            RunSkippedError: If another process is at work there, or something is not delivered.
         """
         outbox = file_of(self.path, self.run_id)
         with contextlib.ExitStack() as stack:

@@ -19,8 +19,8 @@ class Target:
     """A trial or a study.
 
     Args:
-        study: name of the study.
-        trial: number of the trial; None for the whole study.
+        study: Name of the study.
+        trial: Number of the trial; None for the whole study.
     """
 
     study: str
@@ -31,7 +31,7 @@ def target_of(run: Run) -> Target | None:
     """Return the trial or the study that a run is of; None if it is of none.
 
     Raises:
-        TrackingError: if its tag is no number of a trial.
+        TrackingError: If its tag is no number of a trial.
     """
     tags = run.data.tags
     if STUDY_TAG not in tags:
@@ -46,7 +46,7 @@ def interrupt(run: Run) -> str:
     """Interrupt the process of a run that is of no study, as Ctrl-C does; returns what will happen, in one line.
 
     Raises:
-        TrackingError: if it is not running on this machine.
+        TrackingError: If it is not running on this machine.
     """
     run_id, note = run.info.run_id, Note.of(run.info.run_id)
     if run.info.status != "RUNNING":

@@ -44,9 +44,9 @@ def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
     """Return the mean over seeds and volumes, with an interval that draws seeds, each with all its volumes.
 
     Args:
-        scores: scores, shape (seeds, volumes).
-        mean: function that aggregates the values, such as `numpy.mean`.
-        seed: seed of the resamples; default: 0.
+        scores: Scores, shape (seeds, volumes).
+        mean: Function that aggregates the values, such as `numpy.mean`.
+        seed: Seed of the resamples. Default: 0.
 
     Returns:
         The estimate, without an interval where there is one seed or a score is NaN.
@@ -62,8 +62,8 @@ def band_over_seeds(scores: FloatArray, mean: Mean) -> Band:
     """Return the mean over the seeds at each point, with an interval; a resample has the same seeds at all points.
 
     Args:
-        scores: scores, shape (seeds, points), all finite.
-        mean: function that aggregates the values over an axis, such as `numpy.mean`.
+        scores: Scores, shape (seeds, points), all finite.
+        mean: Function that aggregates the values over an axis, such as `numpy.mean`.
 
     Returns:
         The band, without an interval where there is one seed.
@@ -83,14 +83,14 @@ def probability_of_improvement(ours: FloatArray, theirs: FloatArray) -> Estimate
     interval draws each seed with all its volumes, because one training was judged on all of them.
 
     Args:
-        ours: our scores, shape (seeds, volumes), greater is better, all finite.
-        theirs: their scores, shape (seeds, the same volumes).
+        ours: Our scores, shape (seeds, volumes), greater is better, all finite.
+        theirs: Their scores, shape (seeds, the same volumes).
 
     Returns:
         The estimate, without an interval where either has one seed.
 
     Raises:
-        InvalidValueError: if the volumes are not as many.
+        InvalidValueError: If the volumes are not as many.
     """
     if ours.shape[1:] != theirs.shape[1:]:
         raise InvalidValueError(

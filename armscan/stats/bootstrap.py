@@ -84,13 +84,13 @@ def estimates(
     """Return figures with their intervals, by name; all of them from the same resamples.
 
     Args:
-        columns: by the name of each figure its statistic and the value of each episode, NaN for those left out.
-        volumes: volume of each episode.
-        trainings: training of each episode; None if all are of one.
-        seed: seed of the resampling; the same one gives the same intervals.
+        columns: Statistic and values of each figure, by its name; a value for each episode, NaN for those left out.
+        volumes: Volume of each episode.
+        trainings: Training of each episode; None if all are from one.
+        seed: Seed of the resampling; the same seed gives the same intervals.
 
     Raises:
-        InvalidValueError: if a column has another length than `volumes`, or there is no episode.
+        InvalidValueError: If a column has another length than `volumes`, or there is no episode.
     """
     trainings = [None] * len(volumes) if trainings is None else trainings
     lengths = {len(trainings), *(len(values) for _, values in columns.values())}

@@ -18,8 +18,8 @@ class OnPlane(NamedTuple):
     """Limits within which a plane counts as the labelled one, both ends included.
 
     Args:
-        mm: largest distance of the slice's centre along the labelled normal, in mm, above 0.
-        deg: largest angle between the normals, in degrees, above 0.
+        mm: Largest distance of the slice's centre along the labelled normal, in mm, above 0.
+        deg: Largest angle between the normals, in degrees, above 0.
     """
 
     mm: float
@@ -54,11 +54,11 @@ def check_on_plane(name: str, limits: object) -> tuple[OnPlane, ...]:
     """Return limits that were given as pairs, the first of which leads.
 
     Args:
-        name: what an error calls them, such as `evaluation.on_plane`.
-        limits: pairs of mm and degrees.
+        name: Name of the limits in an error, such as `evaluation.on_plane`.
+        limits: Pairs of mm and degrees.
 
     Raises:
-        InvalidValueError: if they are no list, empty, or a pair is none, not above 0, or there twice.
+        InvalidValueError: If they are no list, empty, or a pair is none, not above 0, or there twice.
     """
     if not isinstance(limits, Sequence) or isinstance(limits, str) or not limits:
         raise InvalidValueError(f"{name} is {limits!r}, but it must be {WANTED}")

@@ -35,10 +35,10 @@ def evaluate_baselines(
     """Return the episodes of the baselines, by their names: `random` and, where one component is free, a sweep.
 
     Args:
-        env: environment of the volumes.
-        n_episodes: number of episodes, in turn on the volumes.
-        seed: seed of the first episode; the others follow from it.
-        on_plane: limits within which a plane counts as the labelled one. Default: those of `Evaluation`.
+        env: Environment of the volumes.
+        n_episodes: Number of episodes, in turn on the volumes.
+        seed: Seed of the first episode; the others follow from it.
+        on_plane: Limits within which a plane counts as the labelled one. Default: those of `Evaluation`.
     """
     names = tuple(env.get_wrapper_attr("action_names"))
     agents: dict[str, Agent] = {RANDOM: RandomAgent(len(names))}

@@ -14,12 +14,12 @@ class EpochReport:
     """Report at the end of an epoch.
 
     Args:
-        epoch: number of the epoch, from 1.
-        n_env_steps: environment steps taken so far.
-        wall_s: seconds of training so far; the time between an interruption and a resumption is none.
-        metrics: means of the epoch's training, by name.
-        evaluation: evaluation on the validation volumes.
-        is_best: whether no epoch before was as good.
+        epoch: Number of the epoch, from 1.
+        n_env_steps: Environment steps taken so far.
+        wall_s: Seconds of training so far, without the time between an interruption and a resumption.
+        metrics: Means of the epoch's training metrics, by name.
+        evaluation: Evaluation on the validation volumes.
+        is_best: Whether no earlier epoch was as good.
     """
 
     epoch: int
@@ -37,8 +37,8 @@ class Callback(Protocol):
         """Handle the start, called once before the first step.
 
         Args:
-            total_env_steps: environment steps that training may take.
-            earlier: epochs before the interruption of a resumed training; they may be reported a second time.
+            total_env_steps: Environment steps that training may take.
+            earlier: Epochs before the interruption of a resumed training; they may be reported a second time.
         """
 
     def on_epoch(self, report: EpochReport) -> None:

@@ -23,9 +23,9 @@ def save_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) ->
     """Write a checkpoint; a reader sees the old one or the new one, never half of one.
 
     Args:
-        path: place of the file.
-        state: state of the learner.
-        facts: numbers and texts about it, such as how many steps it has taken.
+        path: Place of the file.
+        state: State of the learner.
+        facts: Numbers and texts to keep beside the state, such as the number of steps.
     """
     import torch
 
@@ -50,7 +50,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         The learner's state, and the facts beside it.
 
     Raises:
-        CheckpointError: if the file is missing, damaged, of a newer armscan, or something else.
+        CheckpointError: If the file is missing, damaged, of a newer armscan, or something else.
     """
     import torch
 
@@ -78,7 +78,7 @@ def load_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         The weights by name, and the facts beside them.
 
     Raises:
-        CheckpointError: as `load_checkpoint` does, or if it holds something else, or weights that are not finite.
+        CheckpointError: As `load_checkpoint` does, or if it holds something else, or weights that are not finite.
     """
     import torch
 

@@ -29,7 +29,7 @@ class CheckpointProvenance:
 
     Args:
         run_id: MLflow run ID.
-        volumes: fingerprints of the volumes, by split and name.
+        volumes: Fingerprints of the volumes, by split and name.
     """
 
     run_id: str = ""
@@ -63,16 +63,16 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
     """Restore a learner to the state of its last checkpoint.
 
     Args:
-        learner: learner that has learned nothing yet.
-        folder: folder with the checkpoints.
-        provenance: provenance of this training.
+        learner: Learner that has not learned anything yet.
+        folder: Folder with the checkpoints.
+        provenance: Provenance of this training.
 
     Returns:
         The reports of the epochs so far, for `train`; none where there is no checkpoint yet.
 
     Raises:
-        CheckpointError: if a checkpoint is damaged or another run's, or the best one is missing.
-        ChangedVolumesError: if a checkpoint is of other volumes.
+        CheckpointError: If a checkpoint is damaged or another run's, or the best one is missing.
+        ChangedVolumesError: If a checkpoint is of other volumes.
     """
     last, best = folder / LAST_CHECKPOINT, folder / BEST_CHECKPOINT
     if not last.exists():

@@ -27,10 +27,11 @@ class TrainingDomain:
     """Observations of environments on some volumes, and the range of the volumes' sizes.
 
     Args:
-        observed: the shape of each part of an observation, of the one vector under the name `vector`.
-        slice_px: shape (across, depth) in pixels that every slice has at least, and images are cropped to.
-        pixel_mm: lowest and highest size of a pixel, (across, depth).
-        size_mm: lowest and highest size of a volume, (across, along): what a normalised translation goes over.
+        observed: Shape of each part of an observation; a single vector has the name `vector`.
+        slice_px: Smallest slice (across, depth) in pixels; images are cropped to it.
+        pixel_mm: Smallest and largest pixel size, (across, depth) in mm.
+        size_mm: Smallest and largest size of a volume, (across, along) in mm, which is the range of a normalised
+            translation.
     """
 
     observed: dict[str, tuple[int, ...]]
@@ -43,8 +44,8 @@ class TrainingDomain:
         """Return what an environment is like.
 
         Args:
-            env: environment with the volumes.
-            slice_px: crop of its images if the configuration gives none; default: the smallest slice.
+            env: Environment with the volumes.
+            slice_px: Crop of its images if the configuration gives none. Default: the smallest slice.
         """
         space, volumes = env.observation_space, env.get_wrapper_attr("volumes").values()
         parts = space.spaces if isinstance(space, spaces.Dict) else {"vector": space}
@@ -64,7 +65,7 @@ class TrainingDomain:
         """Read what `to_json` wrote.
 
         Raises:
-            InvalidValueError: if it is anything else.
+            InvalidValueError: If it is anything else.
         """
         try:
             return TypeAdapter(cls).validate_json(text)
@@ -112,12 +113,12 @@ def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> A
     data sets. Images that are resized to one shape keep that rule if slices are smaller.
 
     Args:
-        rules: configuration as plain dictionaries and lists, or the name of an observation.
-        trained: the smallest slice of the training volumes, (across, depth) in pixels.
-        here: the smallest slice of the volumes that the agent is applied to.
+        rules: Configuration as plain dictionaries and lists, or the name of an observation.
+        trained: Smallest slice of the training volumes, (across, depth) in pixels.
+        here: Smallest slice of the volumes that the agent is applied to, (across, depth) in pixels.
 
     Raises:
-        InvalidValueError: if images would have to be larger than the slices.
+        InvalidValueError: If images would have to be larger than the slices.
     """
     return _cropped(_spelled_out(rules), trained, here)
 

@@ -43,26 +43,28 @@ class EpisodeResult:
     """How one episode went.
 
     Args:
-        volume: name of its volume.
-        seed: seed that it was reset with.
-        n_steps: number of steps taken.
-        is_success: whether it ended on a rewarded plane.
-        starts_solved: whether it also began on one.
-        episode_return: sum of the rewards.
-        final_reward: reward of the last plane.
-        best_reward: best reward of the planes that were chosen; the start is not among them.
-        distance_mm: distance of the last plane from the optimal one, in mm.
-        distance_deg: angle between the two, in degrees.
-        dice_bones: how far the last slice shows the bones where the optimal plane's slice does, as `tissue_dice` says.
-        dice_tendons: likewise.
-        dice_artery: likewise.
-        seconds_per_plane: mean wall time of choosing a plane and looking at it, of planes in episodes side by side an
-            equal share each; two episodes that differ in nothing else are equal.
-        nerve_area_error_mm2: how far the median nerve's area on the last slice is from that on the optimal plane's, in
-            mm2. Default: None, the optimal plane's shows no nerve, or nobody has measured it.
-        nerve_area_error_percent: the same in per cent of the area on the optimal plane's. Default: None, likewise.
-        expected_mm: how far off the agent expected its last plane to be, in mm. Default: None, it expects nothing.
-        expected_deg: the same in degrees. Default: None, likewise.
+        volume: Name of the volume.
+        seed: Seed of the reset.
+        n_steps: Number of steps taken.
+        is_success: Whether the episode ended on a rewarded plane.
+        starts_solved: Whether the episode also started on a rewarded plane.
+        episode_return: Sum of the rewards.
+        final_reward: Reward of the last plane.
+        best_reward: Best reward of the chosen planes, without the start.
+        distance_mm: Distance of the last plane from the optimal one, in mm.
+        distance_deg: Angle between the last plane and the optimal one, in degrees.
+        dice_bones: Dice coefficient of the bones on the last slice and on the optimal plane's slice, in [0, 1]; see
+            `tissue_dice`.
+        dice_tendons: Dice coefficient of the tendons, in [0, 1].
+        dice_artery: Dice coefficient of the artery, in [0, 1].
+        seconds_per_plane: Mean wall time of choosing a plane and slicing it, in seconds; an equal share for each of
+            several episodes side by side. Not compared by `==`.
+        nerve_area_error_mm2: Absolute error of the median nerve's area on the last slice against that on the optimal
+            plane's, in mm². Default: None, not measured, or no nerve on the optimal plane's slice.
+        nerve_area_error_percent: The same in per cent of the area on the optimal plane's slice. Default: None, as
+            above.
+        expected_mm: Error that the agent expects of its last plane, in mm. Default: None, it expects none.
+        expected_deg: Error that the agent expects of its last plane, in degrees. Default: None, it expects none.
     """
 
     volume: str
@@ -98,9 +100,9 @@ class Evaluation:
     """Episodes and what they add up to; every mean is over all episodes unless its name says otherwise.
 
     Args:
-        episodes: the episodes.
-        on_plane: limits within which a plane counts as the labelled one, the leading ones first. Default: 5 mm and
-            10 degrees, and 2 mm and 5 degrees.
+        episodes: Episodes of the evaluation.
+        on_plane: Limits within which a plane counts as the labelled one, the leading ones first. Default: 5 mm and 10
+            degrees, then 2 mm and 5 degrees.
     """
 
     episodes: tuple[EpisodeResult, ...]
@@ -111,11 +113,11 @@ class Evaluation:
         """Return the evaluation of episodes that were read from JSON, as `to_dict` has given them.
 
         Args:
-            episodes: the episodes, as a list.
-            on_plane: the limits, as pairs. Default: those of evaluations that have kept none.
+            episodes: Episodes as plain values, in a list.
+            on_plane: Limits as pairs of mm and degrees. Default: those of evaluations that have kept none.
 
         Raises:
-            InvalidValueError: if they are no list, or one of them is none: a value is missing, unknown, or no number.
+            InvalidValueError: If they are no list, or one of them is none: a value is missing, unknown, or no number.
         """
         if not isinstance(episodes, list):
             raise InvalidValueError(f"the episodes are a {type(episodes).__name__}, but they must be a list")
@@ -155,8 +157,8 @@ class Evaluation:
         """Return the key that evaluations are compared by, the higher the better.
 
         Args:
-            best_by: `success`, the rate of it, then the fewest steps; or `distance`, the sum of the mean distance in mm
-                and the mean angle in degrees, then the success rate.
+            best_by: Criterion: `success` is the success rate, then the fewest steps; `distance` is the sum of the mean
+                distance in mm and the mean angle in degrees, then the success rate.
         """
         if best_by == DISTANCE:
             return -self._mean("mean_distance_mm") - self._mean("mean_distance_deg"), self.success_rate

@@ -35,11 +35,12 @@ def evaluate(
     Each is, bit for bit, the episode that `play` plays.
 
     Args:
-        agent: agent that plays them; each by a copy of it, unless it is a `BatchAgent`.
-        env: an `ArmscanEnv`, with or without its wrappers; its rules are played by, it is left as it is.
-        n_episodes: number of episodes; a multiple of the number of volumes treats them alike.
-        seed: seed of the first episode, the next has the next: the same seed gives the same episodes to every agent.
-        on_plane: limits within which a plane counts as the labelled one. Default: those of `Evaluation`.
+        agent: Agent to evaluate. Each episode is played by a copy of it, unless it is a `BatchAgent`.
+        env: An `ArmscanEnv`, with or without its wrappers, whose rules the episodes follow; it does not change.
+        n_episodes: Number of episodes; a multiple of the number of volumes treats them alike.
+        seed: Seed of the first episode; the next has the next seed. The same seed gives the same episodes to every
+            agent.
+        on_plane: Limits within which a plane counts as the labelled one. Default: those of `Evaluation`.
     """
     names = list(env.get_wrapper_attr("volumes"))
     count = check_int("episodes", n_episodes, at_least=1)
@@ -89,11 +90,11 @@ def play(
     """Play an episode.
 
     Args:
-        agent: agent that plays it.
-        env: an `ArmscanEnv`, with or without wrappers.
-        volume_name: name of one of the environment's volumes.
-        seed: seed of the episode.
-        look: called when it begins, and after every step.
+        agent: Agent to play the episode.
+        env: An `ArmscanEnv`, with or without wrappers.
+        volume_name: Name of one of the environment's volumes.
+        seed: Seed of the episode.
+        look: Function called at the start and after every step.
     """
     observation, info = env.reset(seed=seed, options={"volume": volume_name})
     look()
@@ -121,11 +122,11 @@ def _result(
     """Return how an episode went that has ended.
 
     Args:
-        episode: the episode.
-        seed: seed that it was reset with.
-        seconds: wall time of all its steps.
-        optimal_xz: slice of its optimal plane.
-        expected: how far off the agent expects its last plane to be, in mm and degrees, or None and None.
+        episode: Finished episode.
+        seed: Seed of its reset.
+        seconds: Wall time of all its steps, in seconds.
+        optimal_xz: Slice of its optimal plane, indexed [across, depth].
+        expected: Errors that the agent expects of its last plane, in mm and degrees, or None and None.
     """
     # The first is the start's.
     _, *rewards = episode.rewards

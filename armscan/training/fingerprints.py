@@ -23,11 +23,11 @@ def fingerprints_in(record: bytes | Any, where: str) -> Fingerprints:
     """Return the fingerprints of a record.
 
     Args:
-        record: JSON text, or plain dictionaries, as somebody has stored it.
-        where: place of the record, for the message.
+        record: JSON text or plain dictionaries, as they were stored.
+        where: Place of the record, for errors.
 
     Raises:
-        ChangedVolumesError: if it is no record of volumes.
+        ChangedVolumesError: If it is no record of volumes.
     """
     reader = TypeAdapter(Fingerprints)
     try:

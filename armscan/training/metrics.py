@@ -46,13 +46,13 @@ class MetricEstimates:
     """Sums and means over some episodes.
 
     Args:
-        n_seeds: number of trainings that they are of.
-        n_volumes: number of volumes that they are on.
-        n_episodes: number of episodes.
-        n_started_solved: number of those that started on a rewarded plane.
-        estimates: metrics by name, over all episodes; those whose names end with `_not_started_solved` over the others
-            only. Those whose names end with `_wilson` are rates with Wilson's interval.
-        on_plane: limits of the on-plane rates among them, the leading ones first.
+        n_seeds: Number of trainings that they summarise.
+        n_volumes: Number of volumes that they summarise.
+        n_episodes: Number of episodes.
+        n_started_solved: Number of episodes that started on a rewarded plane.
+        estimates: Metrics by name, over all episodes. Names that end with `_not_started_solved` are over the others
+            only; names that end with `_wilson` are rates with Wilson's interval.
+        on_plane: Limits of the on-plane rates, the leading ones first.
     """
 
     n_seeds: int
@@ -67,8 +67,8 @@ class MetricEstimates:
         """Compute them; the same episodes give the same intervals.
 
         Args:
-            evaluation: the episodes.
-            trainings: training of each episode; None if all are of one.
+            evaluation: Episodes to summarise.
+            trainings: Training of each episode; None if all are from one.
         """
         episodes = evaluation.episodes
         volumes = [episode.volume for episode in episodes]
@@ -104,7 +104,7 @@ class MetricEstimates:
         """Compute them over the episodes of several trainings.
 
         Args:
-            evaluations: the episodes of each training, by what tells it from the others; at least one.
+            evaluations: Episodes of each training, by its name; one training or more.
         """
         played = [(training, each) for training, evaluation in evaluations.items() for each in evaluation.episodes]
         trainings, episodes = zip(*played, strict=True)
@@ -116,8 +116,8 @@ class MetricEstimates:
         """Return what `metrics` gave, or a run has kept; without an interval where there is none.
 
         Args:
-            metrics: numbers by name.
-            n_seeds: number of trainings that they are of. Default: 1.
+            metrics: Numbers by the name of the metric.
+            n_seeds: Number of trainings that they summarise. Default: 1.
         """
         ends = {name + end for name in metrics for end in ENDS if name + end in metrics}
         n_volumes, n_episodes, n_started_solved = (int(metrics.get(name, 0)) for name in COUNTS)

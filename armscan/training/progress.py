@@ -17,8 +17,8 @@ def progress_reporter(label: str | None = None, measured: str = "validation") ->
     """Return a progress bar on a terminal; elsewhere, or with the label of a job, one line an epoch.
 
     Args:
-        label: label of the job. Default: None, a single run.
-        measured: what the figures are of, such as `validation, 48 episodes, deterministic`. Default: `validation`.
+        label: Label of the job. Default: None, a single run.
+        measured: Origin of the figures, such as `validation, 48 episodes, deterministic`. Default: `validation`.
     """
     return ProgressBar(measured) if label is None and sys.stdout.isatty() else ProgressLines(label, measured)
 
@@ -27,7 +27,7 @@ class ProgressBar:
     """A bar with environment steps, on-plane rate, success rate, mean steps of the validation, and time left.
 
     Args:
-        measured: what the figures are of; see `progress_reporter`.
+        measured: Origin of the figures; see `progress_reporter`.
     """
 
     def __init__(self, measured: str) -> None:

@@ -40,9 +40,9 @@ class Quantity(NamedTuple):
     """A column of the table.
 
     Args:
-        metric: name of the metric.
-        title: heading of the column, the statistic last, such as `steps, mean`.
-        form: format of its value.
+        metric: Name of the metric.
+        title: Heading of the column, the statistic last, such as `steps, mean`.
+        form: Format of its value.
     """
 
     metric: str
@@ -85,9 +85,9 @@ class ResultTable:
     """Results side by side.
 
     Args:
-        results: figures of each result, by its name, such as `random, test`; the on-plane limits are those of the
+        results: Metrics of each result, by its name, such as `random, test`; the on-plane limits are those of the
             first.
-        facts: further columns of the results, by heading, each with a text for each result; they come first.
+        facts: Further columns, shown first: a text for each result, by heading.
     """
 
     results: Mapping[str, MetricEstimates]
@@ -109,7 +109,7 @@ class ResultTable:
         """Return what to print on a terminal: a few results side by side, many as lines.
 
         Args:
-            width: width of the terminal, in characters; what does not fit is left out, and named.
+            width: Width of the terminal, in characters; columns that do not fit are left out, and named.
         """
         if not self.facts and len(self.results) <= MOST_ABREAST:
             return [*self._abreast(width)]
@@ -190,9 +190,9 @@ def with_baselines(
     """Return results with the baselines below them.
 
     Args:
-        results: figures of each result, by its name.
-        baselines: those that belong to a result, by its name and theirs. Results with the same volumes and rules have
-            the same ones, which are shown once; others are named after their results.
+        results: Metrics of each result, by its name.
+        baselines: Metrics of each result's baselines, by its name and theirs. Results with the same volumes and rules
+            share baselines, which are shown once; others carry the names of their results.
     """
     of_figures: dict[tuple[str, str], list[str]] = {}
     for result, ours in baselines.items():

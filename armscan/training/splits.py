@@ -24,12 +24,12 @@ class Split:
     """Volumes by name.
 
     Args:
-        training: volumes that the agent learns on.
-        validation: what it is tested on after each epoch; these choose the checkpoint and stop the training.
-        test: what has no part in training at all; the final evaluation judges by them.
+        training: Volumes that the agent learns on.
+        validation: Volumes of the validation after each epoch, which choose the checkpoint and stop the training.
+        test: Volumes of the final evaluation, which have no part in training.
 
     Raises:
-        InvalidValueError: if one of the three has no volume, or two have the same.
+        InvalidValueError: If one of the three has no volume, or two have the same.
     """
 
     training: dict[str, LabelVolume]
@@ -76,15 +76,15 @@ def phantom_data(
     """Phantom wrists; those for validation and test come from seeds that no training phantom has.
 
     Args:
-        n_training: number of phantoms to train on.
-        n_validation: number of phantoms that choose the checkpoint.
-        n_test: number of phantoms to judge on.
-        first_seed: seed of the first of the training phantoms, which have consecutive seeds.
-        cache_dir: folder where phantoms are kept; the user's cache folder where it is None.
-        version: version of the phantoms, 1 or 2, as in `make_phantom`. Default: 1, as runs have had it that name none.
+        n_training: Number of phantoms to train on.
+        n_validation: Number of phantoms that choose the checkpoint.
+        n_test: Number of phantoms of the final evaluation.
+        first_seed: Seed of the first training phantom; the next ones follow.
+        cache_dir: Folder that keeps phantoms. None: the user's cache folder.
+        version: Version of the phantoms, 1 or 2; see `make_phantom`. Default: 1, as in runs that name none.
 
     Raises:
-        InvalidValueError: if a number is out of range.
+        InvalidValueError: If a number is out of range.
     """
     check_int("data.n_training", n_training, at_least=1)
     check_int("data.n_validation", n_validation, at_least=1, at_most=TEST_FIRST_SEED - VALIDATION_FIRST_SEED)
@@ -115,16 +115,18 @@ def nifti_data(
     """Return the volumes of a folder, as `open_dataset` reads them, split by subject.
 
     Args:
-        path: the folder.
-        validation: a share of the subjects, in (0, 1), rounded up; or the names of subjects or volumes. None: as the
-            manifest's splits say; where it has none, or `test` is given, a quarter; with `folds` the next fold's.
-        test: likewise, with `validation` the other way round; None with `folds`, which say it.
-        split_seed: draws which subjects make up the shares and the folds.
-        folds: cross-validation: `leave_one_out`, each subject is a fold, or the number of folds. Default: None, none.
-        fold: number of the fold that is tested on, from 0. Default: None, no cross-validation.
+        path: Folder of the volumes.
+        validation: Share of the subjects, in (0, 1), rounded up, or names of subjects or volumes. None: the manifest's
+            splits; a quarter if it has none or `test` is given; the next fold with `folds`.
+        test: Share of the subjects, in (0, 1), rounded up, or names of subjects or volumes. None: the manifest's
+            splits; a quarter if it has none or `validation` is given. Must be None with `folds`.
+        split_seed: Seed that draws the subjects of shares and folds.
+        folds: Cross-validation: `leave_one_out` makes each subject a fold; a number gives the number of folds. Default:
+            None, no cross-validation.
+        fold: Number of the test fold, from 0. Default: None, no cross-validation.
 
     Raises:
-        InvalidValueError: if one of the three splits would have no volume, or a subject would be in two of them.
+        InvalidValueError: If one of the three splits would have no volume, or a subject would be in two of them.
     """
     dataset = open_dataset(check_path("data.path", path))
     parts = parts_by_subject(dataset, {"test": test, "validation": validation}, path, split_seed, folds, fold)
@@ -149,23 +151,24 @@ def mixed_data(
     """Volumes of a folder, split by subject, and phantom wrists beside those to train on.
 
     Args:
-        path: the folder.
-        n_volumes: number of its volumes to use, the first by name; None for all.
-        n_training: number of phantoms to train on beside them, which may be 0.
-        n_validation: number of phantoms that choose the checkpoint, where phantoms do.
-        n_test: number of phantoms to judge on, where phantoms are judged on.
-        first_seed: seed of the first of the training phantoms.
-        cache_dir: folder where phantoms are kept; the user's cache folder where it is None.
-        version: version of the phantoms, as in `phantom_data`. Default: 1.
-        validation: as in `nifti_data`, or `phantoms`, so that no subject is spent on it. Default: `phantoms`, as runs
-            have had it that say nothing.
-        test: likewise.
-        split_seed: as in `nifti_data`.
-        folds: as in `nifti_data`.
-        fold: as in `nifti_data`.
+        path: Folder of the volumes.
+        n_volumes: Number of its volumes to use, the first by name. None: all.
+        n_training: Number of phantoms to train on beside the volumes, 0 or more.
+        n_validation: Number of phantoms that choose the checkpoint, with `validation=phantoms`.
+        n_test: Number of phantoms of the final evaluation, with `test=phantoms`.
+        first_seed: Seed of the first training phantom; the next ones follow.
+        cache_dir: Folder that keeps phantoms. None: the user's cache folder.
+        version: Version of the phantoms; see `phantom_data`. Default: 1.
+        validation: Validation volumes; see `nifti_data`. `phantoms` spends no subject on them. Default: `phantoms`, as
+            in runs that name none.
+        test: Test volumes; see `nifti_data`. `phantoms` spends no subject on them. Default: `phantoms`, as in runs that
+            name none.
+        split_seed: Seed that draws the subjects of shares and folds.
+        folds: Cross-validation; see `nifti_data`. Default: None.
+        fold: Number of the test fold, from 0. Default: None.
 
     Raises:
-        InvalidValueError: if a number is out of range, or the volumes cannot be split so.
+        InvalidValueError: If a number is out of range, or the volumes cannot be split so.
     """
     n_beside = check_int("data.n_training", n_training, at_least=0)
     given = {"test": test, "validation": validation}

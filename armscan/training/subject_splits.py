@@ -24,11 +24,12 @@ def n_folds(folds: object, n_subjects: int) -> int:
     """Return the number of folds.
 
     Args:
-        folds: `leave_one_out`, a fold for each subject, or a number from 2 to that of the subjects.
-        n_subjects: number of the subjects.
+        folds: Folds: `leave_one_out` makes each subject one; a number, from 2 to the number of subjects, gives their
+            number.
+        n_subjects: Number of subjects.
 
     Raises:
-        InvalidValueError: if it is neither, or there are fewer than two subjects.
+        InvalidValueError: If it is neither, or there are fewer than two subjects.
     """
     if n_subjects < 2:
         raise InvalidValueError(f"data.folds is {folds!r}, but there must be two subjects or more, not {n_subjects}")
@@ -43,13 +44,13 @@ def tested(subjects: Sequence[str], folds: object, fold: object, seed: int) -> t
     """Return the subjects that a fold tests on, and those of the fold after it.
 
     Args:
-        subjects: all subjects, each once.
-        folds: as in `n_folds`.
-        fold: number of the fold, from 0.
-        seed: draws which subjects are in which fold where folds have several; not with `leave_one_out`.
+        subjects: All subjects, each once.
+        folds: Folds; see `n_folds`.
+        fold: Number of the fold, from 0.
+        seed: Seed that draws the subjects of each fold; unused with `leave_one_out`.
 
     Raises:
-        InvalidValueError: if there is no such fold.
+        InvalidValueError: If there is no such fold.
     """
     count = n_folds(folds, len(subjects))
     if fold is None:
@@ -70,15 +71,15 @@ def parts_by_subject(
     """Return the split of each volume, by name: `train`, `validation` or `test`.
 
     Args:
-        dataset: the volumes.
-        wanted: what each of `validation` and `test` is to be; a part that is missing gets no volume.
-        path: the folder, for errors.
-        split_seed: draws which subjects make up shares and folds.
-        folds: as in `n_folds`, or None.
-        fold: number of the fold that is tested on; None without folds.
+        dataset: Volumes and their subjects.
+        wanted: Choice of `validation` and `test`, by name; a missing part gets no volume.
+        path: Folder of the volumes, for errors.
+        split_seed: Seed that draws the subjects of shares and folds.
+        folds: Folds; see `n_folds`. None: no cross-validation.
+        fold: Number of the test fold; None without folds.
 
     Raises:
-        InvalidValueError: if the volumes cannot be split so.
+        InvalidValueError: If the volumes cannot be split so.
     """
     if folds is None and fold is not None:
         raise InvalidValueError(f"data.fold is {fold!r}, but data.folds is None: it must say how many folds there are")

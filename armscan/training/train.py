@@ -22,9 +22,9 @@ class SolvedCriterion:
     """When training may stop before its budget is spent.
 
     Args:
-        success_rate: at least this share of the validation episodes succeeds,
-        mean_steps: in at most this many steps on average,
-        n_epochs: in this many epochs one after another.
+        success_rate: Lowest success rate on the validation episodes, in [0, 1].
+        mean_steps: Largest mean number of steps on the validation episodes.
+        n_epochs: Number of consecutive epochs that must meet both.
     """
 
     success_rate: float = 1.0
@@ -50,11 +50,11 @@ class Budget:
     """How long to train, and how often to validate.
 
     Args:
-        env_steps: environment steps to take at most, all of them counted; rounded up to what the agent takes at once.
-        eval_every_env_steps: environment steps between two validations, rounded up likewise.
-        validation_episodes: number of episodes of a validation.
-        solved: stop as soon as this holds; None to spend the whole budget.
-        best_by: what the best epoch is chosen by, `success` or `distance`; see `Evaluation.score`.
+        env_steps: Largest number of environment steps; rounded up to the number that the agent takes at once.
+        eval_every_env_steps: Environment steps between two validations; rounded up in the same way.
+        validation_episodes: Number of episodes of each validation.
+        solved: Criterion that stops the training early; None spends the whole budget.
+        best_by: Criterion that chooses the best epoch, `success` or `distance`; see `Evaluation.score`.
     """
 
     env_steps: int
@@ -76,9 +76,9 @@ class TrainingResult:
     """Result of a training; the learner holds its best weights again.
 
     Args:
-        reports: one an epoch.
-        is_solved: whether it stopped because the task was solved.
-        wall_s: seconds of learning and validating, before an interruption and after it.
+        reports: Report of each epoch, in order.
+        is_solved: Whether it stopped early because the task was solved.
+        wall_s: Seconds of learning and validating, before and after an interruption.
     """
 
     reports: tuple[EpochReport, ...]
@@ -104,13 +104,13 @@ def train(
     """Train a learner; it ends with the weights of its best epoch.
 
     Args:
-        learner: learner to train.
-        budget: length of the training in environment steps, and of its epochs.
-        validate: evaluates the learner on the validation volumes.
-        folder: folder where `best.pt` and `last.pt` are kept.
-        callbacks: called at start, after each epoch and at the end.
-        provenance: origin of the checkpoints, kept in them.
-        earlier: reports that `resume_from_checkpoint` returned, for a resumed training.
+        learner: Learner to train.
+        budget: Length of the training and of its epochs, in environment steps.
+        validate: Function that evaluates the learner on the validation volumes.
+        folder: Folder that keeps `best.pt` and `last.pt`.
+        callbacks: Callbacks at the start, after each epoch and at the end.
+        provenance: Origin of the checkpoints, kept in them.
+        earlier: Reports that `resume_from_checkpoint` returned, for a resumed training.
 
     Returns:
         The reports of all epochs.

@@ -34,8 +34,8 @@ class VideoRecorder:
     """Pictures one after another, each written when it comes; at no time are all of them in memory.
 
     Args:
-        gif: the file.
-        mp4: another one with the same pictures, None for none.
+        gif: GIF file to write.
+        mp4: MP4 file with the same pictures; None for none.
     """
 
     def __init__(self, gif: Path, mp4: Path | None = None) -> None:
@@ -57,11 +57,11 @@ class VideoRecorder:
         """Play an episode and record it; the last frame is held longer.
 
         Args:
-            agent: agent that plays it.
-            env: environment made with `render_mode="rgb_array"`.
-            volume_name: name of one of the environment's volumes.
-            seed: seed of the episode.
-            title: text above each picture, and before what became of the episode above the last; empty for neither.
+            agent: Agent to play the episode.
+            env: Environment made with `render_mode="rgb_array"`.
+            volume_name: Name of one of the environment's volumes.
+            seed: Seed of the episode.
+            title: Text above each picture, and before the outcome above the last one; empty for neither.
 
         Returns:
             The episode, as an evaluation would have played it.
@@ -133,10 +133,10 @@ def record_episode(agent: Agent, env: Env, path: Path, *, seed: int) -> None:
     """Play an episode on the first volume and write it as an animated GIF; the last frame is held longer.
 
     Args:
-        agent: agent that plays it.
-        env: environment made with `render_mode="rgb_array"`.
-        path: the file, ending in `.gif`.
-        seed: seed of the episode; where it starts solved, that of the next one is tried, a few times.
+        agent: Agent to play the episode.
+        env: Environment made with `render_mode="rgb_array"`.
+        path: File to write, ending in `.gif`.
+        seed: Seed of the episode; if it starts solved, the next few seeds are tried.
     """
     first = next(iter(env.get_wrapper_attr("volumes")))
     for attempt in range(MAX_ATTEMPTS):

@@ -37,10 +37,10 @@ class DashboardView:
     """A WSGI application that changes the answers of Optuna's dashboard; other people's studies stay as they are.
 
     Args:
-        application: Optuna's dashboard.
-        stop: asks the worker of a trial to end it, by the trial's ID in the storage; returns whether there is one. The
+        application: WSGI application of Optuna's dashboard.
+        stop: Asks the worker of a trial to end it, by the trial's ID in the storage; returns whether there is one. The
             button that fails a running trial does that: a worker keeps what it has, and the trial ends as pruned.
-        mlflow: address of MLflow's UI, to which the links of trials lead. Default: None, they stay as they are.
+        mlflow: Address of MLflow's UI that links of trials lead to. Default: None, links do not change.
     """
 
     def __init__(self, application: WSGIApplication, stop: Callable[[int], bool], mlflow: str | None = None) -> None:

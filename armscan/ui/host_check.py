@@ -24,8 +24,8 @@ class HostCheck:
     MLflow's server has the same check.
 
     Args:
-        application: application to protect.
-        hosts: allowed values of the header Host, `NAME:PORT`; `*` stands for any port.
+        application: WSGI application to protect.
+        hosts: Allowed values of the header Host, `NAME:PORT`; `*` stands for any port.
     """
 
     def __init__(self, application: WSGIApplication, hosts: Sequence[str]) -> None:

@@ -19,7 +19,7 @@ def runs_page(address: str) -> str:
     """Return the page of the runs of the experiment that has the latest run, with the columns that matter.
 
     Args:
-        address: address of an MLflow server that answers.
+        address: Address of an MLflow server that answers.
 
     Returns:
         The page; that of all experiments where there is no run, or the server does not say.

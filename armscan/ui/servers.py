@@ -65,13 +65,13 @@ def start_dashboard(
     Its own program would open a journal without the lock that workers use.
 
     Args:
-        storage: the storage of the studies.
-        artifacts: the folder of the plots that it shows.
-        port: the port of the address.
-        host: the address to listen on, default: the loopback address.
-        allowed_hosts: the names and ports, `NAME:PORT`, by which browsers may ask for it; `*` stands for any port.
+        storage: Storage of the studies.
+        artifacts: Folder of the plots that it shows.
+        port: Port to listen on.
+        host: Address to listen on. Default: the loopback address.
+        allowed_hosts: Names and ports, `NAME:PORT`, by which browsers may reach it; `*` stands for any port.
             Default: `127.0.0.1` and `localhost` with the port.
-        mlflow: address of MLflow's UI, to which the links of trials lead. Default: None, to the one that they name.
+        mlflow: Address of MLflow's UI that links of trials lead to. Default: None, the address that they name.
     """
     from optuna.artifacts import FileSystemArtifactStore
     from optuna_dashboard import wsgi
@@ -92,7 +92,7 @@ def mlflow_server(uri: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
     """Serve MLflow's UI inside the context, which begins once the server answers.
 
     Raises:
-        TrackingError: if the server does not answer in time, or ends by itself; the end of its log is printed.
+        TrackingError: If the server does not answer in time, or ends by itself; the end of its log is printed.
     """
     store = database_url(uri, TRACKING_PASSWORD).render_as_string(hide_password=False)
     # In the environment, because anyone can read the command line of a process. Without jobs: eight processes fewer.

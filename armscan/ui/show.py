@@ -30,10 +30,10 @@ def show(
     Args:
         storage: Optuna storage of the studies.
         tracking: MLflow tracking store of the runs.
-        artifacts: folder of the plots that the dashboard shows.
-        mlflow_port: port of MLflow's UI.
-        dashboard_port: port of Optuna's dashboard.
-        named: options that were given on the command line, `--storage` or `--tracking`; these stores must exist.
+        artifacts: Folder of the plots that the dashboard shows.
+        mlflow_port: Port of MLflow's UI.
+        dashboard_port: Port of Optuna's dashboard.
+        named: Options given on the command line, `--storage` or `--tracking`; these stores must exist.
     """
     # Deferred: a mistake on the command line should be answered before this is loaded.
     from armscan.sweeps.storage.storage import existing_storage

@@ -18,7 +18,7 @@ def wide_console(log_chars: int = LOG_CHARS) -> Console:
     """Return a console as wide as the terminal; what is no terminal takes longer lines.
 
     Args:
-        log_chars: longest line where the output is no terminal and `COLUMNS` is not set. Default: 160.
+        log_chars: Length of the longest line if the output is no terminal and `COLUMNS` is not set. Default: 160.
     """
     console = Console()
     return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=log_chars)
@@ -28,10 +28,10 @@ def print_table(heading: str, names: Sequence[str], columns: Sequence[Column], r
     """Print a table with a name for each row: in a column where it fits, else in a line above its row.
 
     Args:
-        heading: heading of the names.
-        names: names of the rows.
-        columns: the other columns, whose cells are one line each.
-        rows: cells of each row.
+        heading: Heading of the column of names.
+        names: Names of the rows.
+        columns: Headings of the other columns, whose cells have one line each.
+        rows: Cells of each row.
     """
     console = wide_console(WHOLE_CHARS)
     beside = _table([Column(heading), *columns], [[name, *row] for name, row in zip(names, rows, strict=True)])

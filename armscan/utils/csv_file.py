@@ -16,9 +16,9 @@ def write_csv(file: TextIO, columns: Sequence[str], rows: Iterable[Mapping[str, 
     """Write rows as CSV.
 
     Args:
-        file: text file, opened with `newline=""`, or standard output.
-        columns: names of the columns.
-        rows: values of each row by column; a missing one is an empty cell.
+        file: Text file, opened with `newline=""`, or standard output.
+        columns: Names of the columns.
+        rows: Values of each row by column; a missing one is an empty cell.
     """
     writer = csv.writer(file, lineterminator="\n")
     for row in (dict(zip(columns, columns, strict=True)), *rows):

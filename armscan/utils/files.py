@@ -74,9 +74,9 @@ def atomic_write(path: Path, write: Callable[[BinaryIO], object], *, follow_link
     Once it has returned, neither a killed process nor a power cut loses the new one.
 
     Args:
-        path: the file's place; its folder exists.
-        write: writes the contents to the open file it is given.
-        follow_link: whether to replace the file that a link at this place leads to, and not the link. Default: False,
+        path: Place of the file, in an existing folder.
+        write: Function that writes the contents to the open file.
+        follow_link: Whether to replace the file that a link at this place leads to, and not the link. Default: False,
             because a stranger's folder may have links to any file of this user.
     """
     path = _place(path, follow_link=follow_link)
@@ -104,10 +104,10 @@ def named_if_full(path: Path) -> Iterator[None]:
     """Name what is written in the error of a full disk, which only says so itself where a file is opened.
 
     Args:
-        path: a file, or the folder of several.
+        path: File, or folder of several files.
 
     Raises:
-        OSError: with the path, in the place of any error that a full disk has led to.
+        OSError: With the path, in the place of any error that a full disk has led to.
     """
     try:
         yield

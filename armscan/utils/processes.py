@@ -72,12 +72,12 @@ class ProcessInfo:
     Containers and machines may share a host name; a process ID means something only in one boot and PID namespace.
 
     Args:
-        host: the machine that it runs on.
-        pid: its ID there.
-        started: when it was started, see `process_start`; empty if no process is meant.
-        directory: the directory that it works in; empty if nobody has to know.
-        boot: the ID of the machine's boot; empty if it is not known, as in what earlier versions have written.
-        pid_namespace: the PID namespace that its ID is of; empty if it is not known.
+        host: Name of the machine that it runs on.
+        pid: Process ID on that machine.
+        started: Time of its start, see `process_start`; empty if no process is meant.
+        directory: Working directory; empty if it is not needed.
+        boot: ID of the machine's boot; empty if it is not known, as in records of earlier versions.
+        pid_namespace: PID namespace of its process ID; empty if it is not known.
     """
 
     host: str

@@ -23,11 +23,12 @@ class RetryPolicy:
     """Repeats operations while a service is unavailable.
 
     Args:
-        what: name of the service, such as `the storage`.
-        named: the setting that names it, for messages, such as `study.storage is 'a.db'`.
-        reason: returns why an error means that the service is unavailable; None if it means something else.
-        error: raised after `retry_s`.
-        retry_s: seconds to retry. Default: `RETRY_S`.
+        what: Name of the service, such as `the storage`.
+        named: Setting that names the service, for messages, such as `study.storage is 'a.db'`.
+        reason: Function that returns why an error means that the service is unavailable, or None if it means something
+            else.
+        error: Error to raise after `retry_s`.
+        retry_s: Seconds to retry. Default: `RETRY_S`.
     """
 
     def __init__(
@@ -49,10 +50,10 @@ class RetryPolicy:
         """Return the result of an operation, once the service is available.
 
         Args:
-            operate: the operation; may be repeated although it succeeded, if only its answer was lost.
+            operate: Operation to call; it may be repeated although it succeeded, if only its answer was lost.
 
         Raises:
-            AwayError: if the service stays unavailable, or this thread is in `no_retry`.
+            AwayError: If the service stays unavailable, or this thread is in `no_retry`.
         """
         try:
             return operate()

@@ -17,8 +17,8 @@ def load_yaml(text: str | bytes) -> Any:
     """Return the contents of a YAML file.
 
     Raises:
-        ValueError: if it is nested or repeats itself more than any file of armscan, or a mapping has a key twice.
-        yaml.YAMLError: if it is no YAML, or holds anything but plain values.
+        ValueError: If it is nested or repeats itself more than any file of armscan, or a mapping has a key twice.
+        yaml.YAMLError: If it is no YAML, or holds anything but plain values.
     """
     # Of each collection that is open, the nodes in it, and how many nodes these are with all that aliases repeat.
     open_nodes: list[list[yaml.NodeEvent]] = [[]]

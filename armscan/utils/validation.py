@@ -80,11 +80,11 @@ def check_ints(name: str, value: Any, length: int | None, meaning: str, **bounds
     """Return `value` as a tuple of `length` whole numbers, of any number of them where it is None.
 
     Args:
-        name: of the argument.
-        value: a sequence; text and bytes are none.
-        length: how many.
-        meaning: says of what: '(across, depth)'.
-        **bounds: of each, as in `check_int`.
+        name: Name of the argument, for errors.
+        value: Sequence to check; text and bytes are refused.
+        length: Required number of values.
+        meaning: Meaning of the values, such as '(across, depth)'.
+        **bounds: Bounds of each value; see `check_int`.
     """
     is_sequence = isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray | memoryview)
     if not is_sequence or (length is not None and len(value) != length):
