@@ -1,0 +1,134 @@
+"""Train the configurations of a bench, each with every seed, and keep their curves."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import joblib
+import pandas as pd
+
+from benchmarks.sweeps.bench.design import Design
+from benchmarks.sweeps.bench.table import METRICS, TEST, VALIDATION, check_rows, read_rows, table_file, write_rows
+
+
+def collect(
+    sweep: str,
+    n_configs: int,
+    n_seeds: int,
+    workers: int = 1,
+    *,
+    allow_changes: bool = False,
+    overrides: Sequence[str] = (),
+    file: Path | None = None,
+) -> None:
+    """Train what is missing in the table of a sweep: all seeds of a configuration before the next one.
+
+    Args:
+        sweep: name of the sweep, such as `sac_y`.
+        n_configs: number of configurations, the default one included.
+        n_seeds: trainings of each, with the seeds from 0.
+        workers: processes that train. Default: 1, this one.
+        allow_changes: whether to add to a table although other settings than the searched ones have changed since.
+            Default: False.
+        overrides: of the configuration of all trainings, as on the command line. Default: none.
+        file: the table. Default: None, the one of the bench.
+    """
+    file = file or table_file(sweep)
+    design, rows = Design.of(sweep, n_configs, overrides), read_rows(file)
+    check_rows(rows, design)
+    earlier = set(rows.fixed_sha256) - {design.fixed_sha256}
+    if earlier and not allow_changes:
+        raise ValueError(
+            f"settings of {sweep} that are not searched have changed since {file.name} was begun: give --allow-changes "
+            "if they change no training, or take the table away"
+        )
+    done = set(zip(rows.config, rows.seed, strict=True))
+    missing = [(number, seed) for number in range(n_configs) for seed in range(n_seeds) if (number, seed) not in done]
+    print(f"{sweep}: {len(done)} trainings are in {file.name}, {len(missing)} are missing", flush=True)
+    origin = {"fixed_sha256": design.fixed_sha256, "commit": _commit()}
+    trained = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(
+        joblib.delayed(trained_rows)(
+            [f"sweep={sweep}", *overrides], {**origin, "config": number, "seed": seed}, design.configs[number]
+        )
+        for number, seed in missing
+    )
+    start_s = time.monotonic()
+    for n_trained, of_training in enumerate(trained, start=1):
+        fresh = pd.DataFrame(of_training)
+        rows = pd.concat([rows, fresh], ignore_index=True) if len(rows) else fresh
+        write_rows(file, rows)
+        each_s = (time.monotonic() - start_s) / n_trained
+        print(f"{n_trained} of {len(missing)} trainings, {each_s:.1f} s each", flush=True)
+
+
+def trained_rows(words: Sequence[str], training: Mapping[str, Any], values: dict[str, Any]) -> list[dict[str, Any]]:
+    """Train a configuration with a seed to its end as a trial would, and return its rows of the table.
+
+    Args:
+        words: overrides of the configuration, as on the command line.
+        training: what every row has, the seed among it.
+        values: values of the configuration by name.
+    """
+    from armscan.experiment.build import build_experiment
+    from armscan.experiment.results import TEST_VOLUMES_SEED
+    from armscan.experiment.runner import train_agent
+    from armscan.sweeps.space.parameter import overrides_of
+    from armscan.sweeps.tasks.attempt import composed, volumes_of
+    from armscan.training import evaluate
+    from armscan.utils.log import silence_library_warnings
+
+    silence_library_warnings()
+    config, _ = composed([*words, *overrides_of(values), f"seed={training['seed']}"])
+    setup = build_experiment(config, volumes_of(config))
+    recorder = _Recorder()
+    with tempfile.TemporaryDirectory() as folder:
+        result = train_agent(setup, Path(folder), [recorder], run_id="bench", tell=lambda _: None)
+    seed = TEST_VOLUMES_SEED + setup.seed
+    tested = evaluate(setup.agent, setup.test_env, n_episodes=setup.n_episodes, seed=seed, on_plane=setup.on_plane)
+    last = {
+        "volumes": TEST,
+        "env_steps": result.best.n_env_steps,
+        "processor_s": recorder.epochs[-1]["processor_s"],
+        **_shortened(tested.metrics()),
+    }
+    return [{**training, **epoch, **values} for epoch in (*recorder.epochs, last)]
+
+
+@dataclass
+class _Recorder:
+    """A training callback that keeps the validation of each epoch."""
+
+    epochs: list[dict[str, Any]] = field(default_factory=list)
+    start_s: float = 0.0
+
+    def on_start(self, total_env_steps: int, earlier: Any) -> None:
+        self.start_s = time.process_time()
+
+    def on_epoch(self, report: Any) -> None:
+        self.epochs.append(
+            {
+                "volumes": VALIDATION,
+                "env_steps": report.n_env_steps,
+                "processor_s": round(time.process_time() - self.start_s, 2),
+                **_shortened(report.evaluation.metrics()),
+            }
+        )
+
+    def on_end(self) -> None:
+        pass
+
+
+def _shortened(metrics: dict[str, float]) -> dict[str, float]:
+    # Four digits are more than the episodes can tell apart.
+    return {name: float(f"{metrics[name]:.4g}") for name in METRICS}
+
+
+def _commit() -> str:
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=9"]
+    return subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True).stdout.strip()

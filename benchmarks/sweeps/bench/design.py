@@ -1,0 +1,105 @@
+"""The configurations of a bench: the default one, then a Sobol sequence through the space of a sweep."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
+from scipy.stats import qmc
+
+from armscan.config.compose import compose
+from armscan.sweeps.space.parameter import Value, as_kept
+from armscan.sweeps.space.space import Space
+from armscan.sweeps.tasks.attempt import config_sha256, of_run
+from armscan.volumes.plane import FloatArray
+
+# Of the Sobol sequence's scrambling.
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Design:
+    """The configurations of a bench.
+
+    Args:
+        sweep: name of the sweep whose space it is.
+        space: the space.
+        configs: values by name of each configuration, the default one first.
+        fixed_sha256: sum of the configuration that the space is searched in.
+    """
+
+    sweep: str
+    space: Space
+    configs: tuple[dict[str, Value], ...]
+    fixed_sha256: str
+
+    @classmethod
+    def of(cls, sweep: str, n_configs: int, overrides: Sequence[str] = ()) -> Design:
+        """Return the first configurations of a sweep; those of a smaller number are among those of a larger.
+
+        Args:
+            sweep: name of the sweep, such as `sac_y`.
+            n_configs: number of configurations, at least 1.
+            overrides: of the configuration, as on the command line. Default: none.
+        """
+        config = compose([f"sweep={sweep}", *overrides], return_hydra_config=True)
+        space = Space.read(OmegaConf.to_container(config.study.space, resolve=True))
+        if conditional := [each.name for each in space.parameters if each.when]:
+            raise ValueError(f"sweep {sweep} searches {conditional[0]} only beside other values, which no bench does")
+        fixed, _ = of_run(config)
+        points = sobol(len(space.parameters), n_configs)[: n_configs - 1]
+        return cls(sweep, space, (default_of(space, fixed), *(values_at(space, row) for row in points)), _sha256(fixed))
+
+
+def sobol(n_dimensions: int, n_points: int) -> FloatArray:
+    """Return the first points of a scrambled Sobol sequence and some more, shape (points, dimensions), from 0 to 1."""
+    sequence = qmc.Sobol(n_dimensions, rng=np.random.default_rng(SEED))
+    return np.asarray(sequence.random_base2(max(1, n_points).bit_length()))
+
+
+def values_at(space: Space, places: FloatArray) -> dict[str, Value]:
+    """Return the values of a space by name at a place in each of its dimensions, from 0 to below 1."""
+    return {
+        each.name: value_at(each.distribution, float(place))
+        for each, place in zip(space.parameters, places, strict=True)
+    }
+
+
+def default_of(space: Space, config: DictConfig) -> dict[str, Value]:
+    """Return the values that the keys of a space have in a configuration."""
+    return {each.name: as_kept(OmegaConf.select(config, each.name)) for each in space.parameters}
+
+
+def value_at(distribution: BaseDistribution, place: float) -> Value:
+    """Return the value of a distribution at a place from 0 to below 1, all of them equally likely."""
+    if isinstance(distribution, CategoricalDistribution):
+        return distribution.choices[int(place * len(distribution.choices))]
+    drawn: Any = distribution
+    is_whole = isinstance(drawn, IntDistribution)
+    low, high = (drawn.low - 0.5, drawn.high + 0.5) if is_whole else (drawn.low, drawn.high)
+    number = math.exp(_between(math.log(low), math.log(high), place)) if drawn.log else _between(low, high, place)
+    # Seven digits are enough, and the same wherever it is read again.
+    return min(max(round(number), drawn.low), drawn.high) if is_whole else float(f"{number:.7g}")
+
+
+def place_of(distribution: BaseDistribution, value: Any) -> float:
+    """Return where a value lies between the ends of its range, from 0 to 1; of a choice its place among them."""
+    if isinstance(distribution, CategoricalDistribution):
+        return distribution.choices.index(value) / max(1, len(distribution.choices) - 1)
+    drawn: Any = distribution
+    scale = math.log if drawn.log else float
+    return float((scale(value) - scale(drawn.low)) / (scale(drawn.high) - scale(drawn.low)))
+
+
+def _between(low: float, high: float, place: float) -> float:
+    return low + (high - low) * place
+
+
+def _sha256(config: Mapping[str, Any]) -> str:
+    # Where runs are tracked changes no curve.
+    return config_sha256({key: value for key, value in config.items() if key != "tracking"})[:12]

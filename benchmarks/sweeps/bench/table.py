@@ -1,0 +1,120 @@
+"""The table of a bench: validations of every epoch and the test at the end, for each configuration and seed."""
+
+from __future__ import annotations
+
+import gzip
+from dataclasses import dataclass
+from operator import methodcaller
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from armscan.sweeps.space.space import Space
+from armscan.utils.files import atomic_write
+from armscan.volumes.plane import FloatArray
+from benchmarks.sweeps.bench.design import Design
+
+FOLDER = Path(__file__).parent / "tables"
+VALIDATION, TEST = "validation", "test"
+METRICS = (
+    *("mean_steps", "success_rate", "on_plane_5mm_10deg", "on_plane_2mm_5deg"),
+    *("mean_distance_mm", "mean_distance_deg", "mean_return"),
+)
+# Of each row, beside the values of its configuration and the metrics.
+ROW = ("fixed_sha256", "commit", "config", "seed", "volumes", "env_steps", "processor_s")
+
+
+def table_file(sweep: str) -> Path:
+    """Return where the table of a sweep is."""
+    return FOLDER / f"{sweep}.csv.gz"
+
+
+def read_rows(file: Path) -> pd.DataFrame:
+    """Return the rows of a table; none where it does not exist yet."""
+    if not file.exists():
+        return pd.DataFrame(columns=[*ROW, *METRICS])
+    return pd.read_csv(file, dtype={"fixed_sha256": str, "commit": str})
+
+
+def write_rows(file: Path, rows: pd.DataFrame) -> None:
+    """Write the rows of a table, in the order of their configurations and seeds; a reader never sees half of it."""
+    ordered = rows.sort_values(["config", "seed", "volumes", "env_steps"], ascending=[True, True, False, True])
+    text = ordered.to_csv(index=False, float_format="%.7g")
+    # The same rows give the same file.
+    atomic_write(file, methodcaller("write", gzip.compress(text.encode(), mtime=0)))
+
+
+def check_rows(rows: pd.DataFrame, design: Design) -> None:
+    """Raise `ValueError` if rows have other values than the configurations of a design."""
+    for number, of_config in rows.groupby("config"):
+        for name, value in design.configs[number].items() if number < len(design.configs) else ():
+            if name not in rows or (of_config[name] != value).any():
+                raise ValueError(f"the table of {design.sweep} has another {name} in configuration {number}")
+
+
+@dataclass(frozen=True)
+class Curves:
+    """The curves of the configurations that have been trained with all seeds.
+
+    Args:
+        sweep: name of the sweep.
+        space: the space that the configurations are of.
+        configs: values by name of each configuration; the first is the default one.
+        env_steps: environment steps at the end of each epoch, shape (epochs,).
+        validation: metrics of each epoch by name, shape (configurations, seeds, epochs).
+        test: metrics of the best epoch's weights on the test volumes by name, shape (configurations, seeds).
+        processor_s: processor seconds of each training, shape (configurations, seeds).
+    """
+
+    sweep: str
+    space: Space
+    configs: tuple[dict[str, Any], ...]
+    env_steps: FloatArray
+    validation: dict[str, FloatArray]
+    test: dict[str, FloatArray]
+    processor_s: FloatArray
+
+    @classmethod
+    def read(cls, sweep: str, file: Path | None = None) -> Curves:
+        """Return the curves of a table, without the configurations of which trainings are missing.
+
+        Args:
+            sweep: name of the sweep.
+            file: the table. Default: None, the one that `collect` keeps.
+        """
+        rows = read_rows(file or table_file(sweep))
+        if rows.empty:
+            raise ValueError(f"there is no table of {sweep} yet: python -m benchmarks.sweeps.bench collect {sweep}")
+        design = Design.of(sweep, int(rows.config.max()) + 1)
+        check_rows(rows, design)
+        n_seeds = rows.seed.nunique()
+        tests = rows[rows.volumes == TEST]
+        trained = tests.groupby("config").seed.nunique()
+        whole = trained[trained == n_seeds].index
+        tests = tests[tests.config.isin(whole)].sort_values(["config", "seed"])
+        epochs = rows[(rows.volumes == VALIDATION) & rows.config.isin(whole)]
+        epochs = epochs.sort_values(["config", "seed", "env_steps"])
+        shape = (len(whole), n_seeds)
+        env_steps = epochs.env_steps.to_numpy(float).reshape(*shape, -1)
+        if (env_steps != env_steps[0, 0]).any():
+            raise ValueError(f"the epochs of the table of {sweep} are not all after the same environment steps")
+        return cls(
+            sweep,
+            design.space,
+            tuple(design.configs[number] for number in whole),
+            env_steps[0, 0],
+            {name: epochs[name].to_numpy(float).reshape(env_steps.shape) for name in METRICS},
+            {name: tests[name].to_numpy(float).reshape(shape) for name in METRICS},
+            tests.processor_s.to_numpy(float).reshape(shape),
+        )
+
+    def best_validation(self, metric: str) -> FloatArray:
+        """Return a metric of each training's best validation, shape (configurations, seeds).
+
+        The best is the first with the highest success rate, then the fewest steps, as `training.best_by=success` says.
+        """
+        score = self.validation["success_rate"] * 1e6 - self.validation["mean_steps"]
+        best = score.argmax(axis=-1)[..., np.newaxis]
+        return np.take_along_axis(self.validation[metric], best, axis=-1)[..., 0]
