@@ -67,17 +67,19 @@ def test_a_table_is_read_as_it_was_written(tmp_path):
     write_rows(file, rows.sample(frac=1.0, random_state=0))
     pd.testing.assert_frame_equal(read_rows(file), rows, check_dtype=False)
     curves = Curves.read("sac_y", file)
-    assert curves.validation["mean_steps"].shape == (4, 3, 5)
-    assert curves.test["mean_steps"][2, 1] == pytest.approx(3.6)
-    # The fewest steps of equal success rates.
-    assert curves.best_validation("mean_steps")[2, 1] == pytest.approx(3.1)
+    assert curves.validation["mean_steps"].shape == (12, 5)
+    assert curves.config_of.tolist() == [0] * 3 + [1] * 3 + [2] * 3 + [3] * 3
+    assert curves.env_steps.tolist() == [1000, 2000, 3000, 4000, 5000]
+    assert curves.test["mean_steps"][7] == pytest.approx(3.6)
+    assert curves.validation["mean_steps"][7].tolist() == pytest.approx([5.1, 4.1, 3.1, 4.1, 5.1])
 
 
-def test_configurations_without_all_seeds_are_left_out(tmp_path):
+def test_configurations_with_few_seeds_are_left_out(tmp_path):
     file = tmp_path / "sac_y.csv.gz"
-    write_rows(file, rows_of(4, 3, 5, left_out=[(1, 2)]))
+    write_rows(file, rows_of(4, 4, 5, left_out=[(1, 2), (1, 3), (2, 0)]))
     curves = Curves.read("sac_y", file)
     assert curves.configs == tuple(Design.of("sac_y", 4).configs[number] for number in (0, 2, 3))
+    assert curves.config_of.tolist() == [0] * 4 + [1] * 3 + [2] * 4
 
 
 def test_a_table_of_another_space_is_refused(tmp_path):
@@ -102,17 +104,13 @@ SMALL = (
 
 def test_a_table_is_added_to_by_the_same_command(tmp_path):
     file = tmp_path / "sac_y.csv.gz"
-    collect("sac_y", 1, 2, overrides=SMALL, file=file)
+    collect("sac_y", 1, 1, overrides=SMALL, file=file)
     first = read_rows(file)
-    assert list(zip(first.seed, first.volumes, first.env_steps, strict=True))[:2] == [
-        (0, "validation", 256),
-        (0, "validation", 512),
-    ]
-    collect("sac_y", 2, 2, overrides=SMALL, file=file)
+    # Whole collections of the agent.
+    assert list(zip(first.volumes, first.env_steps, strict=True))[:2] == [("validation", 288), ("validation", 512)]
+    collect("sac_y", 2, 1, overrides=SMALL, file=file)
     rows = read_rows(file)
+    assert set(rows.config) == {0, 1}
     pd.testing.assert_frame_equal(rows[rows.config == 0], first)
-    assert Curves.read("sac_y", file).validation["mean_steps"].shape == (2, 2, 2)
-    collect("sac_y", 2, 2, overrides=SMALL, file=file)
-    pd.testing.assert_frame_equal(read_rows(file), rows)
     with pytest.raises(ValueError, match="--allow-changes"):
-        collect("sac_y", 3, 2, overrides=[*SMALL, "evaluation.episodes=3"], file=file)
+        collect("sac_y", 3, 1, overrides=[*SMALL, "evaluation.episodes=3"], file=file)

@@ -87,6 +87,11 @@ def value_at(distribution: BaseDistribution, place: float) -> Value:
     return min(max(round(number), drawn.low), drawn.high) if is_whole else float(f"{number:.7g}")
 
 
+def places_of(space: Space, values: Mapping[str, Value]) -> list[float]:
+    """Return where values by name lie in each dimension of a space; see `place_of`."""
+    return [place_of(each.distribution, values[each.name]) for each in space.parameters]
+
+
 def place_of(distribution: BaseDistribution, value: Any) -> float:
     """Return where a value lies between the ends of its range, from 0 to 1; of a choice its place among them."""
     if isinstance(distribution, CategoricalDistribution):

@@ -10,13 +10,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from armscan.sweeps.space.space import Space
 from armscan.utils.files import atomic_write
 from armscan.volumes.plane import FloatArray
-from benchmarks.sweeps.bench.design import Design
+from benchmarks.sweeps.bench.design import Design, places_of
 
 FOLDER = Path(__file__).parent / "tables"
+# With fewer trainings of a configuration little is known of chance.
+FEWEST_SEEDS = 3
 VALIDATION, TEST = "validation", "test"
 METRICS = (
     *("mean_steps", "success_rate", "on_plane_5mm_10deg", "on_plane_2mm_5deg"),
@@ -56,21 +59,23 @@ def check_rows(rows: pd.DataFrame, design: Design) -> None:
 
 @dataclass(frozen=True)
 class Curves:
-    """The curves of the configurations that have been trained with all seeds.
+    """The curves of the configurations that have been trained with enough seeds.
 
     Args:
         sweep: name of the sweep.
         space: the space that the configurations are of.
         configs: values by name of each configuration; the first is the default one.
+        config_of: place of each training's configuration among them, shape (trainings,).
         env_steps: environment steps at the end of each epoch, shape (epochs,).
-        validation: metrics of each epoch by name, shape (configurations, seeds, epochs).
-        test: metrics of the best epoch's weights on the test volumes by name, shape (configurations, seeds).
-        processor_s: processor seconds of each training, shape (configurations, seeds).
+        validation: metrics of each epoch by name, shape (trainings, epochs).
+        test: metrics of the best epoch's weights on the test volumes by name, shape (trainings,).
+        processor_s: processor seconds of each training, shape (trainings,).
     """
 
     sweep: str
     space: Space
     configs: tuple[dict[str, Any], ...]
+    config_of: NDArray[np.intp]
     env_steps: FloatArray
     validation: dict[str, FloatArray]
     test: dict[str, FloatArray]
@@ -78,7 +83,7 @@ class Curves:
 
     @classmethod
     def read(cls, sweep: str, file: Path | None = None) -> Curves:
-        """Return the curves of a table, without the configurations of which trainings are missing.
+        """Return the curves of a table, without the configurations that have few seeds yet.
 
         Args:
             sweep: name of the sweep.
@@ -89,32 +94,28 @@ class Curves:
             raise ValueError(f"there is no table of {sweep} yet: python -m benchmarks.sweeps.bench collect {sweep}")
         design = Design.of(sweep, int(rows.config.max()) + 1)
         check_rows(rows, design)
-        n_seeds = rows.seed.nunique()
-        tests = rows[rows.volumes == TEST]
-        trained = tests.groupby("config").seed.nunique()
-        whole = trained[trained == n_seeds].index
-        tests = tests[tests.config.isin(whole)].sort_values(["config", "seed"])
-        epochs = rows[(rows.volumes == VALIDATION) & rows.config.isin(whole)]
-        epochs = epochs.sort_values(["config", "seed", "env_steps"])
-        shape = (len(whole), n_seeds)
-        env_steps = epochs.env_steps.to_numpy(float).reshape(*shape, -1)
-        if (env_steps != env_steps[0, 0]).any():
+        n_seeds = rows.groupby("config").seed.nunique()
+        numbers = n_seeds[n_seeds >= FEWEST_SEEDS].index
+        rows = rows[rows.config.isin(numbers)].sort_values(["config", "seed", "env_steps"])
+        tests, epochs = rows[rows.volumes == TEST], rows[rows.volumes == VALIDATION]
+        env_steps = epochs.env_steps.to_numpy(float).reshape(len(tests), -1)
+        if (env_steps != env_steps[0]).any():
             raise ValueError(f"the epochs of the table of {sweep} are not all after the same environment steps")
         return cls(
             sweep,
             design.space,
-            tuple(design.configs[number] for number in whole),
-            env_steps[0, 0],
+            tuple(design.configs[number] for number in numbers),
+            np.searchsorted(numbers, tests.config),
+            env_steps[0],
             {name: epochs[name].to_numpy(float).reshape(env_steps.shape) for name in METRICS},
-            {name: tests[name].to_numpy(float).reshape(shape) for name in METRICS},
-            tests.processor_s.to_numpy(float).reshape(shape),
+            {name: tests[name].to_numpy(float) for name in METRICS},
+            tests.processor_s.to_numpy(float),
         )
 
-    def best_validation(self, metric: str) -> FloatArray:
-        """Return a metric of each training's best validation, shape (configurations, seeds).
+    def places(self) -> FloatArray:
+        """Return where each configuration lies in the space, shape (configurations, dimensions), from 0 to 1."""
+        return np.array([places_of(self.space, values) for values in self.configs])
 
-        The best is the first with the highest success rate, then the fewest steps, as `training.best_by=success` says.
-        """
-        score = self.validation["success_rate"] * 1e6 - self.validation["mean_steps"]
-        best = score.argmax(axis=-1)[..., np.newaxis]
-        return np.take_along_axis(self.validation[metric], best, axis=-1)[..., 0]
+    def mean_over_seeds(self, values: FloatArray) -> FloatArray:
+        """Return the mean of each configuration's trainings, shape (configurations, ...) of (trainings, ...)."""
+        return np.array([values[self.config_of == number].mean(axis=0) for number in range(len(self.configs))])
