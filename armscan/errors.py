@@ -21,7 +21,7 @@ class ArmscanError(Exception):
 
 
 class InvalidValueError(ArmscanError, ValueError):
-    """An argument or configuration value is outside what is allowed."""
+    """An argument or configuration value is not allowed."""
 
 
 class VolumeError(ArmscanError, ValueError):
@@ -101,7 +101,7 @@ class StorageAwayError(StudyError, AwayError):
 
 
 def is_interruption(error: BaseException | None) -> bool:
-    """Whether an error is an interrupt, or came of one: raised inside compiled code, it can come out as any other."""
+    """Return whether an error is an interrupt or follows from one: compiled code can turn it into any other error."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True
@@ -116,7 +116,7 @@ def listed(allowed: Iterable[object]) -> str:
 
 
 def few(names: Iterable[object], most: int = 4) -> str:
-    """Return the first few of what may be many, as they are written in a message: 'a, b, c, d and 96 more'."""
+    """Return the first few of possibly many names for a message: 'a, b, c, d and 96 more'."""
     texts = [str(name) for name in names]
     return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "")
 

@@ -1,4 +1,4 @@
-"""The command `armscan run`: one run, with -m several, with resume=ID what was interrupted."""
+"""The command `armscan run`: one run, several with -m, an interrupted one with resume=ID."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
 
 
 def run(config: DictConfig) -> None:
-    """Run what Hydra has composed: a single run, one job of a multirun, or one worker of a study."""
+    """Run a configuration composed by Hydra: a single run, a job of a multirun, or a worker of a study."""
     if config.get("study") is not None:
         # Deferred, because only studies need Optuna.
         from armscan.sweeps.study.arguments import words_of_trials
@@ -90,12 +90,12 @@ def repeat_grid(words: Sequence[str]) -> None:
 
 
 def main() -> int:
-    """Run what the command line asks for; return the exit code."""
+    """Run the command line; return the exit code."""
     if os.environ.get("HYDRA_FULL_ERROR") == "1":
         os.environ[WANTS_TRACEBACKS] = "1"
     # Hydra raises, so that its errors are answered here and not by Hydra.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    # Whoever ends a run, by Ctrl-C or by kill, finds it closed as killed in the tracking store.
+    # A run that is ended by Ctrl-C or kill is closed as killed in the tracking store.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     silence_library_warnings()
     # Hydra reads its options only before the first override, and people write them anywhere.
@@ -114,7 +114,7 @@ def main() -> int:
         else:
             launch(with_folds(sys.argv[1:]))
     except BrokenPipeError:
-        # Whoever reads what --help prints may stop reading; nothing more can be written, not even on the way out.
+        # The reader of --help, such as `head`, may have closed the pipe: nothing can be written, not even on exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (KeyboardInterrupt, Exception) as error:

@@ -1,4 +1,4 @@
-"""Who acts: learning algorithms, their networks, and what to compare them with."""
+"""Agents: learning algorithms with their networks, and baselines to compare them with."""
 
 from armscan.agents.baselines import Exhaustive, Random
 from armscan.agents.compute import Compute

@@ -51,7 +51,7 @@ class BaseLearner(ABC):
             group["lr"] = lr
 
     def _epoch_seeds(self) -> list[np.random.SeedSequence]:
-        """Seed torch for an epoch, the first time before the first; returns three more seeds for what else draws."""
+        """Seed torch for an epoch, from before the first on; return three more seeds for other random numbers."""
         for_torch, *others = np.random.SeedSequence([self._seed, self._n_epochs]).spawn(4)
         torch.manual_seed(int(for_torch.generate_state(1)[0]))
         return others
@@ -155,7 +155,7 @@ def teacher_of(envs: Any) -> ArmscanVectorEnv:
 
 
 def is_finite(module: nn.Module) -> bool:
-    """Whether all weights are finite."""
+    """Return whether all weights are finite."""
     return all(bool(torch.isfinite(weights).all()) for weights in module.parameters())
 
 

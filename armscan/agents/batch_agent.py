@@ -59,5 +59,5 @@ class OneAtATime:
 
 
 def batch_agent(agent: Agent) -> BatchAgent:
-    """Return an agent that plays side by side what the given one plays one after another."""
+    """Return an agent that plays episodes side by side as the given one plays them one after another."""
     return agent if isinstance(agent, BatchAgent) else OneAtATime(agent)

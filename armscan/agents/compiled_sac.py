@@ -1,4 +1,4 @@
-"""Tianshou's SAC with a compiled update, wherever one can be compiled."""
+"""Tianshou's SAC with a compiled update, if its update can be compiled."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class UpdateStats(sac.SACTrainingStats):
 
 
 class CompiledSAC(sac.SAC[Any]):
-    """Tianshou's SAC whose gradient steps are compiled, in place of some 9,500 Python calls each.
+    """Tianshou's SAC with compiled gradient steps, each of which replaces some 9,500 Python calls.
 
     Batches and noise are drawn as Tianshou draws them, so that both updates agree but for rounding, and each can go on
     from the other's state. Policy, buffer, collector, trainer and the format of the state are Tianshou's.
@@ -169,7 +169,7 @@ def layer_sizes(network: Any) -> list[int] | None:
 
 @functools.cache
 def _blas() -> ThreadpoolController:
-    """Return what limits the threads of BLAS: small products are fastest on one, and then the same to the bit."""
+    """Return the control of BLAS's threads: small products are fastest on one, and then reproducible to the bit."""
     # Its BLAS is the one that numba calls.
     importlib.import_module("scipy.linalg.cython_blas")
     return ThreadpoolController().select(user_api="blas")

@@ -1,4 +1,4 @@
-"""Where and how tensors are computed."""
+"""Device and precision of tensors, and compilation of networks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PRECISIONS = ("float32", "bfloat16")
 
 @dataclass(frozen=True)
 class Compute:
-    """Where and how tensors are computed.
+    """Device and precision of tensors, and compilation of networks.
 
     Args:
         device: `cpu`, `cuda`, or `auto` for `cuda` where there is one.
@@ -47,7 +47,7 @@ class Compute:
 
     @property
     def is_plain(self) -> bool:
-        """Whether all is computed in 32 bits on the CPU, as a plain copy of a network does."""
+        """Return whether tensors are on the CPU in 32 bits, so that a plain copy of a network computes the same."""
         return self.torch_device == "cpu" and self.precision == "float32"
 
     def apply_to(self, network: nn.Module) -> None:

@@ -10,7 +10,7 @@ from tianshou.utils import LazyLogger
 
 
 class EpochMetrics(LazyLogger):
-    """Gathers what Tianshou's trainer reports during an epoch, to be taken at its end as means.
+    """Collects the reports of Tianshou's trainer during an epoch, and averages them at its end.
 
     Tianshou's own loggers write to TensorBoard or elsewhere at every gradient step, while training waits.
     """
@@ -45,7 +45,7 @@ class EpochMetrics(LazyLogger):
                 self._values[ours] += [float(value)] * n_updates
 
     def take(self) -> dict[str, float]:
-        """Return what was gathered since the last call: means, the worst episode, numbers of episodes and updates."""
+        """Return the metrics since the last call: means, the worst episode, numbers of episodes and updates."""
         metrics = {name: float(np.mean(values)) for name, values in self._values.items() if values}
         if self._values["train/length"]:
             metrics["train/length_max"] = float(np.max(self._values["train/length"]))

@@ -114,7 +114,7 @@ class FrameStore:
 
     @property
     def n_bytes(self) -> int:
-        """Bytes of all frames as they are kept, without what Python adds to each."""
+        """Bytes of all stored frames, without Python's overhead for each."""
         return sum(map(len, self._frames))
 
     def add(self, pixels: Pixels) -> int:

@@ -1,4 +1,4 @@
-"""Parameters of learning algorithms: what is allowed, and whether a training's budget leaves room for them."""
+"""Hyperparameters of learning algorithms: their ranges, and checks against the training's budget."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def round_up(n_env_steps: int, num_envs: int) -> int:
 
 
 def buffer_capacity(buffer_size: int, num_envs: int, setup: AgentSetup) -> int:
-    """Return how many transitions a buffer needs to hold: what it may, but no more than the whole training takes."""
+    """Return the capacity of a buffer, in transitions: as configured, but at most those of the whole training."""
     return min(buffer_size, setup.total_env_steps + num_envs)
 
 
@@ -108,6 +108,6 @@ def check_updates(utd_ratio: float, setup: AgentSetup, *, learning_starts: int =
 
 
 def check_batch(batch_size: int, n_kept: int, what: str) -> None:
-    """Raise `InvalidValueError` where a batch is larger than what it is drawn from, which `what` names."""
+    """Raise `InvalidValueError` if a batch is larger than its source, which `what` names."""
     if batch_size > n_kept:
         raise InvalidValueError(f"agent.batch_size is {batch_size}, but it must be at most {n_kept}, {what}")

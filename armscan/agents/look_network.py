@@ -134,7 +134,7 @@ class FinderModule(nn.Module):
         return self.geometry.planes(actions[:, -1]), place, expected * self.calibration, step
 
     def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
-        """Return the next actions, shape (n, n_action), and the expected errors of what is found so far, (n, 2)."""
+        """Return the next actions, shape (n, n_action), and the expected errors of the planes found so far, (n, 2)."""
         plane, place, expected, step = self.estimate(observations)
         beside_mm = step @ self.offsets
         is_last = step[:, -1] > 0.0

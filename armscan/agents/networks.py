@@ -110,7 +110,7 @@ class NetworkByObservation:
 
 
 def is_vector(space: spaces.Space[Any]) -> bool:
-    """Whether observations are one vector."""
+    """Return whether observations are one vector."""
     return isinstance(space, spaces.Box) and len(space.shape) == 1
 
 

@@ -1,4 +1,4 @@
-"""A taught agent that looks beside the plane: what it is made from."""
+"""Supervised agent that looks beside the plane: its configuration."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ class PlaneFinderLearner(SupervisedLearner):
         return loss.detach()
 
     def _next_looks(self, seen: dict[str, Tensor], offset_mm: float, rng: np.random.Generator) -> FloatArray:
-        """Return the next looks beside what is found, some of them led astray, as actions that never stop."""
+        """Return the next looks beside the planes found so far, some of them led astray, as actions that never stop."""
         n = self._envs.num_envs
         draws = torch.as_tensor(rng.normal(size=(n, 4)), dtype=torch.float32, device=self._device)
         spreads = np.exp([rng.uniform(math.log(low), math.log(high), n) for low, high in (ASTRAY_DEG, ASTRAY_MM)])
@@ -134,7 +134,7 @@ class PlaneFinderLearner(SupervisedLearner):
         return np.column_stack([actions, np.full(n, -1.0)]) if self._has_stop else actions
 
     def _further_metrics(self, seed: int) -> dict[str, float]:
-        """Scale the expected errors to be right on average where they are judged; returns what was seen there."""
+        """Scale the expected errors to be right on average on the validation volumes; return the metrics there."""
         envs = self._calibration_envs
         if envs is None:
             return {}
@@ -204,5 +204,5 @@ class PlaneFinderLearner(SupervisedLearner):
         return np.array(actions)
 
     def policy(self) -> Policy:
-        """Return a copy of what `act` asks."""
+        """Return a copy of the module that `act` evaluates."""
         return Policy(self._module, clip_action, self._compute)

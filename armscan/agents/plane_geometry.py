@@ -121,7 +121,7 @@ class PlaneGeometry(nn.Module):
 
 
 def common_geometry(rules: Rules, n_looks: int) -> PlaneGeometry:
-    """Return what planes are on all volumes of environments in which an agent takes `n_looks` looks.
+    """Return the geometry of planes on all volumes of environments in which an agent takes `n_looks` looks.
 
     Slices of other sizes are seen about their own middle, so that the mean of the middles serves all of them.
 

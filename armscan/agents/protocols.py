@@ -57,7 +57,7 @@ class Learner(Agent, Protocol):
 
     @property
     def update_note(self) -> str | None:
-        """How gradient steps are computed, for a reader of the log; None where there is but one way."""
+        """Return how gradient steps are computed, for the log; None if there is only one way."""
 
     def warm_up(self) -> None:
         """Take the steps that come before the first update; called once, at the very beginning."""
@@ -66,10 +66,10 @@ class Learner(Agent, Protocol):
         """Learn for `n_env_steps`, or slightly more; return its training metrics by name."""
 
     def policy(self) -> Policy:
-        """Return a copy of what `act` computes with, for batches of observations; later learning leaves it alone."""
+        """Return a copy of the module that `act` computes with, for batches; later learning does not change it."""
 
     def weights(self) -> dict[str, Any]:
-        """Return what `act` needs: tensors by name."""
+        """Return the weights that `act` requires: tensors by name."""
 
     def load_weights(self, weights: dict[str, Any]) -> None:
         """Take over what `weights` returned."""

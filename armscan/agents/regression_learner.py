@@ -82,7 +82,7 @@ class RegressionLearner(SupervisedLearner):
         return int(self._n_env_steps * self._utd_ratio)
 
     def _step(self, observations: Observed, rng: np.random.Generator) -> Observed:
-        """Keep what is seen, starts of episodes included; returns what is seen from the next planes."""
+        """Store the observations, starts of episodes included; return those of the next planes."""
         self._examples.add(observations, self._teacher.optimal_actions)
         observations, _, terminated, truncated, _ = self._envs.step(self._next_planes(observations, rng))
         self._n_env_steps += self._envs.num_envs

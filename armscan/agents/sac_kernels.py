@@ -315,7 +315,7 @@ def _returns(
     layers: Layers,
     alpha: np.float32,
 ) -> Floats:
-    """Return what the critics should say of a batch, by the actions that were drawn after it."""
+    """Return the critics' targets for a batch, from the actions drawn after it."""
     values, returns = np.empty((2, index.size, 1), F), np.empty(index.size, F)
     for k in range(2):
         _judge(agent.targets[k], layers, obs_next, drawn.actions, values[k])

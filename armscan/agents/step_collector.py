@@ -38,7 +38,7 @@ class StepCollector(Collector[CollectStats]):
         self._envs, self._replay = envs, replay
 
     def _is_plain(self, render: float | None, reset_arguments: dict[str, Any] | None) -> bool:
-        """Whether steps are collected as arrays: of Gaussian policies without hooks, pictures or options of a reset."""
+        """Return whether steps are collected as arrays: Gaussian policies without hooks, rendering or reset options."""
         hooks = self.get_on_step_hook(), self.get_on_episode_done_hook()
         is_known = type(self.policy) in (SACPolicy, ProbabilisticActorPolicy)
         is_gaussian = is_known and type(self.policy.actor) is ContinuousActorProbabilistic

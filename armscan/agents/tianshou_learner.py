@@ -91,7 +91,7 @@ class TianshouLearner(BaseLearner):
 
     @property
     def update_note(self) -> str:
-        """How gradient steps are computed: `compiled`, or `Tianshou`, with the reason where there is one."""
+        """Return how gradient steps are computed: `compiled`, or `Tianshou` with the reason, if there is one."""
         if not isinstance(self._algorithm, CompiledSAC):
             return "Tianshou"
         reason = self._algorithm.why_tianshou
@@ -99,7 +99,7 @@ class TianshouLearner(BaseLearner):
 
     @property
     def validation_note(self) -> str:
-        """How the actions of evaluations are chosen: `deterministic` or `sampled`."""
+        """Return how the actions of evaluations are chosen: `deterministic` or `sampled`."""
         return "deterministic" if self._algorithm.policy.deterministic_eval else "sampled"
 
     def warm_up(self) -> None:

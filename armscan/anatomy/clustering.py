@@ -261,7 +261,7 @@ def summarise_label(
     min_samples: int,
     summary: NDArray[np.float64],
 ) -> None:
-    """Clusters the pixels of a label, and keeps of it only what rewards and observations need.
+    """Cluster the pixels of a label, and keep only the summary that rewards and observations require.
 
     Args:
         slice_xz: Labels of the slice, indexed [across, depth].

@@ -20,12 +20,12 @@ THIRD = 1 / 3
 
 
 class Reward(Protocol):
-    """Scores slices; implement both methods to make one's own."""
+    """Scores slices; implement both methods for a reward of your own."""
 
     def fit(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Reward:
-        """Return the reward with what it takes from labelled planes of training volumes, if it has nothing yet.
+        """Return the reward fitted to the labelled planes of training volumes; a fitted one is returned unchanged.
 
-        `tissues` says how what they show is clustered.
+        `tissues` has the clustering rules of their slices.
         """
 
     def score(self, landmarks: Landmarks, pixel_mm: tuple[float, float]) -> float:
@@ -168,7 +168,7 @@ class AgreementReward(LandmarkReward):
 
 
 class Range(NamedTuple):
-    """Where a feature costs nothing, and how far below and above it has its full cost of 1."""
+    """Range in which a feature costs nothing, and distances below and above it at which it costs 1."""
 
     lowest: float
     highest: float
@@ -196,7 +196,7 @@ def _features(landmarks: Landmarks, pixel_mm: tuple[float, float]) -> list[float
 
 
 def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED_TARGETS) -> float:
-    """Return the published reward, `LandmarkReward`, of what a slice shows.
+    """Return the published reward, `LandmarkReward`, of a slice.
 
     Args:
         clusters: Clusters in the slice.

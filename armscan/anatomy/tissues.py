@@ -34,7 +34,7 @@ class Tissue(Protocol):
         """Its value in a labelmap."""
 
     def neighbourhood(self, pixel_mm: tuple[float, float]) -> Neighbourhood:
-        """Return what makes a core pixel in slices of pixels of this size, (across, depth)."""
+        """Return the neighbourhood that makes a core pixel, for pixels of this size, (across, depth)."""
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,7 @@ class Explorer:
         self._look()
 
     def picture(self) -> NDArray[np.uint8]:
-        """Draw what is looked at, shape (512, 860, 3)."""
+        """Draw the current view, shape (512, 860, 3)."""
         remembered = self.rewards[-N_REMEMBERED:]
         first = len(self.rewards) - len(remembered) + 1
         return draw_plane(

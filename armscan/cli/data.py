@@ -1,4 +1,4 @@
-"""`armscan data`: what a folder of volumes holds, its optimal planes, and a look at its slices."""
+"""`armscan data`: inspect a folder of volumes, label its planes, explore its slices."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def data() -> None:
 @data.command(epilog=examples("data inspect wrists"))
 @click.argument("folder")
 def inspect(folder: str) -> None:
-    """Print what the volumes of FOLDER hold.
+    """Print the contents of the volumes of FOLDER.
 
     The volumes are read as the manifest says: their tissues, and what is missing or ignored. docs/manifest.md describes
     the manifest, which may be missing.
@@ -176,7 +176,7 @@ def _grid(shape: Sequence[int], spacing: Sequence[float]) -> str:
 
 
 def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolume, FoundPlane]]) -> None:
-    """Print a table of the planes, and what the person who checks them can do next."""
+    """Print a table of the planes, and the next steps to check them."""
     from armscan.annotation.labelling import SUCCESS_THRESHOLD
     from armscan.config.command_hints import armscan_command
     from armscan.volumes.markups import MARKUP_SUFFIX

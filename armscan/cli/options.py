@@ -154,6 +154,6 @@ clustering_option = click.option(
 
 
 def is_given(name: str) -> bool:
-    """Whether an option of the current command was given on the command line."""
+    """Return whether an option of the current command was given on the command line."""
     source = click.get_current_context().get_parameter_source(name)
     return source is click.core.ParameterSource.COMMANDLINE

@@ -79,7 +79,7 @@ def _watch(write: Callable[[int | None], Path]) -> None:
 
 
 def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int | None], Path]:
-    """Return what writes the report of a study as it stands then, for a browser that reads it again after seconds."""
+    """Return a function that writes the current report of a study, for a browser that reloads it every few seconds."""
     import optuna
 
     from armscan.sweeps.results.report import write_report

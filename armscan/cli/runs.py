@@ -174,7 +174,7 @@ def stop(target: str, storage: str, tracking: str) -> None:
 @click.option("--tracking", type=UriParam(), help="MLflow tracking store.  [default: the one that each run names]")
 @trust_option
 def sync(folder: Path, tracking: str | None, trust: bool) -> int:
-    """Upload what runs could not while their store was away.
+    """Upload metrics and files buffered while the tracking server was unreachable.
 
     FOLDER is the folder of a run, of a study, or above them. What is delivered already is not delivered again; runs
     that are still going on deliver for themselves. Exit code: 1 if something is left.
@@ -247,7 +247,7 @@ def _open(uri: str) -> Iterator[TrackingStore]:
 
 
 def remove_planned(client: TrackingStore, cases: Sequence[Any], what: str) -> int:
-    """Remove what is planned, run by run, and print how each went; return the exit code."""
+    """Remove the planned files, run by run, and print each outcome; return the exit code."""
     from rich.filesize import decimal
 
     from armscan.runs.prune import remove

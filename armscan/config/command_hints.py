@@ -30,12 +30,12 @@ def typed(program: str) -> tuple[str, ...]:
 
 
 def kept_command(words: Iterable[str]) -> str:
-    """Return the command that runs what these Hydra overrides describe, as a run keeps it for every machine."""
+    """Return the command that runs these Hydra overrides, as a run keeps it for every machine."""
     return shlex.join([*RUN, *words])
 
 
 def run_command(words: Iterable[str]) -> str:
-    """Return the command that runs what these Hydra overrides describe."""
+    """Return the command that runs these Hydra overrides."""
     return shlex.join([*typed(RUN[0]), *RUN[1:], *words])
 
 

@@ -40,7 +40,7 @@ class SweepsSource(FileConfigSource):
 
     @staticmethod
     def scheme() -> str:
-        """Return what its addresses begin with."""
+        """Return the scheme of its addresses."""
         return SWEEPS
 
     def is_group(self, config_path: str) -> bool:
@@ -57,7 +57,7 @@ class SweepsSource(FileConfigSource):
         return super().load_config(config_path.removeprefix(f"{SWEEP}/"))
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        """Return the studies of the folder; of what the folder is in, the group."""
+        """Return the studies of the folder; for a parent of the folder, the group."""
         if not config_path:
             return [] if results_filter == ObjectType.CONFIG else [SWEEP]
         names = sorted(path.stem for path in Path(self.path).glob("*.yaml"))

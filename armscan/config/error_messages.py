@@ -1,4 +1,4 @@
-"""A user's mistake, answered in one line that names what is allowed."""
+"""One-line messages for users' mistakes, with the allowed values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from armscan.utils.files import FULL_DISK
 
 
 def one_line_message(error: BaseException) -> str | None:
-    """Return what a user did wrong and what is allowed instead; None if the error is no user's mistake."""
+    """Return a user's mistake and the allowed values in one line; None if the error is no user's mistake."""
     if (ours := _ours(error)) is not None:
         return str(ours)
     text = " ".join(str(error).split())

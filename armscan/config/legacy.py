@@ -51,7 +51,7 @@ def migrate(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def rename_hint(key: str) -> str | None:
-    """Return what to write instead of a key of an earlier version; None: the key has not been renamed."""
+    """Return the current name of a key of an earlier version; None if the key has not been renamed."""
     if (now := RENAMED_KEYS.get(key)) is None:
         return None
     return f"{key} has been renamed: give {now}" + (", which means the opposite" if key in INVERTED else "")

@@ -1,4 +1,4 @@
-"""Where the configuration is: armscan's own, and one's own in the working folder, which takes precedence."""
+"""Sources of the configuration: the working folder, which takes precedence, and armscan itself."""
 
 from __future__ import annotations
 

@@ -59,12 +59,12 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
 
 
 def needs_trust(config: Mapping[str, Any]) -> bool:
-    """Whether a run of this configuration, or of these MLflow parameters, is read with `--trust` only."""
+    """Return whether a run of this configuration, or of these MLflow parameters, is read with `--trust` only."""
     return _foreign_part(migrate(config)) is not None
 
 
 def _foreign_part(config: Mapping[str, Any]) -> str | None:
-    """Return what of a configuration is not armscan's own; None if nothing is."""
+    """Return the part of a configuration that is not armscan's own; None if there is none."""
     for key, value in _leaves(config):
         if key.rpartition(".")[2] == TARGET and str(value) not in offered_classes():
             return (

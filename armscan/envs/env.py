@@ -164,7 +164,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         return self._seen()
 
     def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
-        """Place the plane; see the class for what comes back."""
+        """Place the plane; the class describes the return values."""
         episode = self._episode
         if episode is None or not episode.is_running:
             raise ResetNeededError("the episode has ended or not begun: call reset() before step()")

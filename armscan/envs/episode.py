@@ -1,4 +1,4 @@
-"""One episode as it goes on: the scene, the current plane, and what has been seen of it."""
+"""A running episode: its scene, the current plane and its slice."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Episode:
         self.plane: ManipulatorAction = self.scene.bounds.denormalise(normalised)
 
     def see(self, view: View) -> None:
-        """Take what the plane shows."""
+        """Set the view of the current plane."""
         view.action = self.action
         self.view = view
         self.n_steps += 1
@@ -59,14 +59,14 @@ class Episode:
 
     @property
     def distance(self) -> tuple[float, float]:
-        """How far the plane is from the optimal one, in mm and degrees."""
+        """Return the distance of the plane from the optimal one, in mm and degrees."""
         if self._distance is None:
             self._distance = self.scene.distance(self.plane)
         return self._distance
 
     @property
     def is_running(self) -> bool:
-        """Whether a step can be taken; an episode that starts solved still takes its first."""
+        """Return whether a step can be taken; an episode that starts solved still takes its first."""
         return self.n_steps == 0 or not (self.is_terminated or self.is_truncated)
 
 

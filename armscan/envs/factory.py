@@ -73,7 +73,7 @@ def make_armscan_env(
     stack_memory: bool = False,
     **kwargs: Any,
 ) -> Env:
-    """Make an environment with its wrappers; this is what `gymnasium.make("armscan/Armscan-v0", ...)` calls.
+    """Make an environment with its wrappers, as `gymnasium.make("armscan/Armscan-v0", ...)` does.
 
     Args:
         volumes: as in `ArmscanEnv`.
@@ -87,7 +87,7 @@ def make_armscan_env(
 
 
 def make_armscan_vector_env(num_envs: int = 1, volumes: Volumes = None, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
-    """Make many environments with their wrappers; what `gymnasium.make_vec("armscan/Armscan-v0", ...)` calls.
+    """Make many environments with their wrappers, as `gymnasium.make_vec("armscan/Armscan-v0", ...)` does.
 
     Args:
         num_envs: number of environments.
@@ -143,6 +143,6 @@ def _wrapped(
 
 
 def _keywords(env_factory: Callable[..., Any]) -> list[str]:
-    """Return the names of what can only be given by name."""
+    """Return the names of keyword-only arguments."""
     parameters = inspect.signature(env_factory).parameters.values()
     return [parameter.name for parameter in parameters if parameter.kind is inspect.Parameter.KEYWORD_ONLY]

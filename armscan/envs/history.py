@@ -82,7 +82,7 @@ class Remembered(Protocol):
         """Add the latest observation and `info` of environments."""
 
     def added_to(self, parts: Parts, env_ids: EnvIds) -> Parts:
-        """Return the latest observations with what is remembered, in arrays that are not filled again."""
+        """Return the latest observations with the remembered pairs, in arrays that are not filled again."""
 
 
 class FrameHistory:
@@ -118,7 +118,7 @@ class FrameHistory:
             frames[env_ids, latest] = parts[name]
 
     def added_to(self, parts: Parts, env_ids: EnvIds) -> Parts:
-        """Return the latest observations, what is stacked of them as (n_envs, size, ...)."""
+        """Return the latest observations; stacked parts have the shape (n_envs, size, ...)."""
         places = self._places[self._latest[env_ids]]
         return {
             name: self._stack(name, env_ids, places) if name in self._frames else part for name, part in parts.items()

@@ -26,7 +26,7 @@ Overlaps = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 
 class MetricSliceObservation:
-    """How much of each pixel is bones, tendons and artery, in an image about the slice's middle whose pixels have mm.
+    """Share of bones, tendons and artery in each pixel, in an image about the slice's middle with pixels in mm.
 
     A pixel is the mean of what the slice shows in its area, from 0 to 255, so that small structures fade, but move
     smoothly, and volumes of any spacing give the same image. Beside the slice there is nothing: 0.

@@ -63,7 +63,7 @@ class View:
 
 
 class Observation(Protocol):
-    """A set of named parts of what the agent sees; implement both methods to make one's own."""
+    """A set of named parts that the agent sees; implement both methods for an observation of your own."""
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """Return the space of each part, for every geometry that can occur and `n_free` action components."""
@@ -160,7 +160,7 @@ class ClusterObservation:
         return features.astype(np.float32)
 
     def _scale(self, geometry: SliceGeometry) -> tuple[FloatArray, FloatArray]:
-        """Return what is subtracted from a summary, and the factor that follows, each of shape (3, 4)."""
+        """Return the offset to subtract from a summary, and the factor to multiply it with, each of shape (3, 4)."""
         zero, scale = np.zeros((3, 4)), np.empty((3, 4))
         zero[:, 2:] = (np.array(geometry.shape) - 1) / 2
         scale[:, 0] = 1.0 / np.array(self._targets)

@@ -86,7 +86,7 @@ def _slice_inks(view: View, numbers: NDArray[np.int32]) -> Inks:
 
 
 def _outlines(codes: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Where a pixel of a cluster, one whose code is not 0, lies beside one that is not of it."""
+    """Return the outlines of clusters: pixels with a code that is not 0, beside a pixel with another code."""
     framed = np.pad(codes, 1)
     middle = framed[1:-1, 1:-1]
     beside = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])

@@ -1,4 +1,4 @@
-"""Pictures of an episode, and of a plane outside of one: what it shows, where it lies, what it is worth."""
+"""Pictures of a plane, in an episode or outside of one: its slice, its place, its reward."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Box = tuple[int, int, int, int]
 
 
 class Beside(NamedTuple):
-    """Another plane that is drawn beside the current one, and what it is called: `optimal plane`."""
+    """Another plane to draw beside the current one, and its name, such as `optimal plane`."""
 
     action: ManipulatorAction
     name: str
@@ -80,7 +80,7 @@ def draw_plane(
     history: History | None = None,
     caption: str = "",
 ) -> NDArray[np.uint8]:
-    """Draw a plane: its slice, the volume from two sides, what it is worth.
+    """Draw a plane: its slice, the volume from two sides, its reward.
 
     Args:
         volume: volume that the plane lies in.

@@ -147,7 +147,7 @@ class Rules:
         )
 
     def is_solved(self, view: View) -> bool:
-        """Whether a view's reward is a success."""
+        """Return whether a view's reward is a success."""
         return view.reward > -self.success_threshold
 
     def observe(self, view: View) -> Observed:

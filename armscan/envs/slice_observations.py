@@ -36,7 +36,7 @@ class _FramedSlice:
         self._shape = None if shape is None else _checked_shape("shape", shape)
 
     def _observed_shape(self, geometries: Sequence[SliceGeometry]) -> Shape:
-        """Return the shape of what is observed; raise `InvalidValueError` if the crop exceeds the smallest slice."""
+        """Return the shape of the observed image; raise `InvalidValueError` if the crop exceeds the smallest slice."""
         smallest = smallest_shape(geometries)
         if self._crop is not None and (self._crop[0] > smallest[0] or self._crop[1] > smallest[1]):
             raise InvalidValueError(

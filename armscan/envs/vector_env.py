@@ -131,7 +131,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         return self._observed(episodes), rewards, terminated, truncated, infos
 
     def episodes(self, env_ids: Sequence[int] | EnvIds) -> list[Episode]:
-        """Return the current episodes of some environments; like `optimal_actions`, they know what no agent may."""
+        """Return the current episodes of some environments, which, like `optimal_actions`, no agent may see."""
         return [self._episode(int(i)) for i in env_ids]
 
     @property

@@ -164,6 +164,6 @@ def _checked(env: Any, kind: type[Any]) -> Any:
 
 
 def _batch_of_one(observation: Observed, info: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the parts of an observation and what is remembered of `info`, each as a batch of one."""
+    """Return the parts of an observation, and the remembered parts of `info`, each as a batch of one."""
     infos = {key: np.asarray(info[key])[None] for key in ("action", "reward") if key in info}
     return {name: part[None] for name, part in parts_of(observation).items()}, infos

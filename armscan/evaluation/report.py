@@ -57,7 +57,7 @@ class EvaluationReport:
 
     @cached_property
     def by_split(self) -> dict[str, MetricEstimates]:
-        """By what the volumes are called, and of all together under `all volumes`."""
+        """Return the metrics by the name of the volumes, and those of all together under `all volumes`."""
         return self._by_split(self.evaluations)
 
     @cached_property
@@ -66,7 +66,7 @@ class EvaluationReport:
         return {name: self._by_split(evaluations) for name, evaluations in self.baselines.items()}
 
     def tables(self) -> dict[str, ResultTable]:
-        """Return the agent beside the baselines, by what the volumes are called."""
+        """Return the agent beside the baselines, by the name of the volumes."""
         return {
             label: ResultTable(
                 {AGENT: figures, **{name: each[label] for name, each in self.baselines_by_split.items()}}
@@ -84,14 +84,14 @@ class EvaluationReport:
 
     @cached_property
     def by_volume(self) -> dict[str, dict[str, MetricEstimates]]:
-        """By what the volumes are called, then by the volume's name."""
+        """Return the metrics by the name of the group of volumes, then by the volume's name."""
         return {
             label: {name: MetricEstimates.of(each) for name, each in evaluation.by_volume().items()}
             for label, evaluation in self.evaluations.items()
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON; what was not measured is None."""
+        """Return everything, ready for JSON; missing measurements are None."""
         return {
             **self.facts,
             "intervals": {
@@ -119,7 +119,7 @@ class EvaluationReport:
         }
 
     def metrics(self) -> dict[str, dict[str, float]]:
-        """Return the numbers by what they are of: `test_volumes`, `volume/NAME`."""
+        """Return the metrics by their origin: `test_volumes`, `volume/NAME`."""
         groups = {label.replace(" ", "_"): metrics.metrics() for label, metrics in self.by_split.items()}
         for volumes in self.by_volume.values():
             for name, metrics in volumes.items():
@@ -132,7 +132,7 @@ class EvaluationReport:
 
 
 def report_tables(report: EvaluationReport, width: int) -> list[Table | Text]:
-    """Return what stands beside the tables of results: each volume of each group, and further figures.
+    """Return the tables beside those of the results: each volume of each group, and further figures.
 
     Args:
         report: Report to show.

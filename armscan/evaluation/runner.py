@@ -77,7 +77,7 @@ def apply(
     check: Callable[[Mapping[str, Volumes]], None] = lambda _: None,
     render_mode: str | None = None,
 ) -> PreparedAgent:
-    """Bring an agent to volumes, and print what differs from its training.
+    """Prepare an agent for volumes, and print the differences from its training.
 
     Args:
         source: Agent to apply.

@@ -71,7 +71,7 @@ def volume_groups(data: str | None, n_phantoms: int, own: Callable[[], Split]) -
 
 
 def data_name(data: str | None) -> str:
-    """Return what volumes are called in the names of files and runs."""
+    """Return the name of the volumes for files and runs."""
     return "own volumes" if data is None else Path(data).resolve().name
 
 
@@ -123,7 +123,7 @@ def known_volumes(source: TrainedAgent, groups: Mapping[str, Volumes]) -> list[s
 
 
 class TrainingVolumes(Mapping[str, LabelVolume]):
-    """The training volumes, which `load` does not read before somebody looks at them: only some rewards do."""
+    """Training volumes that `load` reads on first use; only some rewards use them."""
 
     def __init__(self, load: Callable[[], Split]) -> None:
         self._load = load

@@ -68,27 +68,27 @@ class Experiment:
 
     @cached_property
     def training_env(self) -> Env:
-        """Of the training volumes, for the final evaluation."""
+        """Return the environment of the training volumes, for the final evaluation."""
         return self.env_factory.undeformed().make_env(self.split.training)
 
     @cached_property
     def validation_env(self) -> Env:
-        """Of the validation volumes, for the validation after each epoch."""
+        """Return the environment of the validation volumes, for the validation after each epoch."""
         return self.env_factory.undeformed().make_env(self.split.validation)
 
     @cached_property
     def test_env(self) -> Env:
-        """Of the test volumes, for the final evaluation."""
+        """Return the environment of the test volumes, for the final evaluation."""
         return self.env_factory.undeformed().make_env(self.split.test)
 
     @cached_property
     def video_env(self) -> Env:
-        """Of the test volumes, for the video of an episode."""
+        """Return the environment of the test volumes, for the video of an episode."""
         return self.env_factory.undeformed().make_env(self.split.test, render_mode="rgb_array")
 
     @cached_property
     def fingerprints(self) -> Fingerprints:
-        """Of the volumes; once, because they take a second for a hundred of them."""
+        """Return the fingerprints of the volumes; computed once, because a hundred volumes take a second."""
         return self.split.fingerprints()
 
     def provenance(self, run_id: str) -> CheckpointProvenance:
@@ -164,7 +164,7 @@ def check_words(config: DictConfig) -> None:
 
 
 def _made(config: DictConfig, section: str, kind: type[T]) -> T:
-    """Return what a section of the configuration builds, which must be of this class."""
+    """Build the object of a configuration section, which must be of this class."""
     made = instantiate(config[section], _convert_="object")
     if not isinstance(made, kind):
         raise InvalidValueError(f"{section} builds {made!r}, but it must build a {kind.__name__}")

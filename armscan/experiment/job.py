@@ -1,4 +1,4 @@
-"""How a run was asked for: its folder, its words, and which job of a multirun it is.
+"""The invocation of a run: its folder, its overrides, and its job of a multirun.
 
 It imports nothing that takes time, because a multirun's launcher needs it for every job.
 """
@@ -95,7 +95,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Invocation:
-    """How a run was asked for.
+    """The invocation of a run.
 
     Args:
         folder: Folder that takes the run's files.
@@ -125,7 +125,7 @@ class Invocation:
 
 
 def remove_if_untracked(folder: Path, error: BaseException) -> None:
-    """Remove what a run has left that failed before it was tracked; from then on it can be resumed."""
+    """Remove the files of a run that failed before it was tracked; a tracked run can be resumed."""
     is_tracked = (folder / CONFIG_FILE).exists() and not isinstance(error, FolderTakenError)
     # Where somebody else is at work in the folder, everything is theirs.
     if not is_tracked and not isinstance(error, FolderInUseError):
@@ -133,7 +133,7 @@ def remove_if_untracked(folder: Path, error: BaseException) -> None:
 
 
 def remove_run_folder(folder: Path) -> None:
-    """Remove what a run that came to nothing has left in its folder, and the folders that are empty then.
+    """Remove the files of a run that produced nothing from its folder, and the folders that are empty then.
 
     Nothing else is touched: the folder may be one that somebody named, with other files in it.
     """

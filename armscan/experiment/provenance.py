@@ -103,7 +103,7 @@ def start_tracking(
 
 
 def provenance_files(config: dict[str, Any], setup: Experiment) -> dict[str, bytes]:
-    """Return the files that say what a run was started with, by their names: configuration, volumes, code."""
+    """Return the files that describe a run's origin, by their names: configuration, volumes, code."""
     diff = source().diff
     return {
         CONFIG_FILE: yaml.safe_dump(config, sort_keys=False).encode(),
@@ -133,7 +133,7 @@ def place_tags(folder: Path) -> dict[str, str]:
 
 
 def run_name(config: dict[str, Any], choices: dict[str, str]) -> str:
-    """Return what the UI calls a run: what most runs differ by."""
+    """Return the name of a run in the UI: the choices that most runs differ by."""
     projection = config["projection"]
     parts = [choices["agent"], choices["obs"], projection if isinstance(projection, str) else "+".join(projection)]
     parts += [f"{name}{config[name]}" for name, without in (("stack", 1), ("memory", 0)) if config[name] != without]

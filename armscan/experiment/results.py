@@ -1,4 +1,4 @@
-"""The result of a run: its agent and the baselines in one table, what to think of it, and the files that keep it."""
+"""The result of a run: its agent and the baselines in one table, notes on it, and its files."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class RunResult:
         return metrics
 
     def notes(self) -> list[str]:
-        """Return what has to be said of the volumes; see `volume_notes`."""
+        """Return the notes on the volumes; see `volume_notes`."""
         return volume_notes(self.figures[TEST], self.figures.get(VALIDATION))
 
     def write(self, folder: Path, *, title: str) -> None:
@@ -137,7 +137,7 @@ def figures_of(metrics: Mapping[str, float]) -> dict[str, MetricEstimates]:
 
 
 def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = None) -> list[str]:
-    """Return what has to be said of a result's volumes: intervals that do not overlap, or too few volumes.
+    """Return the notes on a result's volumes: intervals that do not overlap, or too few volumes.
 
     Args:
         test: Metrics on the test volumes.

@@ -151,7 +151,7 @@ def train_agent(
 
 
 def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: RunResult, folder: Path) -> None:
-    """Log the final figures, and keep what the run has made in its folder.
+    """Log the final figures, and store the run's files in its folder.
 
     Args:
         tracked: Run to log to.

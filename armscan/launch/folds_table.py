@@ -47,7 +47,7 @@ def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
 
 
 def _evaluations(folder: Path) -> dict[str, Evaluation]:
-    """Return the agent's and the baselines' episodes on the test volumes of a run, by what they are called."""
+    """Return the episodes of the agent and the baselines on the test volumes of a run, by their names."""
     agent = Evaluation.of_dict(json.loads((folder / EVALUATION_FILE).read_text())[TEST])
     baselines = json.loads((folder / BASELINES_FILE).read_text())
     return {AGENT: agent, **{f"{name}{ALL_FOLDS}": Evaluation.of_dict(each) for name, each in baselines.items()}}

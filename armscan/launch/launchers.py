@@ -33,7 +33,7 @@ def check_launcher(name: str) -> None:
 
 
 def silence_launcher(name: str) -> None:
-    """Keep off the screen what a launcher says of its waiting."""
+    """Keep a launcher's messages about waiting off the screen."""
     if name == SLURM:
         # Where Slurm has no accounting, submitit says so again and again. It sets its level when it is imported.
         import submitit

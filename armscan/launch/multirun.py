@@ -1,4 +1,4 @@
-"""Several jobs side by side: their common parent run, and what became of each."""
+"""Several jobs side by side: their parent run, and the outcome of each."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Multirun(Callback):
     is_repeated = False
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Check what a single run would write down."""
+        """Check the addresses that a single run would store."""
         with _answered():
             for key in (TRACKING_URI, "study.storage"):
                 if isinstance(uri := OmegaConf.select(config, key), str):
@@ -180,10 +180,10 @@ def _pool_folds(folder: Path, word: Mapping[str, Any], outcomes: Mapping[str, Jo
 
 
 def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Mapping[str, JobOutcome]) -> list[Run]:
-    """Close the parent run and what a killed job left open; deletes it where no job got as far as a run of its own.
+    """Close the parent run and the open runs of killed jobs; delete the parent if no job has started a run.
 
     Returns:
-        The runs of those that got as far as that, in the order of the jobs.
+        The runs of the jobs that started one, in the order of the jobs.
     """
     from armscan.launch.best_job import show_best
     from armscan.tracking import note_end, open_store, sync

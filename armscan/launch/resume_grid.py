@@ -1,4 +1,4 @@
-"""`armscan run resume=ID` of a grid: it is repeated, but what has finished of it is not run again.
+"""`armscan run resume=ID` of a grid: repeat it without the jobs that have finished.
 
 A job's earlier run is known by its configuration and its volumes, which both have to be the same to the last value.
 """

@@ -1,4 +1,4 @@
-"""A policy as a folder that MLflow loads and serves wherever torch, NumPy and MLflow are, and nothing of armscan."""
+"""A policy as an MLflow model folder, which requires torch, NumPy and MLflow, but not armscan."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
 
 
 def is_model(folder: Path) -> bool:
-    """Whether a folder is a model that was written here."""
+    """Return whether a folder is a model that was written here."""
     try:
         said = yaml.safe_load((folder / MODEL_FILE).read_bytes())
         return "armscan" in said["metadata"]

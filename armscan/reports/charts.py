@@ -98,7 +98,7 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
 
 
 def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Figure:
-    """Return what each group has reached at the end, with its interval, and beside it what single seeds have."""
+    """Return a chart of each group's final figures, with the interval and the single seeds."""
     limits = next(figures.on_plane[0] for figures in reached if figures is not None)
     titles = {limits.metric: limits.title} | {name: title_of(name) for name in FINAL}
     figure = make_subplots(rows=1, cols=len(titles), shared_yaxes=True, horizontal_spacing=0.04)
@@ -160,7 +160,7 @@ def _points(places: Iterable[float], values: Iterable[float]) -> Points:
 
 
 def _said(curve: Curve) -> list[str]:
-    """Return what is said of each place of a curve."""
+    """Return the hover text of each point of a curve."""
     if curve.n_seeds == 1:
         return [f"{value:.3g} (one seed)" for value in curve.band.values]
     return [f"{value:.3g} ({low:.3g} to {high:.3g})" for value, low, high in zip(*curve.band, strict=True)]

@@ -92,7 +92,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
 
 
 def _figures(groups: Sequence[Group]) -> list[str]:
-    """Return the names of what can be drawn: figures of the validation first."""
+    """Return the names of the figures that can be drawn, those of the validation first."""
     names = {name for group in groups for training in group.trainings for name in training.series}
     titles = validation_titles(names)
     return [*titles, *sorted(names - titles.keys())]
@@ -146,7 +146,7 @@ def _final(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -
 
 
 def final_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> ResultTable:
-    """Return the table of what groups have reached, and of the baselines."""
+    """Return the table of the groups' results, and of the baselines."""
     nothing = MetricEstimates.of_metrics({})
     figures = {group.label: each or nothing for group, each in zip(groups, reached, strict=True)}
     baselines = {group.label: baseline_metrics(group) for group in groups if evaluated_trainings(group)}
@@ -206,7 +206,7 @@ def _cell(probability: Estimate | None, *, is_few: bool, is_sure: bool) -> Marku
 
 
 def _span(values: Sequence[float]) -> str:
-    """Return the mean of what is known, with the lowest and the highest where they differ."""
+    """Return the mean of the known values, with the lowest and the highest if they differ."""
     known = [value for value in values if not math.isnan(value)]
     if not known:
         return "–"

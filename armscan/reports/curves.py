@@ -1,4 +1,4 @@
-"""Learning curves of a group: its seeds side by side, and what they say together."""
+"""Learning curves of a group: its seeds side by side, and their mean."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trainings that differ by nothing but the seed, and what such a group is called."""
+"""Groups of trainings that differ only in their seed, and their names."""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ def folded(summary: str, contents: str) -> str:
 
 
 def chart(figure: graph_objects.Figure, *, is_wide: bool = False) -> str:
-    """Return a chart in the look of all; the page's heading says what its title would.
+    """Return a chart in the common style, without a title: the page's heading has it.
 
     Args:
         figure: the chart.

@@ -38,7 +38,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Series:
-    """How a figure went, one value for each epoch.
+    """Course of a figure, one value for each epoch.
 
     Args:
         env_steps: environment steps at the end of each epoch, ascending, shape (epochs,).
@@ -85,32 +85,32 @@ class TrackedTraining:
 
     @property
     def id(self) -> str:
-        """The beginning of its run's id, as people are shown it."""
+        """First characters of its run ID, as shown to users."""
         return self.run_id[:ID_CHARS]
 
     @property
     def seed(self) -> str | None:
-        """As its configuration has it."""
+        """Seed of its configuration."""
         return self.params.get("seed")
 
     @property
     def label(self) -> str:
-        """Label that tells it from the others of its group."""
+        """Label within its group: the seed, or the run ID."""
         return f"seed {self.seed}" if self.seed is not None else f"run {self.id}"
 
     @property
     def env_steps(self) -> float:
-        """That it has taken by its last validation; NaN where it has none, or nothing was to be learned."""
+        """Environment steps at its last validation; NaN without a validation."""
         return self._last("env_steps")
 
     @property
     def wall_s(self) -> float:
-        """Seconds that it took until then."""
+        """Seconds of training until then."""
         return self._last("wall_s")
 
     @property
     def missing(self) -> list[str]:
-        """Which files it has not kept that a comparison shows something of."""
+        """Names of the missing files that a comparison shows."""
         kept = {EVALUATION_FILE: self.evaluation, VIDEO_FILE: self.video}
         return [name for name, contents in kept.items() if contents is None]
 
@@ -128,7 +128,7 @@ def validation_titles(names: Iterable[str]) -> dict[str, str]:
 
 
 def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> TrackedTraining:
-    """Return what a run says of a training.
+    """Return the training of a run.
 
     Args:
         store: the store that it is in.
@@ -192,7 +192,7 @@ def _files(store: TrackingStore, run: Run, folder: Path) -> dict[str, bytes]:
 
 
 def _parsed(run: Run, files: Mapping[str, bytes], name: str, read: Callable[[Any], T]) -> T | None:
-    """Return what a file of a run says, None where it has kept none."""
+    """Return the contents of a run's JSON file; None if the run has none."""
     if (contents := files.get(name)) is None:
         return None
     damaged = TrackingError(f"run {run.info.run_id}: its {name} is damaged; put it back, or leave the run out")

@@ -1,4 +1,4 @@
-"""Which runs a comparison is of: those that are named, and the trainings below them."""
+"""Runs of a comparison: the named runs, and the trainings below them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SelectedRuns:
 
 
 def read_runs(text: str) -> list[str]:
-    """Return what `--runs` names, each once, in order.
+    """Return the names in `--runs`, each once, in order.
 
     Raises:
         InvalidValueError: if one of the names is empty.

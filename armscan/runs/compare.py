@@ -1,4 +1,4 @@
-"""Two runs compared, point by point of all metrics that say what was learned."""
+"""Comparison of two runs, point by point, over all metrics of learning."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ N_SHOWN = 10
 
 @dataclass(frozen=True)
 class Difference:
-    """How one metric differs between two runs.
+    """Difference of one metric between two runs.
 
     Args:
         metric: Name of the metric.
@@ -41,7 +41,7 @@ class Difference:
 
     @property
     def is_same(self) -> bool:
-        """Whether all points of the first run are there again, the same to the last bit."""
+        """Return whether the second run has all points of the first, equal to the last bit."""
         return self.n_missing == 0 and self.largest == 0.0
 
     @property
@@ -70,11 +70,11 @@ class Comparison:
 
     @property
     def is_same(self) -> bool:
-        """Whether all that the first run has measured has come again, to the last bit."""
+        """Return whether the second run has all metrics of the first, equal to the last bit."""
         return bool(self.differences) and all(each.is_same for each in self.differences)
 
     def lines(self) -> list[str]:
-        """Return what a person is told."""
+        """Return the lines to print."""
         n_points = sum(each.n_points for each in self.differences)
         if not self.differences:
             return ["not the same: the first run has no metrics"]
@@ -88,7 +88,7 @@ class Comparison:
         return [told, *(f"  {each}" for each in unlike[:N_SHOWN]), *more]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as plain values, ready for JSON; what was not measured is None."""
+        """Return it as plain values, ready for JSON; missing measurements are None."""
         return {"is_same": self.is_same, "metrics": [asdict(each) for each in self.differences]}
 
 

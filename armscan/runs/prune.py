@@ -37,7 +37,7 @@ class PruneItem:
 
 
 def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneItem]:
-    """Return what is to become of the `CHECKPOINTS` or `FOLDERS` of runs; touch nothing."""
+    """Plan the removal of the `CHECKPOINTS` or `FOLDERS` of runs; remove nothing."""
     everything = {run.info.run_id: run for run in search(client, experiment_ids(client))}
     noted = defaultdict(set)
     for run_id, run in everything.items():
@@ -54,7 +54,7 @@ def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneIte
 
 
 def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
-    """Remove what a plan says of a run.
+    """Remove the files of a run that a plan names.
 
     Returns:
         Why the folder stays; None if it is gone, or was to stay.

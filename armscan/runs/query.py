@@ -1,4 +1,4 @@
-"""Which runs are meant: the words that say it, and the runs of a store that they fit."""
+"""Selection of runs in a store, and the options that select them."""
 
 from __future__ import annotations
 

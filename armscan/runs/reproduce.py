@@ -1,4 +1,4 @@
-"""A tracked run, made once more: what differs from then, and whether the same came of it."""
+"""Reproduction of a tracked run: differences from the original environment, and comparison of the results."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def load_original(tracking: str, run_id: str, *, trust: bool = False) -> Origina
 
 
 def _environment(text: str, run: FoundRun) -> Mapping[str, Any]:
-    """Return what a run has kept of its environment."""
+    """Return the environment that a run has kept."""
     try:
         kept = json.loads(text)
         return dict(kept) | {"packages": dict(kept["packages"])}
@@ -82,7 +82,7 @@ def _environment(text: str, run: FoundRun) -> Mapping[str, Any]:
 
 
 def differences(original: Original) -> list[str]:
-    """Return what is not as it was when a run was made, in a line each: code, packages, machine."""
+    """Return the differences from the original environment of a run, in a line each: code, packages, machine."""
     tags, now = original.run.tags, {**source().tags, **environment_tags()}
     lines = [
         f"{what} was {tags.get(tag, 'not kept')}, and is {now.get(tag, 'not kept')}"
@@ -117,7 +117,7 @@ def _changes(tags: Mapping[str, str]) -> str:
 
 
 def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Comparison:
-    """Make a run again, and compare what came of it.
+    """Repeat a run, and compare the results.
 
     Args:
         original: Run to reproduce.

@@ -1,4 +1,4 @@
-"""A line of a list: a run with what is known of it, and the runs that are folded into it."""
+"""Row of a list: a run with its figures, and the runs folded into it."""
 
 from __future__ import annotations
 
@@ -96,12 +96,12 @@ class RunRow:
 
     @property
     def started(self) -> datetime:
-        """When it was started, in local time."""
+        """Time of its start, in local time."""
         return datetime.fromtimestamp(self.run.info.start_time / 1000).astimezone()
 
     @property
     def duration_s(self) -> float | None:
-        """How long it took; None where it has not ended."""
+        """Duration in seconds; None if it has not ended."""
         # MLflow keeps the end of a run that goes on again.
         end = self.run.info.end_time if self.run.info.status in ENDED else None
         return None if end is None else (end - self.run.info.start_time) / 1000
@@ -113,7 +113,7 @@ class RunRow:
 
     @property
     def on_plane_rate(self) -> float | None:
-        """On-plane rate on the test volumes, within its leading limits; None where it was not evaluated."""
+        """On-plane rate on the test volumes, within its leading limits; None if it was not evaluated."""
         return self.run.data.metrics.get(f"test_volumes/{self.on_plane.metric}")
 
     @property

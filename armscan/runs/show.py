@@ -28,7 +28,7 @@ MAX_VALUE_CHARS = 200
 
 
 def show(client: TrackingStore, run: Run, uri: str) -> None:
-    """Print how a run was started and ended, its figures, files, children, and what can be done with it."""
+    """Print a run's start and end, its figures, files and children, and the commands that use it."""
     console, entry = wide_console(), RunRow(client, run)
     tags = {name: value for name, value in run.data.tags.items() if value}
     _print_pairs(console, "", _facts(run, entry))
@@ -93,7 +93,7 @@ def _print_figures(console: Console, run: Run) -> None:
 
 
 def _print_folder(console: Console, run: Run) -> OwnFolder | None:
-    """Print what lies in the run's folder, and what is at work there; return the folder."""
+    """Print the files in the run's folder and the process that uses it; return the folder."""
     try:
         ours = OwnFolder.of(run)
     except RunSkippedError as error:

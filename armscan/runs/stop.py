@@ -43,7 +43,7 @@ def target_of(run: Run) -> Target | None:
 
 
 def interrupt(run: Run) -> str:
-    """Interrupt the process of a run that is of no study, as Ctrl-C does; returns what will happen, in one line.
+    """Interrupt the process of a run outside a study, as Ctrl-C does; return the consequence in one line.
 
     Raises:
         TrackingError: If it is not running on this machine.

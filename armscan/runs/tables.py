@@ -126,7 +126,7 @@ def _values(row: RunRow) -> dict[str, Any]:
 
 
 def print_plan(cases: Sequence[PruneItem]) -> None:
-    """Print what would be removed, and why the rest would not."""
+    """Print the files that would be removed, and why the others would stay."""
     for case in cases:
         info = case.run.info
         named = f"{shortened(info.run_name)}, {info.status.lower()}, of {format_start(case.run)}"

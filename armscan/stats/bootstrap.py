@@ -1,14 +1,13 @@
-"""How sure a figure is: percentile bootstrap intervals of episodes that come from volumes.
+"""Percentile bootstrap intervals of episodes that come from volumes.
 
-Whoever reads a success rate wants to know it for *other* volumes, and episodes on one volume are alike. So volumes are
-drawn with replacement first, and then, in each of them, as many of its episodes as it has, with replacement too. Where
-there is one volume, that leaves a bootstrap of its episodes, which speaks of that volume alone. Whoever wants to know
-it for other *seeds* of a training as well has several of them: these are drawn before the volumes, and all that are
-drawn meet the same drawn volumes, as all have met the same ones.
+An interval is for *other* volumes, and episodes on one volume are alike. So a resample draws volumes with replacement,
+then as many episodes of each drawn volume as it has, with replacement too. With one volume this is a bootstrap of its
+episodes, and describes that volume only. With several *seeds* of a training, a resample draws the seeds first; all
+drawn seeds share the drawn volumes, as all seeds were evaluated on the same volumes.
 
-With K volumes this is a little too wide where volumes are alike, and too narrow, by about sqrt((K - 1) / K) and more
-for few, where they differ; no resampling can know volumes that it has never seen. Where every episode has the same
-value, as at a success rate of 100 %, it has no width at all; `wilson` has one then, of episodes taken as independent.
+With K volumes, the interval is a little too wide if volumes are alike. If they differ, it is too narrow, by about
+sqrt((K - 1) / K) and more for small K: no resampling knows volumes that it has never seen. If every episode has the
+same value, as at a success rate of 100 %, it has no width; `wilson` then gives one, for independent episodes.
 """
 
 from __future__ import annotations
@@ -129,7 +128,7 @@ def _estimate(value: float, resampled: FloatArray) -> Estimate:
 def _resamples(
     trainings: Sequence[Hashable], volumes: Sequence[Hashable], rng: np.random.Generator
 ) -> Iterator[NDArray[np.intp]]:
-    """Yield the places of the episodes of all resamples, shape (n_resamples, n_places), -1 for nobody's."""
+    """Yield the indices of the episodes of all resamples, shape (n_resamples, n_places), -1 for unused places."""
     of_training, of_volume = _numbered(trainings), _numbered(volumes)
     shape = int(of_training.max()) + 1, int(of_volume.max()) + 1
     sizes = np.zeros(shape, dtype=np.intp)

@@ -1,4 +1,4 @@
-"""When a plane counts as the labelled one: limits of distance and angle, and the share of episodes within them."""
+"""On-plane rate: the share of episodes within limits of distance and angle from the labelled plane."""
 
 from __future__ import annotations
 

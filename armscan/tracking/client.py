@@ -106,7 +106,7 @@ def why_away(error: BaseException) -> str | None:
 
 
 def reason_in(error: BaseException) -> str:
-    """Return what an error says, short and without a password."""
+    """Return the text of an error, short and without a password."""
     text = mask_passwords(" ".join(str(error).split()))
     if told := SHORT.search(text):
         return next(part for part in told.groups() if part).strip()

@@ -29,7 +29,7 @@ HEADER = re.compile(r"^(Name|Version): *(\S+)", re.MULTILINE)
 # Files that nobody has added to git are kept up to this size each: code, and not a volume beside it.
 MAX_UNTRACKED_BYTES = 2**20
 COMMIT, DIRTY, DIFF_SUM = "git.commit", "git.dirty", "git.diff.sha256"
-# Whatever a person has configured for their own eyes would be in the way of `git apply`.
+# A user's own settings of `git diff` would break `git apply`.
 PLAIN = ("--no-ext-diff", "--no-textconv", "--no-color", "--binary", "--src-prefix=a/", "--dst-prefix=b/")
 TIMEOUT_S = 30.0
 
@@ -94,7 +94,7 @@ class Source:
 
 @functools.cache
 def source() -> Source:
-    """Return the state of the code, once for a process, whose code stays what it was when it was loaded."""
+    """Return the state of the code, read once per process, because loaded code does not change."""
     return source_in(Path(__file__).parent)
 
 
@@ -126,7 +126,7 @@ def _diff(tree: Path) -> bytes:
 
 
 def _git(folder: Path, *arguments: str, index: Path | None = None, given: bytes = b"") -> bytes:
-    """Return what git answers, given something to read."""
+    """Return the output of git for this input."""
     # A hook of another repository would have its say here.
     variables = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     if index is not None:

@@ -1,4 +1,4 @@
-"""A run in the store by its id or the beginning of it, and what it has kept: configuration and checkpoint."""
+"""Find a run in the store by its ID or the ID's beginning; read its configuration and checkpoint."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class FoundRun:
         return fingerprints_in(self._started_with(VOLUMES_FILE, folder), f"run {self.run_id}: its {VOLUMES_FILE}")
 
     def text(self, file: str, folder: Path) -> str | None:
-        """Return what an artifact says, fetched into `folder`; None where the run has none of this name."""
+        """Return the text of an artifact, fetched into `folder`; None if the run has none of this name."""
         return self._fetched(file, folder).read_text(errors="replace") if file in self.files else None
 
     def _started_with(self, file: str, folder: Path) -> bytes:
@@ -114,7 +114,7 @@ class FoundRun:
 
 
 def load_run(uri: str, run_id: str) -> FoundRun:
-    """Return the run of an MLflow run ID, or of its first characters, with what it has kept.
+    """Return the run of an MLflow run ID, or of its first characters, with its files.
 
     Raises:
         TrackingError: if no run is meant, or several are, or the store does not exist or cannot be used.

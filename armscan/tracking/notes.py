@@ -1,4 +1,4 @@
-"""Notes of this machine: the runs that may have something to upload, or that nobody has ended."""
+"""Notes of this machine: runs with entries to upload, or without an end."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def forget(run_id: str) -> None:
 
 @dataclass(frozen=True)
 class Note:
-    """A note of this machine: a run, by its outbox, that may have something to upload, or that nobody has ended.
+    """Note of this machine about a run, by its outbox: it may have entries to upload, or no end.
 
     It names the address of the run's tracking store, and the process that tracks the run.
     """
@@ -54,7 +54,7 @@ class Note:
 
     @property
     def is_abandoned(self) -> bool:
-        """Whether the process that tracked the run is known to have died."""
+        """Return whether the process that tracked the run is known to have died."""
         return self.process.is_here and not self.process.is_alive
 
 

@@ -45,7 +45,7 @@ LOCK_TIMEOUT_S = 20.0
 
 @dataclass(frozen=True)
 class Address:
-    """Where the entries of an outbox belong: the ID of a run, and the address of its tracking store.
+    """Destination of an outbox: the ID of a run, and the address of its tracking store.
 
     Raises:
         TrackingError: if the ID is none; files are named after it.
@@ -108,7 +108,7 @@ class OutboxFile:
 
     @property
     def is_delivered(self) -> bool:
-        """Whether everything is uploaded."""
+        """Return whether everything is uploaded."""
         return all(not self.next_entries(channel, 1)[0] for channel in CHANNELS)
 
     @property

@@ -139,7 +139,7 @@ class TrackedRun:
             self._add(params=params)
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Make up for what was not logged any more when the run was killed; from now on the machine is watched."""
+        """Log the metrics that are missing because the run was killed, and start to watch the machine."""
         for report in earlier:
             self.on_epoch(report)
         if (every_s := self._store.system_metrics_s) is not None:
@@ -188,7 +188,7 @@ class TrackedRun:
             self._add(file=[name, place.as_posix()])
 
     def log_results(self, folder: Path) -> None:
-        """Keep what the run has made in its folder; nothing else that is there."""
+        """Upload the files that the run has made in its folder, and no others."""
         self.log_files(*(folder / name for name in RESULTS if (folder / name).is_file()))
 
     def __enter__(self) -> Self:

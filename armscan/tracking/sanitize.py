@@ -19,13 +19,13 @@ N_SUM_CHARS = 8
 
 
 def params_of(config: Mapping[str, Any]) -> dict[str, str]:
-    """Return the leaves of a configuration as MLflow's parameters; what is cut says where the whole is."""
+    """Return the leaves of a configuration as MLflow's parameters; a cut value names the file with the whole."""
     leaves = flattened(config)
     return {name_of(key): shortened(str(value), MAX_PARAM_CHARS, CONFIG_FILE) for key, value in leaves.items()}
 
 
 def tags_of(tags: Mapping[str, str], whole_in: str = CONFIG_FILE) -> dict[str, str]:
-    """Return tags as MLflow takes them; what is cut says in which file the whole is."""
+    """Return tags as MLflow accepts them; a cut value names the file with the whole."""
     return {name_of(key): shortened(value, MAX_TAG_CHARS, whole_in) for key, value in tags.items()}
 
 

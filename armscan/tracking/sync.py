@@ -1,4 +1,4 @@
-"""Upload what past runs could not, because the store was away or their process died."""
+"""Upload the entries that past runs could not, because the store was unreachable or their process died."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Delivery:
 
 
 def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = False) -> list[Delivery]:
-    """Deliver what the runs in a folder, and in the folders in it, have left.
+    """Deliver the entries of the runs in a folder and below it.
 
     Args:
         folder: folder of a run, of a study, or above them.
@@ -92,7 +92,7 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
 
 
 def _is_abandoned(run_id: str, file: Path) -> bool:
-    """Whether the process that kept a run's outbox in this file has died on this machine."""
+    """Return whether the process that kept a run's outbox in this file has died on this machine."""
     note = Note.of(run_id)
     return note is not None and note.is_abandoned and note.outbox == file.absolute()
 
@@ -107,7 +107,7 @@ def _end_removed(run_id: str, opened: Callable[[str], TrackingStore]) -> str | N
         if run.info.status == "RUNNING" and run.info.lifecycle_stage == "active":
             client.set_tag(run_id, FAILURE_TAG, FOLDER_REMOVED)
             client.set_terminated(run_id, "FAILED")
-    # Whatever a store raises: the next start tries again, unless the store has no such run.
+    # Any error of the store: the next start tries again, unless the store has no such run.
     except Exception as error:
         if getattr(error, "error_code", None) != NOT_THERE:
             return reason_in(error)
@@ -134,7 +134,7 @@ def _delivered(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Delivery
     for channel in CHANNELS:
         try:
             n_entries += deliver(outbox, store.mlflow, channel, is_whole=False, trust=trust)
-        # Whatever a store raises: what it does not take stays there, and the next channel may be taken.
+        # Any error of the store: refused entries stay in the outbox, and the next channel may be accepted.
         except Exception as error:
             left = reason_in(error)
     return Delivery(outbox.folder, outbox.address.run_id, n_entries, left)
@@ -155,7 +155,7 @@ def _check_own(outbox: Outbox, store: TrackingStore) -> None:
 
 
 def deliver_pending(store: TrackingStore) -> None:
-    """Deliver what earlier runs of a store have left on this machine; in the background, and once in a process."""
+    """Deliver the entries of a store's earlier runs on this machine, in the background, once per process."""
     if store.uri not in _looked_for:
         _looked_for.add(store.uri)
         threading.Thread(target=_deliver_pending, args=(store,), name="pending", daemon=True).start()

@@ -59,7 +59,7 @@ def _monitors() -> list[Any]:
             # That of the CPU says how busy it was since this thread has looked last.
             monitor.collect_metrics()
             monitor.clear_metrics()
-        # Whatever a machine without such a thing raises, as one without a GPU does.
+        # Any error of a machine without this device, such as one without a GPU.
         except Exception:
             continue
         monitors.append(monitor)

@@ -44,7 +44,7 @@ class Uploader:
 
     @property
     def is_away(self) -> bool:
-        """Whether the store is unavailable, as far as is known, rather than refusing entries."""
+        """Return whether the store is unavailable, as far as is known, rather than refusing entries."""
         return self._failure is None or why_away(self._failure) is not None
 
     def wake(self) -> None:
@@ -94,12 +94,12 @@ class Uploader:
             self._woken.wait()
 
     def _failed(self) -> Exception | None:
-        """Upload what there is; return the last error."""
+        """Upload all entries; return the last error."""
         failure = None
         for channel in CHANNELS:
             try:
                 deliver(self._outbox, self._store.mlflow, channel)
-            # Whatever a store raises: the entries stay in the outbox, and the training goes on.
+            # Any error of the store: the entries stay in the outbox, and the training goes on.
             except Exception as error:
                 failure = error
         return failure

@@ -1,4 +1,4 @@
-"""One training: splits, episodes and what they add up to, checkpoints, callbacks, progress, video."""
+"""Training: splits, episodes and their metrics, checkpoints, callbacks, progress, video."""
 
 from armscan.stats.on_plane import ON_PLANE, OnPlane, check_on_plane
 from armscan.training.baselines import evaluate_baselines

@@ -41,7 +41,7 @@ class TrainingDomain:
 
     @classmethod
     def of(cls, env: Env, slice_px: tuple[int, int] | None = None) -> Self:
-        """Return what an environment is like.
+        """Return the domain of an environment.
 
         Args:
             env: Environment with the volumes.
@@ -62,7 +62,7 @@ class TrainingDomain:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Read what `to_json` wrote.
+        """Read the JSON of `to_json`.
 
         Raises:
             InvalidValueError: If it is anything else.
@@ -84,7 +84,7 @@ class TrainingDomain:
                 )
 
     def differences(self, other: TrainingDomain) -> list[str]:
-        """Return in a sentence each what is silently different for an agent that is applied to other volumes."""
+        """Return the differences that an agent meets on other volumes, in a sentence each."""
         notes = []
         for what, here, there, means in (
             ("a pixel", self.pixel_mm, other.pixel_mm, "images and plain cluster numbers are of another scale"),

@@ -1,4 +1,4 @@
-"""How good an agent is: how whole episodes went, and what they add up to."""
+"""Results of episodes, and their metrics."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Env = gym.Env[Observed, FloatArray]
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult:
-    """How one episode went.
+    """Result of an episode.
 
     Args:
         volume: Name of the volume.
@@ -97,7 +97,7 @@ EPISODE_FIELDS = tuple(each.name for each in fields(EpisodeResult))
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Episodes and what they add up to; every mean is over all episodes unless its name says otherwise.
+    """Episodes and their metrics; every mean is over all episodes unless its name says otherwise.
 
     Args:
         episodes: Episodes of the evaluation.

@@ -113,7 +113,7 @@ class MetricEstimates:
 
     @classmethod
     def of_metrics(cls, metrics: Mapping[str, float], *, n_seeds: int = 1) -> MetricEstimates:
-        """Return what `metrics` gave, or a run has kept; without an interval where there is none.
+        """Return estimates from the numbers of `metrics` or of a run; without an interval if there is none.
 
         Args:
             metrics: Numbers by the name of the metric.

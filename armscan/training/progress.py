@@ -85,7 +85,7 @@ class ProgressLines:
 
 
 def _summary(report: EpochReport) -> str:
-    """Return what the validation of an epoch has measured, the leading rate first."""
+    """Return the figures of an epoch's validation, the leading rate first."""
     evaluation = report.evaluation
     leading, metrics = evaluation.on_plane[0], evaluation.metrics()
     return (

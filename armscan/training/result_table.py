@@ -1,4 +1,4 @@
-"""The table of results: the same figures, with the same names, wherever a result is shown.
+"""The table of results, with the same figures and names everywhere.
 
 Every figure is over all episodes, failed ones included, with its 95 % interval, and its name says which statistic it
 is. The share of episodes that end on the labelled plane leads: the reward also accepts planes far from it.
@@ -106,7 +106,7 @@ class ResultTable:
         return shown or [Quantity(name, name.replace("_", " ") + ", mean", "{:.3g}") for name in sorted(known)]
 
     def show(self, width: int) -> list[Table | Text]:
-        """Return what to print on a terminal: a few results side by side, many as lines.
+        """Return the table for a terminal: a few results side by side, many as lines.
 
         Args:
             width: Width of the terminal, in characters; columns that do not fit are left out, and named.

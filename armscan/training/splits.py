@@ -1,4 +1,4 @@
-"""Which volumes an agent is trained on, which choose its checkpoint, and which judge it at the end."""
+"""Splits of volumes into training, validation and test."""
 
 from __future__ import annotations
 

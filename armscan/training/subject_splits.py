@@ -1,4 +1,4 @@
-"""Which subjects of a folder are trained, validated and tested on: named ones, shares, or folds of cross-validation."""
+"""Splits of a folder's subjects into training, validation and test: by name, by share, or by fold."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def parts_by_subject(
 
 
 def _drawn(dataset: Dataset, wanted: Wanted, path: str, split_seed: int) -> dict[str, str]:
-    """Return the split of each volume: first what is named, then shares of the subjects that are left."""
+    """Return the split of each volume: named subjects first, then shares of the others."""
     subjects = dataset.subjects
     parts: dict[str, str] = {}
     shares: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""How people call metrics, and read their values."""
+"""Titles of metrics, and formats of their values."""
 
 from __future__ import annotations
 

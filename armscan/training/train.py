@@ -19,7 +19,7 @@ from armscan.utils.validation import check_choice, check_float, check_int
 
 @dataclass(frozen=True, kw_only=True)
 class SolvedCriterion:
-    """When training may stop before its budget is spent.
+    """Criterion that stops the training before its budget is spent.
 
     Args:
         success_rate: Lowest success rate on the validation episodes, in [0, 1].
@@ -37,7 +37,7 @@ class SolvedCriterion:
         check_int("training.solved.n_epochs", self.n_epochs, at_least=1)
 
     def holds(self, reports: Sequence[EpochReport]) -> bool:
-        """Whether the last epochs fulfil it."""
+        """Return whether the last epochs meet it."""
         last = reports[-self.n_epochs :]
         return len(last) == self.n_epochs and all(
             report.evaluation.success_rate >= self.success_rate and report.evaluation.mean_steps <= self.mean_steps
@@ -47,7 +47,7 @@ class SolvedCriterion:
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """How long to train, and how often to validate.
+    """Budget of a training: its length, and its validations.
 
     Args:
         env_steps: Largest number of environment steps; rounded up to the number that the agent takes at once.

@@ -1,4 +1,4 @@
-"""Who may ask a server of this machine, and what the files that it serves may do in a browser."""
+"""Protection of local servers: allowed hosts, and a sandbox for the files that they serve."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class HostCheck:
 
 
 def _sandboxed(start_response: StartResponse) -> StartResponse:
-    """Return what starts an answer with the headers of `SANDBOX`."""
+    """Return a `start_response` that adds the headers of `SANDBOX`."""
 
     def start(status: str, headers: list[tuple[str, str]], *error: Any) -> Any:
         return start_response(status, [*headers, *SANDBOX], *error)

@@ -73,7 +73,7 @@ def show(
 
 
 def _has_runs(uri: str) -> bool:
-    """Whether a database has the tables of MLflow, which would create them."""
+    """Return whether a database has the tables of MLflow, which would create them."""
     from sqlalchemy.exc import SQLAlchemyError
 
     from armscan.sweeps.storage.database import tables_in

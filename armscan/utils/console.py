@@ -15,7 +15,7 @@ LOG_CHARS, WHOLE_CHARS = 160, 10_000
 
 
 def wide_console(log_chars: int = LOG_CHARS) -> Console:
-    """Return a console as wide as the terminal; what is no terminal takes longer lines.
+    """Return a console as wide as the terminal; output to a file or pipe has longer lines.
 
     Args:
         log_chars: Length of the longest line if the output is no terminal and `COLUMNS` is not set. Default: 160.

@@ -58,7 +58,7 @@ SQLITE_PREFIX = "sqlite:///"
 
 
 def cache_folder() -> Path:
-    """Return the folder of what a machine keeps for all runs: `$ARMSCAN_CACHE`, or else the user's cache folder."""
+    """Return the machine's cache folder for all runs: `$ARMSCAN_CACHE`, or else the user's cache folder."""
     named = os.environ.get("ARMSCAN_CACHE")
     return Path(named) if named else Path(platformdirs.user_cache_dir("armscan"))
 
@@ -101,7 +101,7 @@ def _place(path: Path, *, follow_link: bool) -> Path:
 
 @contextlib.contextmanager
 def named_if_full(path: Path) -> Iterator[None]:
-    """Name what is written in the error of a full disk, which only says so itself where a file is opened.
+    """Name the file in the error of a full disk, which itself names it only when a file is opened.
 
     Args:
         path: File, or folder of several files.
@@ -155,7 +155,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def is_made_by_run(name: str) -> bool:
-    """Whether a file of this name, relative to the folder of a run, is one that runs make there."""
+    """Return whether a file of this name, relative to the folder of a run, is one that runs make there."""
     return (
         name in (*STARTED_WITH, *RESULTS, *RECORDS)
         or fnmatch.fnmatchcase(name, RESUMED_DIFF_FILE.format("*"))
@@ -178,7 +178,7 @@ def check_free(folder: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what a process that was killed in the middle of a write has left; for who holds the folder."""
+    """Remove the unfinished files of a process that was killed during a write; requires the folder's lock."""
     for file in folder.glob(f".*.{UNFINISHED}"):
         file.unlink(missing_ok=True)
 

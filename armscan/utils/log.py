@@ -10,7 +10,7 @@ from armscan.errors import printable
 
 
 def log(text: str) -> None:
-    """Print a line with the time; what a worker prints is its log."""
+    """Print a line with the time, for the log of a worker."""
     print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {printable(text)}", flush=True)
 
 

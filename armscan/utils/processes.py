@@ -23,7 +23,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"
 
 
 def limit_threads() -> None:
-    """Set one compute thread for this process, if nobody has said otherwise, before a library starts its pool.
+    """Set one compute thread for this process, unless the user set another number, before a library starts its pool.
 
     Small networks are fastest so, and jobs side by side never claim more threads than there are cores.
     """
@@ -54,7 +54,7 @@ def process_start(pid: int) -> str:
 
 
 def _boot_and_pid_namespace() -> tuple[str, str]:
-    """Return what tells the process IDs of this process from those of others with its host name."""
+    """Return the boot ID and the PID namespace, which tell processes of hosts with the same name apart."""
     if not psutil.LINUX:
         return "any", "any"
     try:
@@ -110,18 +110,18 @@ class ProcessInfo:
 
     @property
     def is_here(self) -> bool:
-        """Whether it is a process that this one sees, of which it is known whether it is alive."""
+        """Return whether it is a process that this one sees, of which it is known whether it is alive."""
         own = (socket.gethostname(), *_boot_and_pid_namespace())
         return all(own) and own == (self.host, self.boot, self.pid_namespace)
 
     @property
     def is_alive(self) -> bool:
-        """Whether it has not ended; a process that is not seen from here is taken to be alive."""
+        """Return whether it has not ended; a process that is not seen from here is taken to be alive."""
         return not self.is_here or process_start(self.pid) == self.started != ""
 
     @property
     def is_current(self) -> bool:
-        """Whether it is the current process."""
+        """Return whether it is the current process."""
         return self.is_here and self.pid == os.getpid()
 
 

@@ -66,7 +66,7 @@ def check_choice(name: str, value: T, allowed: Sequence[T]) -> T:
 
 
 def check_numbers(name: str, value: Any, length: int, meaning: str) -> tuple[float, ...]:
-    """Return `value` as a tuple of `length` finite floats; `meaning` says of what: '(rz, rx) in degrees'."""
+    """Return `value` as a tuple of `length` finite floats; `meaning` describes them, such as '(rz, rx) in degrees'."""
     if type(value) is tuple and [type(number) for number in value] == [float] * length and math.isfinite(sum(value)):
         # What every step of an environment gives; the checks below cost more than the rest of its plane.
         return value
@@ -101,7 +101,7 @@ def check_path(name: str, value: Any) -> Path:
 
 
 def _is_finite(value: Any) -> bool:
-    """Whether `value` is a number, not a truth value, that a float can hold."""
+    """Return whether `value` is a number, not a truth value, that a float can hold."""
     try:
         return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:

@@ -1,4 +1,4 @@
-"""A folder of labelmaps with a manifest that says what they are."""
+"""A folder of labelmaps with a manifest that describes them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SHARED_KEYS = ("labels", "orientation", "axes", "overlap")
 
 @dataclass(frozen=True)
 class Dataset:
-    """The volumes of a folder, and what its manifest says about them.
+    """The volumes of a folder, described by its manifest.
 
     Args:
         volumes: Volumes by file name, without the excluded ones.

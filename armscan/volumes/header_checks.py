@@ -132,7 +132,7 @@ def _text_header(path: Path) -> bytes:
 
 
 def _fields(path: Path, header: bytes, separator: str) -> dict[str, str]:
-    """Return what the lines of a header say, by the names of its fields, the first where one is twice."""
+    """Return the fields of a header by name; the first of two with the same name."""
     text = header.decode(errors="surrogateescape").replace("\r\n", "\n")
     # The reading library takes some of them for the end of a line or of the text.
     if re.search(r"[\0-\x08\x0b-\x1f\x7f]", text):

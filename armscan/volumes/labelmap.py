@@ -1,4 +1,4 @@
-"""Which values or segments of a file are which tissue."""
+"""Mapping from the values or segments of a file to tissues."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Source = int | str
 
 @dataclass(frozen=True)
 class LabelMap:
-    """Which values (of plain labelmaps) or segments by name (of .seg.nrrd files) are which tissue.
+    """Mapping from values (of plain labelmaps) or segment names (of .seg.nrrd files) to tissues.
 
     Several sources may be one tissue: segmentations often number every bone by itself. The value 0 is background where
     no tissue names it.
@@ -75,7 +75,7 @@ class LabelMap:
 
     @classmethod
     def from_mapping(cls, mapping: Any) -> Self:
-        """Build a label map from what a manifest says, {'bones': [1, 2], ...}."""
+        """Build a label map from a manifest's entry, {'bones': [1, 2], ...}."""
         allowed = [field.name for field in fields(cls)]
         if not isinstance(mapping, Mapping):
             raise InvalidValueError(f"labels is {mapping!r}, but it must be a mapping with {', '.join(allowed)}")
@@ -89,7 +89,7 @@ class LabelMap:
         return {source: label for tissue, label in TISSUE_LABELS.items() for source in getattr(self, tissue)}
 
     def label_of(self, source: Source) -> int | None:
-        """Return the label, 0 to 4, of what a file holds; None where the map does not name it and refuses others."""
+        """Return the label, 0 to 4, of a value or segment; None if the map does not name it and refuses others."""
         unnamed = BACKGROUND if self.others == "background" or source == 0 else None
         return self.by_source.get(source, unnamed)
 

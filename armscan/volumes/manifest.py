@@ -1,4 +1,4 @@
-"""The file that says what a folder's volumes are: finding it, reading and checking it, writing planes into it."""
+"""Find, read and check a folder's manifest; write planes into it."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def _load(path: Path) -> Document:
 
 
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> Document:
-    """Refuse what JSON allows and everybody regrets: a key that is there twice, the first one forgotten."""
+    """Refuse duplicate keys, of which JSON keeps only the last one."""
     check_no_duplicates([key for key, _ in pairs])
     return dict(pairs)
 

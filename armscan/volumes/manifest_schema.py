@@ -1,4 +1,4 @@
-"""Schema of a manifest, loaded only when one is read; `docs/manifest.md` describes it for those who write one."""
+"""Schema of a manifest, loaded only when one is read; `docs/manifest.md` describes it for users."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class _Strict(BaseModel):
 
 
 class _Settings(_Strict):
-    """What an entry and the whole manifest can say; the description of each key says what its value must be."""
+    """Keys of an entry and of the whole manifest; each key's description states its allowed values."""
 
     labels: Labels | None = None
     orientation: Orientation = None
@@ -83,7 +83,7 @@ class VolumeEntry(_Settings):
 
 
 class Splits(_Strict):
-    """Which subjects are for what."""
+    """Subjects of each split."""
 
     train: Annotated[tuple[str, ...], BeforeValidator(_subjects)] = ()
     validation: Annotated[tuple[str, ...], BeforeValidator(_subjects)] = ()
@@ -101,19 +101,19 @@ class Splits(_Strict):
 
 
 class Manifest(_Settings):
-    """A whole manifest; what stands at the top holds for every volume whose entry says nothing else."""
+    """A whole manifest; keys at the top are the defaults of every volume's entry."""
 
     spacing: Literal["own", "finest"] = Field(default="own", description="own or finest")
     splits: Splits | None = Field(default=None, description="lists of subjects under train, validation and test")
     volumes: dict[Text, VolumeEntry] | None = Field(default=None, description="entries by the names of the files")
 
     def setting(self, entry: VolumeEntry, key: str) -> Any:
-        """Return what holds for a volume: its own value where its entry has the key, else the one for all."""
+        """Return a volume's value of a key: from its own entry, else from the top of the manifest."""
         return getattr(entry if key in entry.model_fields_set else self, key)
 
 
 def check_manifest(document: dict[str, Any], path: Path) -> Manifest:
-    """Return what a manifest says; raise `ManifestError` if that is nothing that it may say."""
+    """Return the checked manifest; raise `ManifestError` if a value is not allowed."""
     try:
         return Manifest.model_validate(document)
     except ValidationError as error:

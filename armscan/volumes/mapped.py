@@ -65,7 +65,7 @@ def mapped_volume(path: Path, make: Callable[[], Made]) -> Made:
 
 
 def open_mapped(path: Path) -> Made | None:
-    """Return a volume whose voxels are those of the file itself, and what else was kept; None if there is no sound one.
+    """Return a volume with the file's own voxels, and the facts beside it; None if there is no intact file.
 
     Args:
         path: Place of the file.
@@ -123,7 +123,7 @@ def _next_page(n_bytes: int) -> int:
 
 
 def _make_room(kept: Path) -> None:
-    """Remove files that nobody has opened for longest until the folder is within its limit, and those of the killed."""
+    """Remove the least recently opened files until the folder is within its limit, and those of killed processes."""
     limit = limit_bytes()
     for unfinished in kept.parent.glob(f".*{SUFFIX}.*.{UNFINISHED}"):
         with contextlib.suppress(OSError):

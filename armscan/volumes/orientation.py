@@ -40,7 +40,7 @@ def check_orientation(value: Any) -> str | None:
 
 
 def check_crop(value: Any) -> Crop | None:
-    """Return what is kept, such as {'y': (20.0, 180.0)} in mm, if it is a range along some axes; None stays None."""
+    """Return the checked crop, ranges along some axes such as {'y': (20.0, 180.0)} in mm; None stays None."""
     if value is None:
         return None
     if not isinstance(value, Mapping) or not value or any(axis not in tuple(AXES) for axis in value):
@@ -57,7 +57,7 @@ def check_crop(value: Any) -> Crop | None:
 
 
 def orientation_of(direction: FloatArray) -> str:
-    """Return what the axes run towards, such as 'LPS', by their largest components where they are oblique.
+    """Return the directions of the axes, such as 'LPS'; oblique axes count by their largest components.
 
     Args:
         direction: Directions of the axes in the world (left, posterior, superior), as columns, shape (3, 3).

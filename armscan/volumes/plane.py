@@ -85,7 +85,7 @@ class ManipulatorAction:
 
     @property
     def offset_mm(self) -> FloatArray:
-        """Where the plane's origin lies in the volume: (tx, ty, 0)."""
+        """Return the plane's origin in the volume, (tx, ty, 0) in mm."""
         return np.array([*self.translation, 0.0])
 
     @property
@@ -139,7 +139,7 @@ class RigidTransform:
         return composed(self.matrix, self.offset_mm, action.matrix, action.offset_mm)
 
     def inverse_plane(self, action: ManipulatorAction) -> ManipulatorAction:
-        """Return the plane of the moved volume that shows what `action` shows of the unmoved one.
+        """Return the plane of the moved volume that shows the same slice as `action` in the unmoved one.
 
         The result is the same set of points. Where the motion turns about X as well, the picture may be turned and
         shifted within the plane, because a `ManipulatorAction` has neither a rotation about Y nor a shift in depth.

@@ -28,7 +28,7 @@ ON_EDGE = 1e-6
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """How a file is read; see `read_volume`."""
+    """Options for reading a file; see `read_volume`."""
 
     labels: LabelMap | None = None
     orientation: str | None = None
@@ -122,7 +122,7 @@ def read_stored(
 
 
 def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, tuple[Found, ...]]:
-    """Return the file as a SimpleITK image of the labels 0 to 4, and what was found in it."""
+    """Return the file as a SimpleITK image of the labels 0 to 4, and the values found in it."""
     # Deferred: it takes long to load, and who steps through phantoms never needs it.
     import SimpleITK
 

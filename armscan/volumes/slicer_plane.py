@@ -94,7 +94,7 @@ def _only_plane(document: Any, path: Path) -> dict[str, Any]:
 
 
 def _shown(markup: dict[str, Any], path: Path) -> Plane | None:
-    """Return the plane that Slicer shows; None where what it takes for that is not there."""
+    """Return the plane that Slicer shows; None if the file lacks the entries for it."""
     # Files without a type are from before there were several.
     kind = markup.get("planeType", "threePoints")
     if not isinstance(kind, str) or kind.lower() not in PLANE_TYPES:

@@ -27,7 +27,7 @@ GZIP, GZIP_OR_ZLIB = 31, 47
 
 @dataclass(frozen=True)
 class StoredVoxels:
-    """Where voxels are stored.
+    """Location of voxels in a file.
 
     Args:
         file: File that holds the voxels.

@@ -62,7 +62,7 @@ class VolumeReport:
 
 
 def missing_sources(labels: LabelMap | None, found: tuple[Found, ...]) -> tuple[Source, ...]:
-    """Return what the label map names and the file lacks: values of a plain file, names of a segmentation."""
+    """Return the entries of the label map that the file lacks: values of a plain file, names of a segmentation."""
     if labels is None:
         return ()
     there = {each.source for each in found if each.n_voxels}

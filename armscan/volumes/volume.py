@@ -1,4 +1,4 @@
-"""A labelmap volume: what the agent moves its plane through."""
+"""A labelmap volume, through which the agent moves its plane."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class LabelVolume:
 
     @classmethod
     def from_checked(cls, labels: NDArray[np.uint8], *, direction: FloatArray, fingerprint: str, **rest: Any) -> Self:
-        """Return a volume of what an earlier one has checked; its labels are not copied.
+        """Return a volume with the checked labels of an earlier one, which are not copied.
 
         Args:
             labels: Labels of the earlier volume, C-contiguous and not writeable.

@@ -28,7 +28,7 @@ from benchmarks.sweeps.studies import by_worker, finish
 
 OF_STUDY = ("config", "opened", "report", "keep_seed", "show_picture")
 N_WORKERS = 2
-# A minute of training for each trial, whatever its learning rate.
+# A minute of training for each trial, with any learning rate.
 TRAINING = (
     *(
         "study.task._target_=benchmarks.sweeps.overhead.TimedTraining",

@@ -28,7 +28,7 @@ class Waited(NamedTuple):
 def wait(
     number: int, shortest_s: float, longest_s: float, on_part: Callable[[int], None] = lambda part: None
 ) -> Waited:
-    """Wait as long as the trial of this number takes, whichever platform runs it.
+    """Wait as long as the trial of this number takes, on any platform.
 
     Args:
         number: of the trial.

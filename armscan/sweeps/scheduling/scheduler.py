@@ -91,7 +91,7 @@ class TrialScheduler:
         outcome.is_told = True
 
     def has_more(self, state: StudyState) -> bool:
-        """Whether a trial can be claimed now."""
+        """Return whether a trial can be claimed now."""
         enough = len(state.finished) + len(state.running) >= self.limits.n_trials
         return not enough and self.end(state) is None and (self._is_open or bool(state.waiting))
 

@@ -98,7 +98,7 @@ class Parameter:
         return cls(name, distribution, {key: tuple(map(as_kept, values)) for key, values in several.items()})
 
     def applies(self, chosen: Mapping[str, Value]) -> bool:
-        """Whether it is searched where these values were chosen before."""
+        """Return whether it is searched where these values were chosen before."""
         return all(name in chosen and chosen[name] in values for name, values in self.when.items())
 
     def suggest(self, trial: BaseTrial) -> Value:

@@ -90,7 +90,7 @@ def _wanted(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]
 
 
 def is_ours(study: optuna.Study) -> bool:
-    """Whether a study was made here, and not by somebody else's program in the same storage.
+    """Return whether a study was made here, and not by somebody else's program in the same storage.
 
     Raises:
         InvalidValueError: if a user attribute of it is of another type than armscan writes.

@@ -44,7 +44,7 @@ class LivenessCheck:
         self._seen: dict[int, tuple[Any, float, float]] = {}
 
     def is_dead(self, trial: FrozenTrial) -> bool:
-        """Whether the worker of a running trial has ended, or has not renewed its lease for long."""
+        """Return whether the worker of a running trial has ended, or has not renewed its lease for long."""
         lease = trial.user_attrs.get(LEASE, {})
         holder = ProcessInfo.of(lease)
         if holder.is_here:

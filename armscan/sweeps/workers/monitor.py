@@ -31,7 +31,7 @@ class StudyMonitor:
         self._liveness: dict[str, LivenessCheck] = defaultdict(LivenessCheck)
 
     def is_over(self) -> bool:
-        """Whether no trial is running, and none is missing."""
+        """Return whether no trial is running, and none is missing."""
         for phase in self._opened.phases:
             phase.scheduler.look_for_stop()
             state = phase.scheduler.state()
@@ -43,7 +43,7 @@ class StudyMonitor:
         return not missing_final_trials(self._opened.settings, search.study, final.scheduler.study)
 
     def is_alive(self) -> bool:
-        """Whether the worker of any trial is."""
+        """Return whether the worker of any trial is."""
         return any(
             not self._liveness[phase.name].is_dead(trial)
             for phase in self._opened.phases

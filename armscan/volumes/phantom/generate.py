@@ -22,7 +22,7 @@ VERSIONS = {1: draw_wrist, 2: draw_varied_wrist}
 
 
 class Pose(NamedTuple):
-    """How a wrist lies in the field of view: (rz, rx) in degrees, its tunnel's middle, scale, left or right."""
+    """Pose of a wrist in the field of view: (rz, rx) in degrees, its tunnel's middle, scale, left or right."""
 
     rotation: tuple[float, float]
     origin_mm: FloatArray

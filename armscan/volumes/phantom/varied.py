@@ -41,7 +41,7 @@ EVEN = np.ones(2)
 
 
 class _Place(NamedTuple):
-    """Where and how thick the tubes of a part are, by what `Tube.arrange` takes.
+    """Place and thickness of a part's tubes, as arguments of `Tube.arrange`.
 
     `spread_mm` is the standard deviation (x, y, z) in mm by which each tube lies elsewhere than the others.
     """

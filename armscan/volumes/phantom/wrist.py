@@ -124,7 +124,7 @@ def _accessory_bones(rng: np.random.Generator) -> Iterator[Tube]:
 
 
 def _beyond(joint: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Where the next bone begins after a joint."""
+    """Return the start of the next bone after a joint."""
     x, y, z = joint
     return x, y - 2.0, z
 
