@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from armscan.reports.groups import Group
 from armscan.reports.load import TrackedTraining
 
-# An animated picture starts when it is first shown, and is shared by all images with its address: each start has new ones.
+# An animated picture starts when first shown, and all images with its address share it: each start has new addresses.
 PROGRAM = """
 <script>
 (() => {
