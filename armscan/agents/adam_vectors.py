@@ -21,7 +21,7 @@ class AdamVectors:
         optimiser: Adam, with one group of parameters.
 
     Attributes:
-        weights: the vectors.
+        weights: Weights of all parameters, in one vector.
     """
 
     def __init__(self, optimiser: torch.optim.Optimizer) -> None:

@@ -38,7 +38,7 @@ class BaseLearner(ABC):
         """Take over what `weights` returned.
 
         Raises:
-            CheckpointError: if it is that of another network.
+            CheckpointError: If it is that of another network.
         """
         load_into(self._network, weights)
 
@@ -64,10 +64,10 @@ class SupervisedLearner(BaseLearner):
     its state bit for bit.
 
     Args:
-        network: the network, which the optimiser is given to.
-        lr: learning rate at the beginning.
-        envs: training environments, of `setup`.
-        setup: environments, spaces, budget and seed of the agent.
+        network: Network to train, which the optimiser updates.
+        lr: Initial learning rate.
+        envs: Training environments of `setup`.
+        setup: Environments, spaces, budget and seed of the agent.
     """
 
     def __init__(self, network: nn.Module, lr: float, envs: Any, setup: AgentSetup) -> None:
@@ -90,7 +90,7 @@ class SupervisedLearner(BaseLearner):
         """Learn for one epoch of at least `n_env_steps`; returns its training metrics by name.
 
         Raises:
-            DivergedError: if the weights are not finite afterwards.
+            DivergedError: If the weights are not finite afterwards.
         """
         self._n_epochs += 1
         for_draws, for_envs, for_others = self._epoch_seeds()
@@ -113,8 +113,8 @@ class SupervisedLearner(BaseLearner):
         """Play and learn until this many environment steps were taken in all.
 
         Args:
-            n_env_steps: number of environment steps.
-            seeds: seed of the first episode of each environment.
+            n_env_steps: Number of environment steps.
+            seeds: Seed of the first episode of each environment.
             rng: NumPy generator of all other random numbers.
 
         Returns:
@@ -141,7 +141,7 @@ class SupervisedLearner(BaseLearner):
         """Take over what `state` returned.
 
         Raises:
-            CheckpointError: if it is that of another agent.
+            CheckpointError: If it is that of another agent.
         """
         self.load_weights(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
@@ -171,7 +171,7 @@ def load_into(module: nn.Module, weights: dict[str, Any]) -> None:
     """Give a network its weights.
 
     Raises:
-        CheckpointError: if they are those of another network.
+        CheckpointError: If they are those of another network.
     """
     try:
         module.load_state_dict(weights)

@@ -60,17 +60,19 @@ class Exhaustive:
     an episode by itself.
 
     Raises:
-        InvalidValueError: if a value is impossible.
+        InvalidValueError: If a value is impossible.
     """
 
     swept: Sequence[str] | None = ("ty",)
-    """One or two components, None for all free ones; more would take thousands of planes even in wide steps."""
+    """Components to sweep, one or two. None: all free ones; more than two would take thousands of planes even in wide
+    steps.
+    """
 
     step_mm: float = 5.0
-    """Between planes along swept translations."""
+    """Distance between planes along swept translations, in mm."""
 
     step_deg: float = 10.0
-    """Between planes about swept rotations."""
+    """Angle between planes about swept rotations, in degrees."""
 
     def __post_init__(self) -> None:
         check_float("agent.step_mm", self.step_mm, at_least=0.01, at_most=1e6)
@@ -89,7 +91,7 @@ class Exhaustive:
         """Make an agent.
 
         Raises:
-            InvalidValueError: if a component to be swept is not free, or more than two are.
+            InvalidValueError: If a component to be swept is not free, or more than two are.
         """
         free = setup.action_names
         swept = tuple(name for name in COMPONENTS if name in (free if self.swept is None else self.swept))
@@ -133,7 +135,7 @@ class ExhaustiveAgent:
         """Return all planes in their order, normalised, shape (n_planes, n_free).
 
         Raises:
-            InvalidValueError: if the steps are so small that there are more than a million.
+            InvalidValueError: If the steps are so small that there are more than a million.
         """
         # Half a component's range, counted in steps. The normalised middle is 0 for rotations and translations alike.
         halves = [self._half_range_steps(name, bounds) for name in self._swept]

@@ -27,9 +27,9 @@ class BatchAgent(Protocol):
         """Return the next action of some of the episodes, shape (n, n_free); see `Agent.act`.
 
         Args:
-            observations: observation of the current plane of each, shape (n, ...).
-            rewards: reward of each plane, shape (n,), from -1 to 0.
-            episodes: number of each episode, its place among the seeds, shape (n,).
+            observations: Observation of each current plane, shape (n, ...).
+            rewards: Reward of each plane, shape (n,), in [-1, 0].
+            episodes: Number of each episode, its index among the seeds, shape (n,).
         """
 
 
@@ -37,7 +37,7 @@ class OneAtATime:
     """Plays each episode with a copy of an agent that acts in one at a time.
 
     Args:
-        agent: the agent, which is left as it is.
+        agent: Agent to copy; it does not change.
     """
 
     def __init__(self, agent: Agent) -> None:

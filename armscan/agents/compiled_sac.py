@@ -34,7 +34,7 @@ class UpdateStats(sac.SACTrainingStats):
     """Means over some gradient steps."""
 
     gradient_steps: int
-    """How many there were."""
+    """Number of gradient steps."""
 
 
 class CompiledSAC(sac.SAC[Any]):
@@ -44,12 +44,12 @@ class CompiledSAC(sac.SAC[Any]):
     from the other's state. Policy, buffer, collector, trainer and the format of the state are Tianshou's.
 
     Args:
-        compute: device and precision of the tensors.
-        replay: replay buffer that it learns from.
-        arguments: keyword arguments of Tianshou's SAC.
+        compute: Device and precision of the tensors.
+        replay: Replay buffer to learn from.
+        arguments: Keyword arguments of Tianshou's SAC.
 
     Attributes:
-        why_tianshou: why updates are left to Tianshou; None where they are compiled.
+        why_tianshou: Reason why Tianshou computes the updates; None if they are compiled.
     """
 
     def __init__(self, *, compute: Compute, replay: ReplayBuffer, **arguments: Any) -> None:
@@ -77,9 +77,9 @@ class CompiledSAC(sac.SAC[Any]):
         """Take compiled gradient steps.
 
         Args:
-            buffer: replay buffer.
-            sample_size: transitions of each batch.
-            n_updates: number of gradient steps, 1 or more.
+            buffer: Replay buffer.
+            sample_size: Number of transitions in each batch.
+            n_updates: Number of gradient steps, 1 or more.
         """
         start_s = time.perf_counter()
         transitions = kernels.Transitions(buffer.obs, buffer.obs_next, buffer.act, buffer.rew, buffer.terminated)

@@ -21,12 +21,13 @@ class Compute:
     """Device and precision of tensors, and compilation of networks.
 
     Args:
-        device: `cpu`, `cuda`, or `auto` for `cuda` where there is one.
-        precision: `float32`, or `bfloat16` for mixed precision: products in 16 bits, sums and weights in 32.
-        compile: whether networks go through `torch.compile`, which takes a minute and a C++ compiler.
+        device: Device of the tensors: `cpu`, `cuda`, or `auto` for `cuda` if there is one.
+        precision: Precision of the products: `float32`, or `bfloat16` for mixed precision (products in 16 bits, sums
+            and weights in 32).
+        compile: Whether to compile networks with `torch.compile`, which takes a minute and requires a C++ compiler.
 
     Raises:
-        InvalidValueError: if a value is unknown, or there is no such device here.
+        InvalidValueError: If a value is unknown, or there is no such device here.
     """
 
     device: str = "auto"

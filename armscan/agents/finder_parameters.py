@@ -18,27 +18,30 @@ class FinderParameters:
     """Parameters of `PlaneFinder`: looks, network, loss and doubt.
 
     Raises:
-        InvalidValueError: if a value is impossible.
+        InvalidValueError: If a value is impossible.
     """
 
     offsets_mm: Sequence[float] = (9.0, -9.0, 0.0)
-    """How far beside the plane found so far the next look is, after each look; as many as there are looks, the start
-    among them. The last is 0: the answer."""
+    """Offset of the next look along the normal from the plane found so far, in mm, after each look, the start included.
+    The last is 0: the answer.
+    """
 
     n_seen: int = 3
-    """The latest looks that the network sees; at most as many as there are."""
+    """Number of latest looks that the network sees; at most the number of looks."""
 
     filters: Sequence[int] = (12, 24, 36)
-    """Of each of the three convolutions."""
+    """Filters of each of the three convolutions."""
 
     hidden_sizes: Sequence[int] = (128, 128)
-    """Units of each layer after them."""
+    """Units of each layer after the convolutions."""
 
     sure_mm: float | None = None
-    """It looks no further where it expects to be less than this off, and than `sure_deg`; None: it takes all looks."""
+    """Expected error in mm below which, together with `sure_deg`, the agent takes no further looks. None: it takes all
+    looks.
+    """
 
     sure_deg: float | None = None
-    """See `sure_mm`; both or none are given."""
+    """Expected error in degrees, see `sure_mm`; give both or none."""
 
     lr: float = number(1.5e-3, above=0.0, at_most=1.0)
     """Learning rate of Adam."""
@@ -47,23 +50,24 @@ class FinderParameters:
     """Final learning rate as a fraction of `lr`, reached along half a cosine."""
 
     num_envs: int = 48
-    """Episodes of one gradient step, all looks of which are learned from."""
+    """Number of episodes of one gradient step, which learns from all their looks."""
 
     loss_mm: float = number(1.0, above=0.0, at_most=100.0)
-    """Error along the normal from which on the loss grows linearly, of all looks but the first: five times as much."""
+    """Error along the normal, in mm, from which on the loss grows linearly; five times as much for the first look."""
 
     loss_deg: float = number(3.0, above=0.0, at_most=90.0)
-    """Likewise of the angle; of the first look twice as much."""
+    """Error of the angle, in degrees, from which on the loss grows linearly; twice as much for the first look."""
 
     loss_across_mm: float = number(6.0, above=0.0, at_most=100.0)
-    """Likewise of where the slice's middle lies across."""
+    """Error of the slice's middle across, in mm, from which on the loss grows linearly."""
 
     astray_share: float = number(0.3, at_least=0.0, at_most=1.0)
-    """Share of the looks in training that are led astray, by up to some mm and degrees."""
+    """Share of the training looks that are moved away at random, by up to some mm and degrees."""
 
     phantom_share: float | None = None
-    """Share of the episodes in training that are on phantoms, where there are other volumes beside them; None: every
-    volume is as frequent as any other."""
+    """Share of the training episodes on phantoms, if there are other volumes beside them. None: every volume is equally
+    frequent.
+    """
 
     def __post_init__(self) -> None:
         for each in fields(self):

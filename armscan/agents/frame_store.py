@@ -24,7 +24,7 @@ def encode(pixels: Pixels) -> bytes:
     would take no fewer bytes than there are pixels, the pixels themselves are returned.
 
     Args:
-        pixels: pixels of one frame, shape (n_pixels,).
+        pixels: Pixels of one frame, shape (n_pixels,).
     """
     buffer = np.empty(pixels.size, dtype=np.uint8)
     n_bytes = _encode(pixels, buffer)

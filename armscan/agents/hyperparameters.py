@@ -23,23 +23,23 @@ class Parameters:
     Fields of subclasses are checked by their types: whole numbers are at least 1, others within their limits.
 
     Raises:
-        InvalidValueError: if a value is outside what is allowed.
+        InvalidValueError: If a value is outside what is allowed.
     """
 
     network: NetworkChoice
-    """Of the actor, and of the critics where there are any."""
+    """Network of the actor, and of the critics if the algorithm has critics."""
 
     lr: float = number(1e-3, above=0.0, at_most=1.0)
     """Learning rate of the networks."""
 
     lr_end_factor: float = number(1.0, at_least=0.0, at_most=1.0)
-    """Final learning rate as a fraction of `lr`, reached linearly; default: 1, constant."""
+    """Final learning rate as a fraction of `lr`, reached linearly. Default: 1, constant."""
 
     batch_size: int = 256
-    """Transitions, or slices, of one gradient step."""
+    """Number of transitions, or slices, in one gradient step."""
 
     num_envs: int = 16
-    """Training environments that are stepped side by side."""
+    """Number of training environments that are stepped side by side."""
 
     def __post_init__(self) -> None:
         check_network(self.network)
@@ -62,7 +62,7 @@ class PolicyParameters(Parameters):
     """Hyperparameters of every algorithm whose policy explores while it learns."""
 
     deterministic_eval: bool = True
-    """Whether the policy is evaluated by its mode; false: its actions are sampled, as they are during training."""
+    """Whether evaluations use the mode of the policy. False: they sample actions, as training does."""
 
 
 def round_up(n_env_steps: int, num_envs: int) -> int:
@@ -79,13 +79,13 @@ def check_collection(n_asked: int, num_envs: int, setup: AgentSetup, *, learning
     """Return the environment steps of one collection, if the training has as many.
 
     Args:
-        n_asked: environment steps that are asked for.
-        num_envs: environments, which all take as many.
-        setup: training environments, observation space, action names, budget in environment steps, seed and compute.
-        learning_starts: taken before the first collection.
+        n_asked: Requested number of environment steps.
+        num_envs: Number of environments, each of which takes the same number of steps.
+        setup: Training environments, observation space, action names, budget in environment steps, seed and compute.
+        learning_starts: Number of environment steps before the first collection.
 
     Raises:
-        InvalidValueError: if it has not.
+        InvalidValueError: If it has not.
     """
     n_collected, n_left = round_up(n_asked, num_envs), setup.total_env_steps - learning_starts
     if n_collected > n_left:

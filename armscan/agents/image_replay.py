@@ -36,9 +36,9 @@ class ImageReplay(Replay):
     Two batches of the same transitions, asked for one after the other, share the memory of their images.
 
     Args:
-        size: number of transitions in all.
-        n_envs: number of environments.
-        images: the parts of an observation that are images, by name.
+        size: Total number of transitions.
+        n_envs: Number of environments.
+        images: Names of the observation's parts that are images.
     """
 
     def __init__(self, size: int, n_envs: int, images: Mapping[str, spaces.Box]) -> None:

@@ -30,9 +30,9 @@ def linear_rows(rows: Rows, weights: Rows, bias: Rows) -> Rows:
     """Return `rows @ weights.T + bias`; each number is summed alone, in the order of the inputs, from its bias on.
 
     Args:
-        rows: shape (n, n_inputs).
-        weights: shape (n_outputs, n_inputs), as torch keeps them.
-        bias: shape (n_outputs,).
+        rows: Inputs, shape (n, n_inputs).
+        weights: Weights, shape (n_outputs, n_inputs), as torch keeps them.
+        bias: Bias, shape (n_outputs,).
     """
     by_input = np.ascontiguousarray(weights.T)
     answers = np.empty((rows.shape[0], bias.size), dtype=np.float32)
@@ -52,10 +52,10 @@ class Inference:
     """Chooses an actor's actions without exploration, for the episodes that `begin` has begun.
 
     Args:
-        actor: gives mean and spread of the actions; asked with the weights that it has at the time.
-        bounded: takes an action to [-1, 1].
-        compute: device and precision of the actor.
-        is_sampling: whether actions are drawn from mean and spread; an episode's draws all come from its own seed.
+        actor: Actor that returns mean and spread of the actions, with its weights at the time.
+        bounded: Function that maps an action to [-1, 1].
+        compute: Device and precision of the actor.
+        is_sampling: Whether actions are drawn from mean and spread; all draws of an episode come from its own seed.
     """
 
     def __init__(self, actor: nn.Module, bounded: Bounded, compute: Compute, *, is_sampling: bool = False) -> None:
@@ -78,8 +78,8 @@ class Inference:
         """Return an action for each observation of a batch, shape (n, n_free), within [-1, 1].
 
         Args:
-            observations: shape (n, ...).
-            episodes: the episode of each, by its place among the seeds.
+            observations: Observations, shape (n, ...).
+            episodes: Episode of each observation, its index among the seeds.
         """
         with torch.no_grad():
             if self._layers is not None:

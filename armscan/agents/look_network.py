@@ -29,11 +29,11 @@ class LookNetwork(nn.Module):
     other, which changes nothing of the features that it is given, how far off that is to be, in mm and degrees.
 
     Args:
-        image_shape: tissues, across and depth of a look's image.
-        n_seen: number of the latest looks that are seen.
-        n_looks: number of looks of an episode.
-        filters: filters of each convolution.
-        hidden_sizes: units of each linear layer.
+        image_shape: Shape of a look's image: tissues, across, depth.
+        n_seen: Number of latest looks that the network sees.
+        n_looks: Number of looks of an episode.
+        filters: Filters of each convolution.
+        hidden_sizes: Units of each linear layer.
     """
 
     units: Tensor
@@ -71,10 +71,10 @@ class LookNetwork(nn.Module):
         """Return the place of the wanted plane, shape (n, 4), and the expected errors, shape (n, 2), both above 0.
 
         Args:
-            images: the looks of an episode from the oldest on, shape (n, n_looks, tissues, across, depth), bytes.
-            actions: their planes, normalised, shape (n, n_looks, 4).
-            step: which of the looks the latest is, one-hot, shape (n, n_looks).
-            geometry: free components and bounds of the planes, in degrees and mm.
+            images: Looks of an episode from the oldest on, bytes of shape (n, n_looks, tissues, across, depth).
+            actions: Planes of the looks, normalised, shape (n, n_looks, 4).
+            step: Number of the latest look, one-hot, shape (n, n_looks).
+            geometry: Free components and bounds of the planes, in degrees and mm.
         """
         looks = images[:, -self._n_seen :].flatten(1, 2).float() / 255.0
         planes = geometry.planes(actions)
@@ -92,11 +92,12 @@ class FinderModule(nn.Module):
     Which look of the episode the latest is follows from the stack of observations: it is filled with the first one.
 
     Args:
-        network: network for the looks.
-        geometry: free components and bounds of the planes, in degrees and mm.
-        offsets_mm: how far beside the plane that is found so far the next look is, after each look; the last is 0.
-        sure: expected errors, in mm and degrees, below which it looks no further; None: it always takes all looks.
-        has_stop: whether actions end with the component `stop`, as with `env.ends=on_stop`.
+        network: Network for the looks.
+        geometry: Free components and bounds of the planes, in degrees and mm.
+        offsets_mm: Offset of the next look along the normal from the plane found so far, in mm, after each look; the
+            last is 0.
+        sure: Expected errors, in mm and degrees, below which it takes no further looks. None: it takes all looks.
+        has_stop: Whether actions end with the component `stop`, as with `env.ends=on_stop`.
     """
 
     offsets: Tensor

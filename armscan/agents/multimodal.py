@@ -30,12 +30,12 @@ class Multimodal:
     units, after the network of Mnih et al. 2015 (doi:10.1038/nature14236).
 
     Args:
-        filters: number of filters of each convolution.
-        vector_sizes: units of each layer for the vectors.
-        head_sizes: units of each layer of the head but the output.
+        filters: Number of filters of each convolution.
+        vector_sizes: Units of each layer for the vectors.
+        head_sizes: Units of each layer of the head but the output.
 
     Raises:
-        InvalidValueError: if a size is not a whole number of at least 1.
+        InvalidValueError: If a size is not a whole number of at least 1.
     """
 
     def __init__(

@@ -20,11 +20,11 @@ class MultimodalBody(ModuleWithVectorOutput):
     """All of the network but its output.
 
     Args:
-        space: space of the observations.
-        n_action: components of the action that a critic judges, 0 for none.
-        filters: number of filters of each convolution.
-        vector_sizes: units of each layer for the vectors.
-        head_sizes: units of each layer of the head but the output.
+        space: Space of the observations.
+        n_action: Number of components of the action that a critic judges; 0 for an actor.
+        filters: Number of filters of each convolution.
+        vector_sizes: Units of each layer for the vectors.
+        head_sizes: Units of each layer of the head but the output.
     """
 
     def __init__(
@@ -51,10 +51,10 @@ class MultimodalBody(ModuleWithVectorOutput):
         """Return the features of a batch of observations, shape (n, head_sizes[-1]), and the state as it came.
 
         Args:
-            obs: the parts by name, each shape (n, ...).
-            state: state of recurrent networks, unused.
-            info: unused.
-            act: the actions to be judged, shape (n, n_action).
+            obs: Parts of the observations by name, each of shape (n, ...).
+            state: State of recurrent networks, unused.
+            info: Unused.
+            act: Actions to judge, shape (n, n_action).
         """
         device = torch_device(self)
         vectors = [obs[name] for name in self._vectors] + ([] if act is None else [act])

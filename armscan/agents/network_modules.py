@@ -15,10 +15,10 @@ def mlp_body(space: spaces.Space[Any], hidden_sizes: list[int], activation: str,
     """Return fully connected layers for flat observations, and beside them actions with `n_action` components.
 
     Args:
-        space: space of one observation.
-        hidden_sizes: units of each hidden layer.
-        activation: name of the layer of `torch.nn` after each of them.
-        n_action: components of the action that a critic judges. Default: 0, none.
+        space: Space of one observation.
+        hidden_sizes: Units of each hidden layer.
+        activation: Name of the `torch.nn` layer after each hidden layer.
+        n_action: Number of components of the action that a critic judges. Default: 0, for an actor.
     """
     return Net(
         state_shape=space.shape or (),

@@ -30,7 +30,7 @@ class NetworkChoice(Protocol):
         """Return the network for such observations; a network returns itself, if it can take them.
 
         Raises:
-            InvalidValueError: if none can; the reason is said.
+            InvalidValueError: If none can; the reason is said.
         """
 
 
@@ -41,9 +41,9 @@ class Network(NetworkChoice, Protocol):
         """Return a Gaussian actor.
 
         Args:
-            observation_space: space of one observation.
-            n_free: components of an action.
-            log_std: initial logarithm of the standard deviation; None: it depends on the observation.
+            observation_space: Space of one observation.
+            n_free: Number of components of an action.
+            log_std: Initial logarithm of the standard deviation. None: it depends on the observation.
         """
 
     def critic(self, observation_space: spaces.Space[Any], n_action: int = 0) -> nn.Module:
@@ -54,11 +54,11 @@ class MLP:
     """Fully connected layers, for flat observations.
 
     Args:
-        hidden_sizes: units of each hidden layer.
-        activation: after each of them.
+        hidden_sizes: Units of each hidden layer.
+        activation: Name of the `torch.nn` layer after each hidden layer.
 
     Raises:
-        InvalidValueError: if a size is not a whole number of at least 1, or the activation is unknown.
+        InvalidValueError: If a size is not a whole number of at least 1, or the activation is unknown.
     """
 
     def __init__(self, hidden_sizes: Sequence[int] = (64, 64), activation: str = "relu") -> None:
@@ -95,8 +95,8 @@ class NetworkByObservation:
     """The network that fits the observation: one for vectors, one for those with images.
 
     Args:
-        vector: for one vector.
-        images: for parts among which there are images.
+        vector: Network for an observation that is one vector.
+        images: Network for an observation of parts with images among them.
     """
 
     def __init__(self, vector: NetworkChoice, images: NetworkChoice) -> None:
@@ -118,7 +118,7 @@ def check_network(network: NetworkChoice, name: str = "network") -> NetworkChoic
     """Return the network, or the choice between some, if it is one; `name` says which it is in messages.
 
     Raises:
-        InvalidValueError: if it cannot say which network takes an observation.
+        InvalidValueError: If it cannot say which network takes an observation.
     """
     if isinstance(network, type) or not callable(getattr(network, "for_space", None)):
         by_name = f"; on the command line network={network} chooses one by its name" if isinstance(network, str) else ""

@@ -16,9 +16,9 @@ class EvenUpdatesTrainer(OffPolicyTrainer):
     training that goes on later takes the same gradient steps as one that was never cut off. No progress bar is shown.
 
     Args:
-        algorithm: algorithm that is trained.
-        params: parameters of the trainer.
-        learning_starts: environment steps before the first collection.
+        algorithm: Algorithm to train.
+        params: Parameters of the trainer.
+        learning_starts: Number of environment steps before the first collection.
     """
 
     def __init__(self, algorithm: CompiledSAC, params: OffPolicyTrainerParams, learning_starts: int) -> None:

@@ -29,14 +29,16 @@ class OptunaSearch:
     sampler itself: its CMA-ES takes a single dimension too, which earlier versions of Optuna answered by random planes.
 
     Raises:
-        InvalidValueError: if a value is impossible.
+        InvalidValueError: If a value is impossible.
     """
 
     sampler: str = "tpe"
-    """`tpe`, `cmaes`, or `gp`, which takes some 50 ms for a plane where the others take one."""
+    """Sampler of Optuna: `tpe`, `cmaes`, or `gp`, which takes some 50 ms per plane where the others take one."""
 
     n_startup_trials: int | None = None
-    """Random planes before the sampler's model is used; None for its own number: 10 for TPE and GP, 1 for CMA-ES."""
+    """Number of random planes before the sampler's model is used. None: the sampler's own number, 10 for TPE and GP, 1
+    for CMA-ES.
+    """
 
     def __post_init__(self) -> None:
         check_choice("agent.sampler", self.sampler, SAMPLERS)

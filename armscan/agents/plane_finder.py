@@ -30,14 +30,14 @@ class PlaneFinder(FinderParameters):
     expected to be, in mm and degrees; it is scaled to be right on average on the validation volumes.
 
     Raises:
-        InvalidValueError: if a value is impossible.
+        InvalidValueError: If a value is impossible.
     """
 
     def agent(self, setup: AgentSetup) -> PlaneFinderLearner:
         """Make an agent that has learned nothing yet.
 
         Raises:
-            InvalidValueError: if the environment does not show or allow what it needs, or the training is too short.
+            InvalidValueError: If the environment does not show or allow what it needs, or the training is too short.
         """
         if setup.action_names[: len(COMPONENTS)] != COMPONENTS:
             raise InvalidValueError(

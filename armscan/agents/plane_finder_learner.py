@@ -40,8 +40,8 @@ class PlaneFinderLearner(SupervisedLearner):
     """Plays episodes in all environments at once, and takes a gradient step on all their looks.
 
     Args:
-        finder: parameters.
-        setup: environments, spaces, budget and seed of the agent.
+        finder: Parameters of the agent.
+        setup: Environments, spaces, budget and seed of the agent.
     """
 
     def __init__(self, finder: FinderParameters, setup: AgentSetup) -> None:
@@ -172,7 +172,7 @@ class PlaneFinderLearner(SupervisedLearner):
         """Learn that an episode begins, in which nothing is drawn.
 
         Raises:
-            InvalidValueError: if actions mean other planes than in training.
+            InvalidValueError: If actions mean other planes than in training.
         """
         given, known = (*bounds.rotation_deg, *bounds.translation_mm), self._module.geometry.bounds.tolist()
         if not np.allclose(given, known, atol=1e-3):

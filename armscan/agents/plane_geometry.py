@@ -25,8 +25,8 @@ class PlaneGeometry(nn.Module):
     where across the middle of its own slice lies, in mm.
 
     Args:
-        bounds: ranges of the components.
-        middle_mm: middle of every slice, (across, depth) from the plane's origin.
+        bounds: Ranges of the components, in degrees and mm.
+        middle_mm: Middle of every slice, (across, depth) in mm from the plane's origin.
     """
 
     bounds: Tensor
@@ -68,9 +68,9 @@ class PlaneGeometry(nn.Module):
         """Return the planes that lie at `seen` in the frames of planes, moved along their normals; shape (n, 4).
 
         Args:
-            planes: planes, shape (n, 4).
-            seen: as `seen_from` returns it, shape (n, 4).
-            beside_mm: way along the normals, shape (n,).
+            planes: Planes, shape (n, 4).
+            seen: Offsets and angles in the frame of the planes, shape (n, 4); see `seen_from`.
+            beside_mm: Offset along the normals, in mm, shape (n,).
         """
         tilt = seen[:, :2]
         tilt = tilt * (MOST_TILT / tilt.norm(dim=1, keepdim=True).clamp(min=MOST_TILT))
@@ -126,7 +126,7 @@ def common_geometry(rules: Rules, n_looks: int) -> PlaneGeometry:
     Slices of other sizes are seen about their own middle, so that the mean of the middles serves all of them.
 
     Raises:
-        InvalidValueError: if that differs between volumes, or an episode may end before all looks are taken.
+        InvalidValueError: If that differs between volumes, or an episode may end before all looks are taken.
     """
     if rules.ends == ON_REWARD or rules.max_steps < n_looks:
         raise InvalidValueError(

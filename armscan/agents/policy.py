@@ -21,10 +21,10 @@ class Policy(nn.Module):
     """A copy of a learner's actor, in 32 bits on the CPU, with the mean of its actions as its answer.
 
     Args:
-        actor: gives mean and spread of the actions.
-        bounded: takes the mean to [-1, 1], as the learner does when it acts.
-        compute: device and precision that the learner computes with.
-        is_sampling: whether the learner draws its actions from mean and spread, also where it is judged.
+        actor: Actor that returns mean and spread of the actions.
+        bounded: Function that maps the mean to [-1, 1], as the learner does when it acts.
+        compute: Device and precision that the learner computes with.
+        is_sampling: Whether the learner draws its actions from mean and spread, in evaluations too.
     """
 
     def __init__(

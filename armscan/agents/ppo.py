@@ -19,37 +19,37 @@ class PPO(PolicyParameters):
     """Proximal policy optimisation (Schulman et al. 2017, arXiv:1707.06347) with a clipped objective."""
 
     gamma: float = number(0.9, at_least=0.0, at_most=1.0)
-    """Discount; planes are absolute, so that what comes much later matters little."""
+    """Discount factor; planes are absolute, so later rewards matter little."""
 
     gae_lambda: float = number(0.95, at_least=0.0, at_most=1.0)
-    """Of generalised advantage estimation: nearer to 1 trusts the rewards, nearer to 0 the critic."""
+    """Lambda of generalised advantage estimation, in [0, 1]: nearer to 1 trusts the rewards, nearer to 0 the critic."""
 
     clip_range: float = number(0.2, at_least=0.0, at_most=1000.0)
-    """How far an action's probability may move from what it was, as a ratio, before that stops being rewarded."""
+    """Clipping range: largest change of an action's probability, as a ratio, that is still rewarded."""
 
     ent_coef: float = number(0.003, at_least=0.0, at_most=1000.0)
-    """Weight of the policy's entropy; higher where it settles too early."""
+    """Weight of the policy's entropy; increase it if the policy settles too early."""
 
     vf_coef: float = number(0.5, at_least=0.0, at_most=1000.0)
     """Weight of the critic's loss."""
 
     max_grad_norm: float = number(0.5, above=0.0, at_most=1e6)
-    """To which the gradient is clipped."""
+    """Norm to which gradients are clipped."""
 
     normalize_advantage: bool = True
-    """Whether advantages are normalised in each batch, which then has two transitions at least."""
+    """Whether to normalise advantages in each batch, which must then have two transitions or more."""
 
     conditioned_sigma: bool = False
     """Whether the policy's standard deviation depends on the observation."""
 
     log_std_init: float = number(-0.5, at_least=-20.0, at_most=2.0)
-    """Logarithm of the policy's standard deviation at first, where it does not depend on the observation."""
+    """Initial logarithm of the policy's standard deviation, if it does not depend on the observation."""
 
     env_steps_per_collection: int = 2_048
-    """Environment steps between two rounds of updates, rounded up to as many for each environment."""
+    """Number of environment steps between two rounds of updates, rounded up to the same number for each environment."""
 
     n_epochs: int = 8
-    """How often each round of updates goes through all that was collected."""
+    """Number of passes of each round of updates over the collected transitions."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,7 +63,7 @@ class PPO(PolicyParameters):
         """Make an agent that has learned nothing yet.
 
         Raises:
-            InvalidValueError: if the training is shorter than a collection, a collection too small for a batch, or the
+            InvalidValueError: If the training is shorter than a collection, a collection too small for a batch, or the
                 network cannot take the observations.
         """
         network = self.network.for_space(setup.observation_space)

@@ -30,16 +30,16 @@ class Agent(Protocol):
         """Begin an episode; all that belongs to it is assigned anew, so that copies do not share it.
 
         Args:
-            seed: seed of the agent's random numbers in this episode.
-            bounds: ranges of the action's components on the episode's volume, in degrees and mm.
+            seed: Seed of the agent's random numbers in this episode.
+            bounds: Ranges of the action's components on the episode's volume, in degrees and mm.
         """
 
     def act(self, observation: Observed, reward: float) -> NDArray[Any]:
         """Return the next action, shape (n_free,), within [-1, 1], as it is judged: without exploration.
 
         Args:
-            observation: observation of the current plane.
-            reward: of the current plane, which is the start's before the first action.
+            observation: Observation of the current plane.
+            reward: Reward of the current plane, which is the start before the first action.
         """
 
 
@@ -89,14 +89,14 @@ class AgentSetup:
     """Everything an agent is made from beside its own parameters.
 
     Args:
-        make_envs: factory of the requested number of training environments, without autoreset.
-        observation_space: observation space of one environment.
-        action_names: names of the components of an action, in order, such as `("rz", "ty")`, or `("rz", "ty", "stop")`.
-        total_env_steps: budget of the training in environment steps.
-        seed: seed of the environments, networks and replay buffer.
-        compute: device and precision of the tensors.
-        make_validation_envs: likewise on the validation volumes, for what a learner sets by them; None, the default,
-            where it does not learn.
+        make_envs: Factory of training environments, called with their number; without autoreset.
+        observation_space: Observation space of one environment.
+        action_names: Names of an action's components, in order, such as `("rz", "ty")`, or `("rz", "ty", "stop")`.
+        total_env_steps: Budget of the training, in environment steps.
+        seed: Seed of the environments, networks and replay buffer.
+        compute: Device and precision of the tensors.
+        make_validation_envs: Factory of environments on the validation volumes, for learners that fit parameters there.
+            Default: None, for an agent that does not learn.
     """
 
     make_envs: VectorEnvFactory

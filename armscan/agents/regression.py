@@ -23,18 +23,19 @@ class Regression(Parameters):
     et al. 2011, arXiv:1011.0686).
 
     Raises:
-        InvalidValueError: if a value is impossible.
+        InvalidValueError: If a value is impossible.
     """
 
     buffer_size: int = 100_000
-    """Slices that are kept, the latest; never more than the whole training takes."""
+    """Number of latest slices to keep; never more than the whole training takes."""
 
     utd_ratio: float = number(0.25, above=0.0, at_most=1000.0)
-    """Gradient steps for each environment step."""
+    """Number of gradient steps for each environment step."""
 
     own_planes_share: float = number(0.0, at_least=0.0, at_most=1.0)
-    """Share of the planes to learn from that lie near those that the network itself would choose; the others are
-    random. Slices near the wanted plane, on which it has to be exact, are rare among random ones."""
+    """Share of the training planes that lie near the network's own choices, in [0, 1]; the others are random. Slices
+    near the wanted plane, which require precision, are rare among random ones.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -47,7 +48,7 @@ class Regression(Parameters):
         """Make an agent that has learned nothing yet.
 
         Raises:
-            InvalidValueError: if the training takes too few steps to learn anything, or the network cannot take the
+            InvalidValueError: If the training takes too few steps to learn anything, or the network cannot take the
                 observations.
         """
         network = self.network.for_space(setup.observation_space)

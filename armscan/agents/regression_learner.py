@@ -30,12 +30,12 @@ class RegressionLearner(SupervisedLearner):
     """Fits a network to the optimal actions of observed planes; default: random planes.
 
     Args:
-        network: kind of network; the mean of its actor's actions is fitted.
-        setup: environments, spaces, budget and seed of the agent.
-        parameters: learning rates, batch size and number of environments.
-        size: number of slices that are kept.
-        utd_ratio: gradient steps for each environment step.
-        own_planes_share: share of the planes to learn from that lie near those that the network would choose.
+        network: Kind of network; the mean of its actor's actions is fitted.
+        setup: Environments, spaces, budget and seed of the agent.
+        parameters: Learning rates, batch size and number of environments.
+        size: Number of slices to keep.
+        utd_ratio: Number of gradient steps for each environment step.
+        own_planes_share: Share of the training planes that lie near the network's own choices, in [0, 1].
     """
 
     def __init__(

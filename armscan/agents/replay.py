@@ -35,8 +35,8 @@ class Replay(VectorReplayBuffer):
         """Add a transition of each of these environments, which are all where none are named.
 
         Args:
-            batch: parts of the transitions by name, a `Batch` or a dict, each of shape (n, ...).
-            buffer_ids: environments, shape (n,). Default: None, all of them.
+            batch: Parts of the transitions by name, a `Batch` or a dict, each of shape (n, ...).
+            buffer_ids: Environments of the transitions, shape (n,). Default: None, all environments.
 
         Returns:
             Places of the transitions; returns and lengths of episodes that end with them, 0 for others; and where the

@@ -28,31 +28,34 @@ class SAC(PolicyParameters):
     """Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) with a learned entropy coefficient."""
 
     ent_coef_init: float = number(0.1, above=0.0, at_most=1000.0)
-    """Initial entropy coefficient; rewards here are small, so that 1 would drown them for long."""
+    """Initial entropy coefficient; rewards here are small, so 1 would dominate them for long."""
 
     ent_coef_lr: float = number(3e-4, above=0.0, at_most=1.0)
     """Learning rate of the entropy coefficient."""
 
     target_entropy_per_dim: float = number(-2.0, at_least=-1000.0, at_most=1000.0)
-    """The policy's wanted entropy for each action component; lower where it oscillates instead of settling."""
+    """Target entropy of the policy for each action component; decrease it if the policy oscillates instead of settling.
+    """
 
     gamma: float = number(0.9, at_least=0.0, at_most=1.0)
-    """Discount; planes are absolute, so that what comes much later matters little."""
+    """Discount factor; planes are absolute, so later rewards matter little."""
 
     tau: float = number(0.005, at_least=0.0, at_most=1.0)
-    """How far the target critics move towards the critics at each update."""
+    """Rate at which the target critics follow the critics at each update."""
 
     buffer_size: int = 100_000
-    """Transitions that the replay buffer holds; never more than the whole training takes."""
+    """Number of transitions in the replay buffer; never more than the whole training takes."""
 
     learning_starts: int = 2_000
-    """Steps with random actions before the first update, rounded up to as many for each environment."""
+    """Number of environment steps with random actions before the first update, rounded up to the same number for each
+    environment.
+    """
 
     env_steps_per_collection: int = 16
-    """Environment steps between two rounds of updates, rounded up to as many for each environment."""
+    """Number of environment steps between two rounds of updates, rounded up to the same number for each environment."""
 
     utd_ratio: float = number(0.25, above=0.0, at_most=1000.0)
-    """Gradient steps for each environment step, on average; they are what training costs."""
+    """Mean number of gradient steps for each environment step; they are most of the training's cost."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,7 +68,7 @@ class SAC(PolicyParameters):
         """Make an agent that has learned nothing yet.
 
         Raises:
-            InvalidValueError: if the training takes too few steps to learn anything, or the network cannot take the
+            InvalidValueError: If the training takes too few steps to learn anything, or the network cannot take the
                 observations.
         """
         network = self.network.for_space(setup.observation_space)

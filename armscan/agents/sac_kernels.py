@@ -347,13 +347,14 @@ def update(
     """Take k gradient steps, each of the critics, then of the actor and the entropy coefficient; move the targets.
 
     Args:
-        transitions: all transitions of the replay buffer.
-        indices: of the transitions of each batch, shape (k, n).
-        noise: standard normal, for the actions after the transitions and those before; shape (k, 2, n, n_free).
-        agent: networks and settings.
-        actor_layers: memory for the actor's layers.
-        critic_layers: memory for a critic's layers.
-        losses: filled with the losses of actor, critics and entropy coefficient, and the coefficient; shape (k, 5).
+        transitions: All transitions of the replay buffer.
+        indices: Indices of the transitions of each batch, shape (k, n).
+        noise: Standard normal noise for the actions after the transitions and before, shape (k, 2, n, n_free).
+        agent: Networks and settings.
+        actor_layers: Memory for the actor's layers.
+        critic_layers: Memory for a critic's layers.
+        losses: Array to fill with the losses of actor, critics and entropy coefficient, and the coefficient, shape (k,
+            5).
     """
     n, tau = indices.shape[1], F(agent.tau)
     obs, actions = _layer(actor_layers.values, actor_layers.sizes, n, 0), np.empty(noise.shape[2:], F)

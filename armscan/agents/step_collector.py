@@ -28,9 +28,9 @@ class StepCollector(Collector[CollectStats]):
     only to be copied into the replay buffer. `_is_plain` holds the whole rule of when they are spared.
 
     Args:
-        policy: policy that acts.
-        envs: training environments.
-        replay: replay buffer that transitions are added to.
+        policy: Policy that chooses the actions.
+        envs: Training environments.
+        replay: Replay buffer to add transitions to.
     """
 
     def __init__(self, policy: Any, envs: TianshouVectorEnv, replay: Replay) -> None:
@@ -116,9 +116,9 @@ class StepCollector(Collector[CollectStats]):
         """Take a step in all environments and keep the transitions.
 
         Args:
-            observations: observations of the current planes.
-            actions: the policy's actions, which are kept, shape (n_envs, n_free).
-            sent: the same as the environments take them.
+            observations: Observations of the current planes.
+            actions: Actions of the policy, which are stored, shape (n_envs, n_free).
+            sent: The same actions in the form that the environments take.
 
         Returns:
             The observations to go on from, those of new episodes included; and the returns and lengths of the episodes

@@ -18,9 +18,9 @@ class SupervisedBuffer:
     """Observations with the optimal actions of their episodes; the oldest make way for new ones.
 
     Args:
-        size: maximum number of observations.
-        space: space of one observation.
-        n_free: components of an action.
+        size: Maximum number of observations.
+        space: Space of one observation.
+        n_free: Components of an action.
     """
 
     def __init__(self, size: int, space: spaces.Space[Any], n_free: int) -> None:

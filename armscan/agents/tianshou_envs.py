@@ -25,11 +25,11 @@ class TianshouVectorEnv(BaseVectorEnv):
     `info` is left out, because a replay buffer would store it with every transition.
 
     Args:
-        envs: steps all environments at once.
+        envs: Steps all environments at once.
 
     Attributes:
-        n_ended: episodes that have ended since somebody set it to 0.
-        n_successes: number of them that ended on a rewarded plane.
+        n_ended: Number of episodes that have ended since it was set to 0.
+        n_successes: Number of these episodes that ended on a rewarded plane.
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:

@@ -45,11 +45,11 @@ class TianshouLearner(BaseLearner):
     episode has to be kept for a training to go on later exactly as it would have gone on at once.
 
     Args:
-        trainer: with `training_parameters`.
-        bounded: takes the mean of the policy's actions to [-1, 1], as the trainer's policy does.
-        parameters: parameters of the algorithm; the learning rates fall by as much in each epoch as it has steps.
-        setup: environments, spaces, budget and seed of the agent.
-        learning_starts: steps with random actions before the first update; default: none.
+        trainer: Trainer of Tianshou, with `training_parameters`.
+        bounded: Function that maps the mean of the policy's actions to [-1, 1], as the trainer's policy does.
+        parameters: Parameters of the algorithm; learning rates fall in each epoch in proportion to its steps.
+        setup: Environments, spaces, budget and seed of the agent.
+        learning_starts: Number of environment steps with random actions before the first update. Default: 0.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class TianshouLearner(BaseLearner):
         """Learn for one epoch of at least `n_env_steps`; returns its training metrics by name.
 
         Raises:
-            DivergedError: if the weights are not finite afterwards.
+            DivergedError: If the weights are not finite afterwards.
         """
         self._n_epochs += 1
         self._begin_epoch()
@@ -190,7 +190,7 @@ class TianshouLearner(BaseLearner):
         """Take over what `state` returned.
 
         Raises:
-            CheckpointError: if it is that of another agent.
+            CheckpointError: If it is that of another agent.
         """
         load_into(self._algorithm, dict(state["algorithm"]))
         if optimiser := _entropy_optimiser(self._algorithm):

@@ -27,11 +27,11 @@ def export_program(policy: Policy, batch: Batch) -> ExportedProgram:
     """Return a policy as a program of torch, for batches of every size.
 
     Args:
-        policy: policy of a learner.
-        batch: two observations at least: one would make a program for one.
+        policy: Policy of a learner.
+        batch: Batch of two observations or more; from one, the program would accept only one.
 
     Raises:
-        ExportError: if torch.export cannot take the policy.
+        ExportError: If torch.export cannot take the policy.
     """
     size = torch.export.Dim("n")
     shapes = {name: {0: size} for name in batch} if isinstance(batch, dict) else {0: size}
@@ -49,12 +49,12 @@ def save_onnx(program: ExportedProgram, batch: Batch, file: Path) -> None:
     """Write a program as ONNX, with the parts of an observation as its inputs, for batches of every size.
 
     Args:
-        program: as `export_program` returns it.
-        batch: batch of observations, which names the inputs.
-        file: takes all of it, weights included.
+        program: Program that `export_program` returned.
+        batch: Batch of observations, whose parts name the inputs.
+        file: File to write, weights included.
 
     Raises:
-        ExportError: if ONNX cannot take the program.
+        ExportError: If ONNX cannot take the program.
     """
     with _quietly("ONNX"):
         onnx = torch.onnx.export(

@@ -31,8 +31,8 @@ class ActionBounds:
     Rotation is a * bound, translation (a + 1) / 2 * bound; a zero bound fixes its component at 0.
 
     Args:
-        rotation_deg: bounds of rz and rx, each in [0, 180].
-        translation_mm: bounds of tx and ty, each in [0, 1e6].
+        rotation_deg: Bounds of rz and rx, in degrees, each in [0, 180].
+        translation_mm: Bounds of tx and ty, in mm, each in [0, 1e6].
     """
 
     rotation_deg: tuple[float, float]
@@ -69,10 +69,10 @@ def free_components(projection: str | Sequence[str]) -> tuple[int, ...]:
     """Return the indices into (rz, rx, tx, ty) of the components that a projection leaves free, in that order.
 
     Args:
-        projection: one of the names in `PROJECTIONS`, or the components themselves.
+        projection: Name in `PROJECTIONS`, or the components themselves.
 
     Raises:
-        InvalidValueError: if the name or a component is unknown, none is given, or one is given twice.
+        InvalidValueError: If the name or a component is unknown, none is given, or one is given twice.
     """
     if isinstance(projection, str):
         names = PROJECTIONS.get(projection, ())

@@ -26,27 +26,26 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
 
     ## Description
     An episode is played on one volume, drawn at random and moved by a random rigid motion. Each action places the plane
-    anew (absolute, not relative to where it was); the slice under it is looked up and its landmarks are clustered.
+    (absolute, not relative to the last one). The environment samples the slice and clusters its landmarks.
 
     ## Action space
     `Box(-1, 1, (n_action,))`: the free components of (rz, rx, tx, ty), normalised. Rotations are a * bound degrees,
-    translations (a + 1) / 2 * bound mm. The components that the projection does not leave free stay at the optimal
-    plane's. Where the agent ends the episode itself (`ends="on_stop"`), a last component follows, `stop`: above 0, this
-    plane is its answer. Values outside [-1, 1] are clipped; a NaN or infinity, or another shape, raises
-    `InvalidValueError`.
+    translations (a + 1) / 2 * bound mm. Components that are not free stay at the optimal plane's values. With
+    `ends="on_stop"`, a last component `stop` follows: above 0, this plane is the agent's answer. Values outside [-1, 1]
+    are clipped; NaN, infinity or another shape raises `InvalidValueError`.
 
     ## Observation space
-    The parts of the chosen observation, then `action`, the last one (n_action), and `reward` (1), of the current slice.
-    Where all of them are vectors, they come as one flat `Box` of 32-bit floats, otherwise as a `MultiBoxSpace`, a
-    `Dict` of boxes; `flat` decides otherwise.
+    The parts of the chosen observation, then `action`, the last one (n_action), and `reward`, that of the current slice
+    (1). If all of them are vectors, they form one flat `Box` of 32-bit floats; otherwise a `MultiBoxSpace`, a `Dict` of
+    boxes. `flat` overrides this.
 
     | observation | part before action and reward | shape |
     | --- | --- | --- |
     | `action_reward` | none | |
     | `cluster` | `clusters`: number, pixels, mean centre of bones, tendons, artery, normalised | (12,) |
     | `slice` | `slice`: the labels, 0 to 4, uint8 | (across, depth) |
-    | `slice_channels` | `channels`: where bones, tendons, artery are, 0 or 1, uint8 | (3, across, depth) |
-    | `slice_metric` | `shares`: of each pixel in mm, what bones, tendons, artery fill, uint8 | (3, across, depth) |
+    | `slice_channels` | `channels`: masks of bones, tendons, artery, 0 or 1, uint8 | (3, across, depth) |
+    | `slice_metric` | `shares`: shares of bones, tendons, artery in each pixel, uint8 | (3, across, depth) |
     | a list of them | all of them | |
 
     ## Rewards
@@ -62,11 +61,11 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     | `ends` | terminated |
     | --- | --- |
     | `on_reward` | on the first plane whose reward is above -success_threshold |
-    | `on_budget` | never: the agent may look beside the plane that it wants, and is judged by its last one |
-    | `on_stop` | with the plane at which the agent says `stop`, rewarded or not |
+    | `on_budget` | never: the agent may look beside the plane that it wants; only its last plane is judged |
+    | `on_stop` | on the plane at which the agent says `stop`, rewarded or not |
 
-    Truncated after `max_steps` steps in any case. `is_success` says of each plane whether its reward is above
-    -success_threshold, so that at an episode's end it says whether this has succeeded.
+    Every episode is truncated after `max_steps` steps. `is_success` is true for a plane whose reward is above
+    -success_threshold; on the last plane, it is the success of the episode.
 
     ## Info
     `volume` (name), `rotation_deg` (rz, rx), `translation_mm` (tx, ty), `counts` (clusters of bones, tendons, artery),
@@ -74,28 +73,32 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     plane: `distance_mm` (of the slice's centre, along the optimal normal) and `distance_deg` (between the normals).
 
     Args:
-        volumes: volumes by name or in a sequence, or the folder of a dataset; four phantoms where it is None.
-        render_mode: `rgb_array`, `render()` returns a picture; `human`, a window shows every reset and step; or None.
-        observation: what the agent sees: a name of the table above, a list of names, or an object with the methods of
-            `Observation`.
-        flat: whether the observation is one vector; None makes it one where every part is a vector.
-        projection: which components are free: `x`, `y`, `xy`, `zy`, `full`, or a list of `rz`, `rx`, `tx`, `ty`.
-        reward: an object with the methods of `armscan.anatomy.Reward`; the published one where it is None. One that
-            is fitted to labelled planes, and is not yet, is fitted to those of these volumes.
-        targets: clusters of bones, tendons and artery that the published reward wants.
-        clustering: `pixels`, as published, `metric`, which serves every spacing, or an `armscan.anatomy.Tissues`.
-        success_threshold: a plane whose reward is above -success_threshold is a success.
-        ends: what ends an episode before its last step: `on_reward`, `on_budget` (nothing) or `on_stop`.
-        max_steps: steps after which an episode is truncated.
-        start: `middle` or `random`.
-        rotation_bounds_deg: bounds of rz and rx.
-        translation_bounds_mm: bounds of tx and ty; the current volume's size where it is None.
-        transform: the motions of the volume at reset; None leaves it as it is.
+        volumes: Volumes by name or in a sequence, or the folder of a dataset. Default: None, four phantoms.
+        render_mode: `rgb_array`: `render()` returns a picture; `human`: a window shows every reset and step. Default:
+            None.
+        observation: Observation of the agent: a name of the table above, a list of names, or an object with the methods
+            of `Observation`. Default: `cluster`.
+        flat: Whether the observation is one vector. Default: None, one vector if every part is a vector.
+        projection: Free components: `x`, `y`, `xy`, `zy`, `full`, or a list of `rz`, `rx`, `tx`, `ty`. Default: `y`.
+        reward: Object with the methods of `armscan.anatomy.Reward`; one that must be fitted to labelled planes is
+            fitted to those of these volumes. Default: None, the published reward.
+        targets: Target counts of the published reward: clusters of bones, tendons and artery. Default: (4, 3, 1).
+        clustering: Clustering rules: `pixels`, as published; `metric`, for every spacing; or an
+            `armscan.anatomy.Tissues`. Default: `pixels`.
+        success_threshold: Threshold of success: a plane whose reward is above -success_threshold succeeds, in (0, 1].
+            Default: 0.05.
+        ends: End of an episode before its last step: `on_reward`, `on_budget` (none) or `on_stop`. Default:
+            `on_reward`.
+        max_steps: Number of steps after which an episode is truncated, 1 or more. Default: 50.
+        start: Plane at the start, `middle` or `random`. Default: `middle`.
+        rotation_bounds_deg: Bounds of rz and rx in degrees, each in [0, 180]. Default: (180, 180).
+        translation_bounds_mm: Bounds of tx and ty in mm. Default: None, the size of the current volume.
+        transform: Random motion of the volume at each reset. Default: `RandomTransform()`; None: no motion.
 
     Raises:
-        InvalidValueError: if an argument is outside what is allowed.
-        OptimalPlaneError: if a volume's labelled plane is missing, outside the bounds, or not above -success_threshold.
-        DisplayError: if the mode is `human` and no window can be opened.
+        InvalidValueError: If an argument is outside what is allowed.
+        OptimalPlaneError: If a volume's labelled plane is missing, outside the bounds, or not above -success_threshold.
+        DisplayError: If the mode is `human` and no window can be opened.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
@@ -131,7 +134,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         """The current episode.
 
         Raises:
-            ResetNeededError: before the first reset.
+            ResetNeededError: Before the first reset.
         """
         if self._episode is None:
             raise ResetNeededError("the environment has no episode yet: call reset() first")

@@ -98,9 +98,9 @@ def begin(rules: Rules, rngs: Sequence[np.random.Generator], volume_names: Seque
     The episodes have been started but not seen: their first planes are still to be looked at.
 
     Args:
-        rules: the rules.
-        rngs: the generators.
-        volume_names: name of each episode's volume, None for one that is drawn.
+        rules: Rules of the episodes.
+        rngs: NumPy generator of each episode.
+        volume_names: Name of each episode's volume; None draws one.
     """
     drawn = [
         name or rules.names[int(rng.integers(len(rules.names)))] for name, rng in zip(volume_names, rngs, strict=True)

@@ -26,10 +26,10 @@ class EnvFactory:
     """Makes environments that differ in nothing but their volumes.
 
     Args:
-        **rules: of every environment, as in `make_armscan_env`.
+        **rules: Rules of every environment, as keyword arguments of `make_armscan_env`.
 
     Raises:
-        InvalidValueError: if there is no such rule.
+        InvalidValueError: If there is no such rule.
     """
 
     def __init__(self, **rules: Any) -> None:
@@ -76,12 +76,12 @@ def make_armscan_env(
     """Make an environment with its wrappers, as `gymnasium.make("armscan/Armscan-v0", ...)` does.
 
     Args:
-        volumes: as in `ArmscanEnv`.
-        stack: how many of the last observations are stacked; 1 for none but the latest.
-        stack_exclude: parts of a `Dict` observation that are not stacked.
-        memory: how many of the best (action, reward) pairs are added; 0 for none.
-        stack_memory: whether the memory is stacked with the rest; otherwise it is added after the stack.
-        **kwargs: the other arguments of `ArmscanEnv`.
+        volumes: Volumes of the environment; see `ArmscanEnv`. Default: None, four phantoms.
+        stack: Number of latest observations to stack, from 1 to 1000. Default: 1, no stacking.
+        stack_exclude: Parts of a `Dict` observation that are not stacked. Default: none.
+        memory: Number of best (action, reward) pairs to add, from 0 to 1000. Default: 0.
+        stack_memory: Whether to stack the memory with the rest, instead of adding it after the stack. Default: False.
+        **kwargs: Other arguments of `ArmscanEnv`.
     """
     return _wrapped(ArmscanEnv(volumes, **kwargs), stack, stack_exclude, memory, stack_memory)
 
@@ -90,9 +90,9 @@ def make_armscan_vector_env(num_envs: int = 1, volumes: Volumes = None, **kwargs
     """Make many environments with their wrappers, as `gymnasium.make_vec("armscan/Armscan-v0", ...)` does.
 
     Args:
-        num_envs: number of environments.
-        volumes: as in `ArmscanEnv`.
-        **kwargs: the arguments of `make_armscan_env` for wrappers, and the other arguments of `ArmscanVectorEnv`.
+        num_envs: Number of environments. Default: 1.
+        volumes: Volumes of the environments; see `ArmscanEnv`. Default: None, four phantoms.
+        **kwargs: Arguments of `make_armscan_env` for wrappers, and other arguments of `ArmscanVectorEnv`.
     """
     wrappers = {name: kwargs.pop(name) for name in _keywords(make_armscan_env) if name in kwargs}
     return _wrapped(ArmscanVectorEnv(num_envs, volumes, **kwargs), **wrappers)
@@ -102,11 +102,11 @@ def side_by_side(env: Env, num_envs: int) -> VectorEnv[Any, Any, Any]:
     """Return many environments without autoreset that play by the rules of one, with its wrappers.
 
     Args:
-        env: an `ArmscanEnv` with the wrappers of `make_armscan_env`.
-        num_envs: number of environments.
+        env: An `ArmscanEnv` with the wrappers of `make_armscan_env`.
+        num_envs: Number of environments.
 
     Raises:
-        InvalidValueError: if it has other wrappers, or is another environment.
+        InvalidValueError: If it has other wrappers, or is another environment.
     """
     if isinstance(env, ArmscanEnv):
         return ArmscanVectorEnv.sharing(env.rules, num_envs)

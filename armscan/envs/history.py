@@ -89,10 +89,10 @@ class FrameHistory:
     """The last observations of a batch of environments, from the oldest to the latest.
 
     Args:
-        boxes: space of each part of one environment.
-        size: number of observations, from 1 to 1000.
-        excluded: parts that are not stacked.
-        n_envs: environments of the batch.
+        boxes: Space of each part of one environment.
+        size: Number of observations, from 1 to 1000.
+        excluded: Parts that are not stacked.
+        n_envs: Number of environments of the batch.
     """
 
     def __init__(self, boxes: Mapping[str, spaces.Box], size: int, excluded: Collection[str], n_envs: int) -> None:
@@ -142,10 +142,10 @@ class BestPairs:
     first plane's; a new pair enters only if its reward beats the worst one kept.
 
     Args:
-        boxes: space of each part of one environment.
-        size: number of pairs of action and reward, from 1 to 1000.
-        action_space: the free components of an action.
-        n_envs: environments of the batch.
+        boxes: Space of each part of one environment.
+        size: Number of pairs of action and reward, from 1 to 1000.
+        action_space: Space of an action's free components.
+        n_envs: Number of environments of the batch.
     """
 
     def __init__(self, boxes: dict[str, spaces.Box], size: int, action_space: spaces.Space[Any], n_envs: int) -> None:

@@ -28,11 +28,11 @@ class MergedObservation:
     """Several observations as one.
 
     Args:
-        observations: what to merge, as objects or by name; no two may have a part of the same name.
-        targets: what `cluster`, given by name, divides its counts by.
+        observations: Observations to merge, as objects or by name; no two may have a part of the same name.
+        targets: Numbers that `cluster`, given by name, divides its counts by. Default: (4, 3, 1).
 
     Raises:
-        InvalidValueError: if there is none, or one is no observation.
+        InvalidValueError: If there is none, or one is no observation.
     """
 
     def __init__(self, observations: Sequence[ObservationLike], *, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
@@ -49,7 +49,7 @@ class MergedObservation:
         """See `Observation.spaces`.
 
         Raises:
-            InvalidValueError: if two observations have a part of the same name.
+            InvalidValueError: If two observations have a part of the same name.
         """
         merged: dict[str, spaces.Box] = {}
         for observation in self.observations:

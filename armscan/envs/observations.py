@@ -39,13 +39,13 @@ class View:
     """View of the environment at one step, from which observations are computed.
 
     Args:
-        slice_xz: the slice's labels, indexed [across, depth].
-        landmarks: the summary of its clusters, shape (3, 4).
-        tissues: clustering rule of each tissue.
-        geometry: the slice's shape and pixel size.
-        smallest_shape: shape that the slices of every volume have at least, (across, depth).
-        action: the free components of the last action, normalised, shape (n_free,).
-        reward: the reward of the slice.
+        slice_xz: Labels of the slice, indexed [across, depth].
+        landmarks: Summary of its clusters, shape (3, 4).
+        tissues: Clustering rule of each tissue.
+        geometry: Shape and pixel size of the slice.
+        smallest_shape: Smallest slice of all volumes, (across, depth) in pixels.
+        action: Free components of the last action, normalised, shape (n_free,).
+        reward: Reward of the slice, in [-1, 0].
     """
 
     slice_xz: NDArray[np.uint8]
@@ -118,8 +118,8 @@ class ClusterObservation:
     numbers, the centre in pixels. Agents learn in a minute with the normalised form what they never learn with the raw.
 
     Args:
-        normalised: which form.
-        targets: numbers that the counts are divided by.
+        normalised: Whether to return the normalised form; False: the raw one. Default: True.
+        targets: Numbers that the counts are divided by. Default: (4, 3, 1).
     """
 
     def __init__(self, *, normalised: bool = True, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:

@@ -53,8 +53,8 @@ def slice_panel(view: View, room: Size) -> Image.Image:
     Pixels of a landmark that belong to no cluster are darker.
 
     Args:
-        view: what is seen.
-        room: (width, height) that the picture fits into, its proportions kept.
+        view: Slice to draw, with its clusters.
+        room: Size (width, height) in pixels that the picture fits into; its proportions stay.
     """
     # Of each pixel the number of its cluster, 0 where it has none; no pixel is of two tissues.
     numbers = np.sum([tissue.image for tissue in view.clusters.each()], axis=0)
@@ -103,11 +103,11 @@ def side_panels(
     """Draw the volume as it was read from the palm (frontal) and from the side (sagittal), fingers up, in one scale.
 
     Args:
-        volume: the volume.
-        transform: how it is moved in the episode, None where it is as it is.
-        planes: what is outlined in it, in the frame of the moved volume, each with its colour and the width of its
-            line in pixels; the last one on top.
-        rooms: (width, height) that either picture fits into, its proportions kept.
+        volume: Volume to draw.
+        transform: Motion of the volume in the episode; None for none.
+        planes: Planes to outline, in the frame of the moved volume, each with its colour and its line width in pixels;
+            the last one is on top.
+        rooms: Size (width, height) in pixels that either picture fits into; its proportions stay.
     """
     if volume not in _SIDES:
         from_palm, from_side = _first_seen(volume.labels[:, :, ::-1], 2), _first_seen(volume.labels, 0)
@@ -146,10 +146,10 @@ def reward_panel(rewards: Sequence[float], places: range, threshold: float, size
     """Draw rewards from left to right between 0, at the top, and -1.
 
     Args:
-        rewards: one for each place from the first, at least one, each in [-1, 0].
-        places: the numbers of the places that there is room for.
-        threshold: drawn as a line across.
-        size: (width, height).
+        rewards: Reward of each place from the first, each in [-1, 0], one or more.
+        places: Numbers of the places to draw.
+        threshold: Reward to draw as a line across.
+        size: Size (width, height) in pixels.
     """
     width, height = size
     left, top, right, bottom = 36, 8, width - 8, height - 22

@@ -83,13 +83,13 @@ def draw_plane(
     """Draw a plane: its slice, the volume from two sides, its reward.
 
     Args:
-        volume: volume that the plane lies in.
-        plane: the plane, in the frame of the moved volume.
-        view: slice at the plane, with its clusters.
-        transform: motion of the volume, None for none.
-        beside: another plane to draw, and to measure the distance from.
-        history: the rewards before.
-        caption: written before the reward.
+        volume: Volume that the plane lies in.
+        plane: Plane to draw, in the frame of the moved volume.
+        view: Slice at the plane, with its clusters.
+        transform: Motion of the volume, None for none.
+        beside: Another plane to draw, and to measure the distance from.
+        history: Rewards of the planes before.
+        caption: Text before the reward.
 
     Returns:
         The picture, shape (512, 860, 3).

@@ -125,7 +125,7 @@ class Rules:
         """Draw a scene of each named volume with the generator beside it, its optimal plane above -success_threshold.
 
         Raises:
-            OptimalPlaneError: if no motion in a thousand leaves the optimal plane within the bounds and rewarded.
+            OptimalPlaneError: If no motion in a thousand leaves the optimal plane within the bounds and rewarded.
         """
         drawn: dict[int, Scene] = {}
         for _ in range(MAX_DRAWS):

@@ -31,17 +31,18 @@ class RandomTransform:
     the landmarks of a larger wrist are larger, in pixels as in mm.
 
     Args:
-        rz_deg: rotation about Z within +- this.
-        rx_deg: rotation about X within +- this.
-        tx_mm: translation along X within +- this.
-        ty_mm: translation along Y within +- this.
-        centre: what the rotation leaves in place: `middle` of the volume, or `first_voxel`, as published, which pushes
-            the hand out of the picture.
-        scale: the volume's size in all directions alike is 1 +- this times as large, from 0 to 0.3.
-        stretch: its size across, along the labelled normal and in depth, each for itself, likewise.
-        shear: shift for each mm along another axis within +- this, from 0 to 0.3: across and in depth with the way
-            along the normal, and with each other.
-        mirror: whether each episode is mirrored, so that it shows the other hand, with probability 0.5.
+        rz_deg: Largest rotation about Z, in degrees, in both directions.
+        rx_deg: Largest rotation about X, in degrees, in both directions.
+        tx_mm: Largest translation along X, in mm, in both directions.
+        ty_mm: Largest translation along Y, in mm, in both directions.
+        centre: Fixed point of the rotation: `middle` of the volume, or `first_voxel`, as published, which moves the
+            hand out of the picture.
+        scale: Largest change of the volume's size in all directions alike, as a share of it, from 0 to 0.3.
+        stretch: Largest change of its size across, along the labelled normal and in depth, each drawn alone, as a share
+            of it, from 0 to 0.3.
+        shear: Largest shift per mm along another axis, from 0 to 0.3: across and in depth with the way along the
+            normal, and with each other.
+        mirror: Whether to mirror an episode's volume, so that it shows the other hand, with probability 0.5.
     """
 
     rz_deg: float = 10.0
@@ -102,10 +103,10 @@ class Scene:
     """A volume as it lies in one episode.
 
     Args:
-        volume: the volume.
-        transform: how it is moved, None where it is as it is.
-        optimum: its optimal plane, in the moved volume's frame, within the bounds.
-        bounds: of the actions.
+        volume: Volume of the episode.
+        transform: Motion of the volume; None for none.
+        optimum: Optimal plane of the moved volume, in its frame, within the bounds.
+        bounds: Bounds of the actions.
     """
 
     volume: LabelVolume
@@ -151,7 +152,7 @@ class SceneSampler:
         """Return the scene of a volume as it is.
 
         Raises:
-            OptimalPlaneError: if scenes of this volume cannot be drawn, because it has no labelled plane, or the plane
+            OptimalPlaneError: If scenes of this volume cannot be drawn, because it has no labelled plane, or the plane
                 can leave the bounds of the rotations, or it misses the volume.
         """
         if volume.optimal_action is None:

@@ -70,12 +70,12 @@ class SliceObservation(_FramedSlice):
     Reduced, a pixel shows the rarest tissue of those that meet in it: artery, nerve, tendons, bones, in this order.
 
     Args:
-        crop: (across, depth) in pixels of the middle that is kept, each from 1 to 4096; None, the default, keeps what
-            the smallest slice of all volumes has.
-        shape: (across, depth) that it is reduced to, likewise; None, the default, leaves it.
+        crop: Size (across, depth) in pixels of the middle part to keep, each from 1 to 4096. Default: None, the
+            smallest slice of all volumes.
+        shape: Size (across, depth) in pixels to reduce it to, each from 1 to 4096. Default: None, no reduction.
 
     Raises:
-        InvalidValueError: if a shape is not two whole numbers from 1 to 4096.
+        InvalidValueError: If a shape is not two whole numbers from 1 to 4096.
     """
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
@@ -98,12 +98,12 @@ class SliceChannelsObservation(_FramedSlice):
     Reduced, a pixel is 1 where any of the pixels it stands for is.
 
     Args:
-        crop: (across, depth) in pixels of the middle that is kept, each from 1 to 4096; None, the default, keeps what
-            the smallest slice of all volumes has.
-        shape: (across, depth) that it is reduced to, likewise; None, the default, leaves it.
+        crop: Size (across, depth) in pixels of the middle part to keep, each from 1 to 4096. Default: None, the
+            smallest slice of all volumes.
+        shape: Size (across, depth) in pixels to reduce it to, each from 1 to 4096. Default: None, no reduction.
 
     Raises:
-        InvalidValueError: if a shape is not two whole numbers from 1 to 4096.
+        InvalidValueError: If a shape is not two whole numbers from 1 to 4096.
     """
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:

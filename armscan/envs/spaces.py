@@ -19,10 +19,10 @@ class MultiBoxSpace(spaces.Dict):
     """A `Dict` space every value of which is a `Box`.
 
     Args:
-        boxes: the boxes by name.
+        boxes: Boxes by the name of their part.
 
     Raises:
-        InvalidValueError: if there is none, or a value is no `Box`.
+        InvalidValueError: If there is none, or a value is no `Box`.
     """
 
     def __init__(self, boxes: Mapping[str, spaces.Box]) -> None:

@@ -29,18 +29,18 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
     with `Disabled` the caller resets the ended ones by `reset(options={"reset_mask": mask})`.
 
     Args:
-        num_envs: how many.
-        volumes: as in `ArmscanEnv`.
-        autoreset_mode: `NextStep` or `Disabled`.
-        render_mode: none is supported.
-        **rules: the other arguments of `ArmscanEnv`.
+        num_envs: Number of environments, 1 or more.
+        volumes: Volumes of the environments; see `ArmscanEnv`. Default: None, four phantoms.
+        autoreset_mode: Autoreset mode of Gymnasium, `NextStep` or `Disabled`.
+        render_mode: Must be None: rendering is not supported.
+        **rules: The other arguments of `ArmscanEnv`.
 
     Attributes:
-        info_keys: what `info` gives; all that `ArmscanEnv` describes, unless somebody who needs less says so, because
-            computing it takes a tenth of a step. The wrappers need `action` and `reward`.
+        info_keys: Keys of `info`. Default: all that `ArmscanEnv` describes. Fewer keys save up to a tenth of a step;
+            the wrappers require `action` and `reward`.
 
     Raises:
-        InvalidValueError: if an argument is outside what is allowed.
+        InvalidValueError: If an argument is outside what is allowed.
     """
 
     metadata: dict[str, Any]
@@ -84,9 +84,10 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         """Start an episode in each environment, or in those that `options["reset_mask"]` marks.
 
         Args:
-            seed: of the first environment, the next has the next seed; or one for each, None to leave it as it is.
-            options: `volume`, the name of a volume for all of them, or a list of one for each; `reset_mask`, truth
-                values, shape (num_envs,).
+            seed: Seed of the first environment; the next has the next seed. Or a seed for each; None keeps a generator
+                as it is.
+            options: `volume`: name of a volume for all, or a list with one for each; `reset_mask`: environments to
+                reset, booleans of shape (num_envs,).
 
         Returns:
             The observations and `info` of all environments; only those that were reset are marked in `info`.
@@ -106,9 +107,9 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         """Take a step in every environment, or in some of them.
 
         Args:
-            actions: a row for each environment that takes a step.
-            env_ids: numbers of these environments, each at most once; what is returned has a row for each of them, in
-                this order, and the others stay as they are. Default: None, all of them.
+            actions: Actions, a row for each environment that takes a step.
+            env_ids: Numbers of these environments, each at most once; results have a row for each of them, in this
+                order, and other environments do not change. Default: None, all environments.
         """
         chosen = np.arange(self.num_envs) if env_ids is None else self._checked_ids(env_ids)
         episodes = [self._episode(int(i)) for i in chosen]

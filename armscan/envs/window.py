@@ -25,7 +25,7 @@ class Window:
     A window that a person closes stays closed, until `close` has been called and another picture comes.
 
     Raises:
-        DisplayError: if no window can be shown here.
+        DisplayError: If no window can be shown here.
     """
 
     def __init__(self, title: str, frames_per_s: float) -> None:
@@ -71,9 +71,9 @@ def opened(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tup
     """Make a figure, not shown yet, that a picture fills in its own pixels.
 
     Args:
-        title: of the window.
-        picture: shape (height, width, 3).
-        height_below: pixels left free below the picture.
+        title: Title of the window.
+        picture: Picture, shape (height, width, 3).
+        height_below: Height left free below the picture, in pixels.
     """
     from matplotlib import pyplot
 

@@ -72,12 +72,12 @@ class FrameStack(_Remembering):
     A vector of n numbers becomes one of `stack` * n; in a `Dict` each part gets a leading axis of length `stack`.
 
     Args:
-        env: an environment whose observation is a vector or a `Dict` of boxes.
-        stack: how many observations.
-        exclude: parts of a `Dict` observation that are not stacked.
+        env: Environment whose observation is a vector or a `Dict` of boxes.
+        stack: Number of latest observations to stack, from 1 to 1000.
+        exclude: Parts of a `Dict` observation that are not stacked.
 
     Raises:
-        InvalidValueError: if `stack` is not a whole number from 1 to 1000, or a part to leave out does not exist.
+        InvalidValueError: If `stack` is not a whole number from 1 to 1000, or a part to leave out does not exist.
     """
 
     def __init__(self, env: Env, stack: int, *, exclude: Collection[str] = ()) -> None:
@@ -91,12 +91,11 @@ class BestActionMemory(_Remembering):
     They are appended to a vector, and become the part `memory` of a `Dict`.
 
     Args:
-        env: an environment whose observation is a vector or a `Dict` of boxes, and whose `info` has `action` and
-            `reward`.
-        memory: how many pairs.
+        env: Environment whose observation is a vector or a `Dict` of boxes, and whose `info` has `action` and `reward`.
+        memory: Number of best (action, reward) pairs to add, from 1 to 1000.
 
     Raises:
-        InvalidValueError: if `memory` is not a whole number from 1 to 1000, or the observation has a part of that name.
+        InvalidValueError: If `memory` is not a whole number from 1 to 1000, or the observation has a part of that name.
     """
 
     def __init__(self, env: Env, memory: int) -> None:

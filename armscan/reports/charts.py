@@ -42,9 +42,9 @@ class Trace:
     """A line of a learning curve.
 
     Args:
-        kind: one of `BANDS` and `SEEDS`, or nothing where it is of the whole group.
+        kind: One of `BANDS` and `SEEDS`, or empty for a trace of the whole group.
         look: Plotly's arguments of the line.
-        over: its points over each of `AXES`.
+        over: Points of the trace over each of `AXES`.
     """
 
     kind: str

@@ -59,10 +59,10 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     """Write the report.
 
     Args:
-        groups: groups that are compared.
-        left_out: trainings that repeat another one.
-        title: title of the page.
-        folder: folder that takes `report.html` and the CSV files.
+        groups: Groups to compare.
+        left_out: Trainings that repeat another one.
+        title: Title of the page.
+        folder: Folder that takes `report.html` and the CSV files.
 
     Returns:
         The HTML file.

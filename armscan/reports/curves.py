@@ -25,10 +25,10 @@ class Curve:
     """A figure of a group over an axis.
 
     Args:
-        places: places on the axis, ascending.
-        band: mean and interval over the seeds at these places.
-        n_seeds: number of its seeds.
-        lines: the line of each seed, by its label: places and values, as they were measured.
+        places: Positions on the axis, ascending.
+        band: Mean and interval over the seeds at these positions.
+        n_seeds: Number of its seeds.
+        lines: Line of each seed, by its label: positions and values, as measured.
     """
 
     places: FloatArray

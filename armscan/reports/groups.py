@@ -26,10 +26,10 @@ class Group:
     """Trainings with the same configuration.
 
     Args:
-        number: number of the group, from 1.
-        name: the keys by which it differs from the other groups.
-        label: number and name, short enough for a legend.
-        trainings: its trainings, each with another seed.
+        number: Number of the group, from 1.
+        name: Keys and values by which it differs from the other groups.
+        label: Number and name, short enough for a legend.
+        trainings: Its trainings, each with another seed.
     """
 
     number: int

@@ -95,17 +95,17 @@ def write_page(
     """Write a report.
 
     Args:
-        folder: folder that takes `report.html` and the CSV files.
-        title: title of the page.
-        parts: pieces of HTML, one below the other.
-        tables: rows by the names of their files; each row's values by column.
-        refresh_s: seconds after which a browser reads the page again. Default: None, never.
+        folder: Folder that takes `report.html` and the CSV files.
+        title: Title of the page.
+        parts: Pieces of HTML, from top to bottom.
+        tables: Rows by the names of their files; each row's values by column.
+        refresh_s: Seconds after which a browser reads the page again. Default: None, never.
 
     Returns:
         The HTML file.
 
     Raises:
-        InvalidValueError: if it would replace what is no report's.
+        InvalidValueError: If it would replace what is no report's.
     """
     from plotly.offline import get_plotlyjs
 
@@ -130,10 +130,10 @@ def page(title: str, body: str, *, script: str = "", refresh_s: int | None = Non
     """Return a page that needs no server.
 
     Args:
-        title: title and first heading.
-        body: pieces of HTML.
+        title: Title and first heading.
+        body: Pieces of HTML.
         script: JavaScript of the page. Default: none.
-        refresh_s: seconds after which a browser reads the page again. Default: None, never.
+        refresh_s: Seconds after which a browser reads the page again. Default: None, never.
     """
     head = "" if refresh_s is None else REFRESH.format(refresh_s)
     return PAGE.format(title=html.escape(title), head=head, script=script, body=body)
@@ -151,9 +151,9 @@ def table(rows: Sequence[Row], *, what: str = "rows", kind: str = "rows") -> str
     """Return rows as a table, with the columns that any of them has; a long one is folded.
 
     Args:
-        rows: the rows, each its values by column; floats are shown with four digits.
-        what: what a folded table has so many of. Default: rows.
-        kind: `rows`, where a phone shows each row as a card, or `matrix`, which stays a table. Default: rows.
+        rows: Values of each row by column; floats are shown with four digits.
+        what: Name of the rows in the summary of a folded table. Default: rows.
+        kind: `rows`: a phone shows each row as a card; `matrix`: it stays a table. Default: rows.
     """
     keys = _columns(rows)
     head = "".join(f"<th>{html.escape(key)}</th>" for key in keys)
@@ -175,8 +175,8 @@ def chart(figure: graph_objects.Figure, *, is_wide: bool = False) -> str:
     """Return a chart in the common style, without a title: the page's heading has it.
 
     Args:
-        figure: the chart.
-        is_wide: whether a phone scrolls it, because it cannot be narrow. Default: false.
+        figure: Chart to embed.
+        is_wide: Whether a phone scrolls the chart, because it cannot be narrow. Default: False.
     """
     from armscan.reports.chart_style import look
 

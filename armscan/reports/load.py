@@ -41,9 +41,9 @@ class Series:
     """Course of a figure, one value for each epoch.
 
     Args:
-        env_steps: environment steps at the end of each epoch, ascending, shape (epochs,).
-        wall_s: seconds of the training by then, NaN where they are not known.
-        values: values of the figure.
+        env_steps: Environment steps at the end of each epoch, ascending, shape (epochs,).
+        wall_s: Seconds of training until then; NaN if not known.
+        values: Values of the figure.
     """
 
     env_steps: FloatArray
@@ -57,17 +57,17 @@ class TrackedTraining:
 
     Args:
         run_id: MLflow run ID.
-        name: name of the run.
-        status: status of the run, in small letters; `pruned` if its trial was.
-        started_ms: time of its start, in ms since 1970.
-        is_whole: whether it has run to its end; not where it was pruned, fails, or is still running.
-        params: its configuration, leaves by dotted keys.
-        choices: what was chosen of each group of the configuration.
-        series: its curves by the name of the figure.
-        evaluation: final evaluation on the test volumes, None where it has kept none.
-        baselines: episodes of the baselines there, by their names. Default: none, as of older runs.
-        volumes: fingerprints of its test volumes by name, None where it has kept none.
-        video: an episode as an animated GIF, None where it has kept none.
+        name: Name of the run.
+        status: Status of the run, in small letters; `pruned` if its trial was.
+        started_ms: Time of its start, in ms since 1970.
+        is_whole: Whether it has run to its end: not pruned, failed or still running.
+        params: Its configuration, leaves by dotted keys.
+        choices: Choice of each configuration group.
+        series: Curves by the name of the figure.
+        evaluation: Final evaluation on the test volumes; None if it has kept none.
+        baselines: Episodes of the baselines on the test volumes, by their names. Default: none, as in older runs.
+        volumes: Fingerprints of its test volumes by name; None if it has kept none.
+        video: Episode as an animated GIF; None if it has kept none.
     """
 
     run_id: str
@@ -131,12 +131,12 @@ def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> Tr
     """Return the training of a run.
 
     Args:
-        store: the store that it is in.
-        found: the run.
-        folder: new folder that takes its files.
+        store: Store of the run.
+        found: Run to read.
+        folder: New folder that takes its files.
 
     Raises:
-        TrackingError: if a file of it is damaged, or the store cannot be used.
+        TrackingError: If a file of it is damaged, or the store cannot be used.
     """
     run, tags = found.run, found.run.data.tags
     folder.mkdir()

@@ -21,16 +21,16 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
     """Write the report of runs.
 
     Args:
-        text: what names them; see `read_runs`.
-        uri: address of the store that they are in.
-        out: folder that takes the report; None for a folder in `reports` that is named after the runs.
+        text: Names of the runs; see `read_runs`.
+        uri: Address of their store.
+        out: Folder that takes the report. None: a folder in `reports`, named after the runs.
 
     Returns:
         The HTML file.
 
     Raises:
-        InvalidValueError: if one of the names is empty.
-        TrackingError: if one of them is not found, is none to be compared, or has kept something damaged.
+        InvalidValueError: If one of the names is empty.
+        TrackingError: If one of them is not found, is none to be compared, or has kept something damaged.
     """
     named = read_runs(text)
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")

@@ -28,8 +28,8 @@ class SelectedRuns:
     """A training that was found.
 
     Args:
-        run: run of the training.
-        is_pruned: whether it is of a trial that was pruned.
+        run: Run of the training.
+        is_pruned: Whether the run belongs to a pruned trial.
     """
 
     run: Run
@@ -40,7 +40,7 @@ def read_runs(text: str) -> list[str]:
     """Return the names in `--runs`, each once, in order.
 
     Raises:
-        InvalidValueError: if one of the names is empty.
+        InvalidValueError: If one of the names is empty.
     """
     named = [name.strip() for name in text.split(",")]
     if not all(name.removeprefix(EXPERIMENT) for name in named):
@@ -54,11 +54,11 @@ def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[SelectedR
     """Return the trainings that are meant, each once: in the order in which they are named, and then were started.
 
     Args:
-        store: the store that they are in.
-        named: IDs or their beginnings, of trainings or of their parents, or whole experiments; see `read_runs`.
+        store: Store of the runs.
+        named: IDs, or their first characters, of trainings or of their parents, or whole experiments; see `read_runs`.
 
     Raises:
-        TrackingError: if one of them is not found, is an evaluation, or there is no training in it.
+        TrackingError: If one of them is not found, is an evaluation, or there is no training in it.
     """
     found: dict[str, Run] = {}
     with store_errors(store.uri):

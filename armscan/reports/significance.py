@@ -25,10 +25,10 @@ class Pair:
     """Comparison of two groups by one metric.
 
     Args:
-        ours: index of the first group.
-        theirs: index of the second group.
-        probability: probability that a training of the first group is better than one of the second; None if they
-            were evaluated on different volumes.
+        ours: Index of the first group.
+        theirs: Index of the second group.
+        probability: Probability that a training of the first group is better than one of the second; None if they were
+            evaluated on different volumes.
     """
 
     ours: int
@@ -51,8 +51,8 @@ def compare_groups(groups: Sequence[Group], figure: str) -> Iterator[Pair]:
     """Yield the comparison of every pair of groups that were evaluated.
 
     Args:
-        groups: groups of trainings, in the order of their indices.
-        figure: name of the metric, one of `COMPARED_BY`.
+        groups: Groups of trainings, in the order of their indices.
+        figure: Name of the metric, one of `COMPARED_BY`.
     """
     volumes = [_volumes(group) for group in groups]
     scores = [_scores(group, figure) * (1.0 if COMPARED_BY[figure] else -1.0) for group in groups]

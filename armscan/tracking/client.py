@@ -33,11 +33,12 @@ class TrackingStore:
     """An open store, asked as one asks `MlflowClient`, but where it is away, it is waited for.
 
     Args:
-        connect: opens the store.
-        uri: its address, as it may be shown.
-        wait_s: seconds for which a run waits for it at its end.
-        retry_s: seconds to wait for it otherwise. Default: None, it is not waited for.
-        system_metrics_s: seconds between two looks at the machine while a run trains. Default: None, no looks.
+        connect: Function that opens the store.
+        uri: Address of the store, without secrets.
+        wait_s: Seconds for which a run waits for the store at its end.
+        retry_s: Seconds to wait for an unavailable store at other times. Default: None, no waiting.
+        system_metrics_s: Seconds between two measurements of the machine while a run trains. Default: None, no
+            measurements.
     """
 
     def __init__(

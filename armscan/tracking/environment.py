@@ -76,8 +76,8 @@ class Source:
     """The code as it was loaded.
 
     Args:
-        commit: of git, `unknown` where the code is under no git.
-        diff: what was changed since, as `git apply` takes it, empty if nothing was; None if that is unknown.
+        commit: Commit of git; `unknown` if the code is not in a git repository.
+        diff: Uncommitted changes, as `git apply` takes them, empty if there are none; None if they are not known.
     """
 
     commit: str

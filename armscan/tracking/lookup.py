@@ -40,15 +40,15 @@ class FoundRun:
     """A run in the store.
 
     Args:
-        client: the run's store.
-        uri: MLflow tracking URI, as somebody typed it.
+        client: Client of the run's store.
+        uri: MLflow tracking URI, as the user typed it.
         experiment_id: MLflow experiment ID.
         run_id: MLflow run ID.
-        name: what the UI calls it.
-        status: how it ended, or that it is RUNNING.
-        tags: its tags.
-        files: paths of its artifacts.
-        needs_trust: whether its configuration names classes that are not armscan's, as far as its parameters say.
+        name: Name of the run in the UI.
+        status: Status of the run, such as RUNNING or FINISHED.
+        tags: Tags of the run.
+        files: Paths of its artifacts.
+        needs_trust: Whether its configuration names classes that are not armscan's, according to its parameters.
     """
 
     client: TrackingStore = field(repr=False)
@@ -65,12 +65,12 @@ class FoundRun:
         """Return the resolved configuration, with the keys of this version.
 
         Args:
-            folder: folder to download the file to.
-            trust: whether it may name classes that are not armscan's; default: false.
+            folder: Folder to download the file to.
+            trust: Whether it may name classes that are not armscan's. Default: False.
 
         Raises:
-            UntrustedError: if it is not trusted, and names other classes.
-            TrackingError: if the run has kept none, it is damaged, or not the one that the run was started with.
+            UntrustedError: If it is not trusted, and names other classes.
+            TrackingError: If the run has kept none, it is damaged, or not the one that the run was started with.
         """
         try:
             config = dict(load_yaml(self._started_with(CONFIG_FILE, folder)))
@@ -117,7 +117,7 @@ def load_run(uri: str, run_id: str) -> FoundRun:
     """Return the run of an MLflow run ID, or of its first characters, with its files.
 
     Raises:
-        TrackingError: if no run is meant, or several are, or the store does not exist or cannot be used.
+        TrackingError: If no run is meant, or several are, or the store does not exist or cannot be used.
     """
     check_run_id(run_id)
     client = open_existing_store(uri)
@@ -146,7 +146,7 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
     """Return the run of an MLflow run ID, or of its first characters, in any experiment of a store.
 
     Raises:
-        TrackingError: if no run is meant, or several are.
+        TrackingError: If no run is meant, or several are.
     """
     check_run_id(run_id)
     experiments = client.search_experiments(max_results=MAX_EXPERIMENTS)
@@ -170,14 +170,15 @@ def run_of_study(
     """Return a run that the storage of a study names: a stranger may have written there the ID of any run.
 
     Args:
-        client: the store.
+        client: Client of the store.
         run_id: MLflow run ID.
         experiment_id: MLflow experiment of the study.
-        tags: what the run's own tags must be, by which it is known to be the study's; None for those that it must lack.
-        where: attribute that names the run, such as `a.user_attrs.mlflow_run`, for the error.
+        tags: Required values of the run's tags, which show that it belongs to the study; None for a tag that it must
+            lack.
+        where: Attribute that names the run, such as `a.user_attrs.mlflow_run`, for the error.
 
     Raises:
-        TrackingError: if it is another run, or the store does not have it.
+        TrackingError: If it is another run, or the store does not have it.
     """
     with store_errors(client.uri):
         run: Run = client.get_run(run_id)

@@ -48,7 +48,7 @@ class Address:
     """Destination of an outbox: the ID of a run, and the address of its tracking store.
 
     Raises:
-        TrackingError: if the ID is none; files are named after it.
+        TrackingError: If the ID is none; files are named after it.
     """
 
     run_id: str
@@ -63,10 +63,10 @@ class OutboxFile:
     """An outbox, read only.
 
     Args:
-        file: with an `Address` in its first line.
+        file: File with an `Address` in its first line.
 
     Raises:
-        TrackingError: if the file is damaged.
+        TrackingError: If the file is damaged.
     """
 
     def __init__(self, file: Path) -> None:
@@ -146,13 +146,13 @@ class Outbox(OutboxFile):
     """An outbox, locked by this process.
 
     Args:
-        file: with an `Address` in its first line.
-        timeout_s: seconds to wait for another process that has locked it.
+        file: File with an `Address` in its first line.
+        timeout_s: Seconds to wait for another process that has locked the file.
 
     Raises:
-        TrackingError: if the file is damaged.
-        FolderInUseError: if another process holds it.
-        FileNotFoundError: if there is no such file; nothing is made in its place.
+        TrackingError: If the file is damaged.
+        FolderInUseError: If another process holds it.
+        FileNotFoundError: If there is no such file; nothing is made in its place.
     """
 
     def __init__(self, file: Path, *, timeout_s: float = LOCK_TIMEOUT_S) -> None:

@@ -46,10 +46,10 @@ class TrackedRun:
     `armscan runs sync FOLDER` uploads what a store that was away has missed.
 
     Args:
-        store: the run's store.
-        outbox: the run's outbox.
-        name: what the UI calls the run.
-        logged: names and steps of the figures that are there already, which are not logged again.
+        store: Store of the run.
+        outbox: Outbox of the run.
+        name: Name of the run in the UI.
+        logged: Names and steps of the metrics that are already in the store, which are not logged again.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class TrackedRun:
         """Log the volumes as datasets of the run.
 
         Args:
-            prints: fingerprint of each volume by its name, by the part (training, validation, test) that it is in.
+            prints: Fingerprint of each volume by its name, by split (training, validation, test).
         """
         self._add(datasets=[[part, volumes] for part, volumes in prints.items() if volumes])
 
@@ -220,9 +220,9 @@ class TrackedRun:
         """Close the run as FINISHED, FAILED (with the reason) or KILLED, and wait until the store has all of it.
 
         Args:
-            status: FINISHED, FAILED or KILLED.
-            reason: why it failed. Default: None.
-            wait_s: seconds to wait for a store that is away. Default: what the configuration says.
+            status: Status: FINISHED, FAILED or KILLED.
+            reason: Reason of a failure. Default: None.
+            wait_s: Seconds to wait for an unavailable store. Default: those of the configuration.
 
         Returns:
             Whether the store has all of it; the rest is in the folder of the run.

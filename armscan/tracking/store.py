@@ -55,18 +55,20 @@ def open_store(
 
     Args:
         uri: MLflow tracking URI, such as `sqlite:///mlruns.db` or the address of an MLflow server.
-        experiment: name of the experiment.
-        artifacts: folder of its artifacts where the store is a database; a server has its own place for them.
-        wait_s: seconds for which a run waits for it at its end.
-        system_metrics_s: seconds between two looks at the machine while a run trains. Default: None, no looks.
-        policy: whether runs keep their policies in it; only checked here, with the rest of the section. Default: True.
-        retry_s: seconds to wait for it otherwise, already while it is opened. Default: None, it is not waited for.
+        experiment: Name of the experiment.
+        artifacts: Folder of the artifacts if the store is a database; a server has its own place for them.
+        wait_s: Seconds for which a run waits for the store at its end.
+        system_metrics_s: Seconds between two measurements of the machine while a run trains. Default: None, no
+            measurements.
+        policy: Whether runs store their policies; only checked here, with the rest of the section. Default: True.
+        retry_s: Seconds to wait for an unavailable store at other times, also while it is opened. Default: None, no
+            waiting.
 
     Returns:
         The store, and the experiment's id.
 
     Raises:
-        TrackingError: if the store cannot be reached or used.
+        TrackingError: If the store cannot be reached or used.
     """
     check_settings(
         uri,

@@ -32,10 +32,10 @@ class Delivery:
     """Delivery of the entries of a run.
 
     Args:
-        folder: the run's folder.
+        folder: The run's folder.
         run_id: MLflow run ID; None if another process holds the outbox.
-        n_entries: number of entries delivered now.
-        left: why some are not delivered; None if all are.
+        n_entries: Number of entries delivered now.
+        left: Reason why some entries are not delivered; None if all are.
     """
 
     folder: Path
@@ -48,10 +48,10 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
     """Deliver the entries of the runs in a folder and below it.
 
     Args:
-        folder: folder of a run, of a study, or above them.
-        opened: opens a store by its address; called once for each address.
-        trust: whether runs are written to that were tracked from elsewhere, and files outside of a run's folder are
-            uploaded; default: false.
+        folder: Folder of a run, of a study, or above them.
+        opened: Function that opens a store by its address; called once for each address.
+        trust: Whether to write to runs tracked from other machines, and to upload files outside of a run's folder.
+            Default: False.
 
     Returns:
         What became of each run that had something left.

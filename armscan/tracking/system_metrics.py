@@ -16,9 +16,9 @@ class SystemMetrics:
     MLflow's own thread would ask the store each time, and write there itself: it ends where the store is away.
 
     Args:
-        take: takes the figures by name, and the number of the look, which MLflow has in place of a step.
-        every_s: seconds between two looks.
-        first: number of the first look.
+        take: Function that takes the metrics by name, and the number of the measurement, which is MLflow's step.
+        every_s: Seconds between two measurements.
+        first: Number of the first measurement.
     """
 
     def __init__(self, take: Callable[[Mapping[str, float], int], None], *, every_s: float, first: int = 0) -> None:

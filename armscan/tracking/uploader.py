@@ -57,7 +57,7 @@ class Uploader:
         """Wait until everything is uploaded, and end the thread.
 
         Args:
-            wait_s: seconds to wait at most; a store that refuses entries is not waited for.
+            wait_s: Longest wait in seconds; a store that refuses entries is not waited for.
 
         Returns:
             Why not everything is uploaded; None if it is.
@@ -121,18 +121,18 @@ def deliver(
     """Upload the pending entries of one channel.
 
     Args:
-        outbox: the run's outbox.
-        client: client of its store.
-        channel: the channel.
-        is_whole: whether the run's folder is complete, so that a missing file was removed on purpose.
-        trust: whether files outside of the run's folder are uploaded that another process has added; default: false.
+        outbox: Outbox of the run.
+        client: Client of the run's store.
+        channel: Channel whose entries are delivered.
+        is_whole: Whether the run's folder is complete, so that a missing file was removed on purpose.
+        trust: Whether to upload files outside of the run's folder that another process has added. Default: False.
 
     Returns:
         The number of entries.
 
     Raises:
-        FileNotFoundError: if a file is missing, and the folder may be an incomplete copy.
-        UntrustedError: if a file outside of the run's folder was added by another process, perhaps a stranger's.
+        FileNotFoundError: If a file is missing, and the folder may be an incomplete copy.
+        UntrustedError: If a file outside of the run's folder was added by another process, perhaps a stranger's.
     """
     n_delivered = 0
     while True:
@@ -155,8 +155,8 @@ def dataset_input(part: str, prints: Mapping[str, str]) -> DatasetInput:
     """Return volumes as a dataset of MLflow; its digest follows from their fingerprints.
 
     Args:
-        part: split of the volumes: `training`, `validation` or `test`.
-        prints: fingerprint of each volume by its name.
+        part: Split of the volumes: `training`, `validation` or `test`.
+        prints: Fingerprint of each volume by its name.
     """
     from mlflow.entities import Dataset, DatasetInput, InputTag
 
