@@ -10,6 +10,8 @@ from armscan.agents.ppo import PPO
 from armscan.agents.protocols import Agent, AgentSetup, Algorithm, Learner, VectorEnvFactory
 from armscan.agents.regression import Regression
 from armscan.agents.sac import SAC
+from armscan.agents.schedule import Segment, scheduled_algorithms
+from armscan.agents.scheduled_learner import ScheduledLearner
 
 __all__ = [
     "MLP",
@@ -29,5 +31,8 @@ __all__ = [
     "PlaneFinder",
     "Random",
     "Regression",
+    "ScheduledLearner",
+    "Segment",
     "VectorEnvFactory",
+    "scheduled_algorithms",
 ]

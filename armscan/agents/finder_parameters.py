@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import ClassVar
 
 from armscan.agents.hyperparameters import number
 from armscan.errors import InvalidValueError
@@ -20,6 +21,17 @@ class FinderParameters:
     Raises:
         InvalidValueError: If a value is impossible.
     """
+
+    SCHEDULABLE: ClassVar[tuple[str, ...]] = (
+        "lr",
+        "lr_end_factor",
+        "loss_mm",
+        "loss_deg",
+        "loss_across_mm",
+        "astray_share",
+        "phantom_share",
+    )
+    """See `Parameters.SCHEDULABLE`."""
 
     offsets_mm: Sequence[float] = (9.0, -9.0, 0.0)
     """Offset of the next look along the normal from the plane found so far, in mm, after each look, the start included.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, ClassVar
 
 from armscan.agents.networks import NetworkChoice, check_network
 from armscan.agents.protocols import AgentSetup
@@ -25,6 +25,9 @@ class Parameters:
     Raises:
         InvalidValueError: If a value is outside what is allowed.
     """
+
+    SCHEDULABLE: ClassVar[tuple[str, ...]] = ("lr", "lr_end_factor", "batch_size")
+    """What a schedule may change during a training: neither networks nor what is kept of the environments."""
 
     network: NetworkChoice
     """Network of the actor, and of the critics if the algorithm has critics."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
-from armscan.agents.hyperparameters import PolicyParameters, check_batch, check_collection, number
+from armscan.agents.hyperparameters import Parameters, PolicyParameters, check_batch, check_collection, number
 from armscan.agents.networks import Network
 from armscan.agents.protocols import AgentSetup
 from armscan.errors import InvalidValueError
@@ -17,6 +17,18 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class PPO(PolicyParameters):
     """Proximal policy optimisation (Schulman et al. 2017, arXiv:1707.06347) with a clipped objective."""
+
+    SCHEDULABLE: ClassVar[tuple[str, ...]] = (
+        *Parameters.SCHEDULABLE,
+        "gamma",
+        "gae_lambda",
+        "clip_range",
+        "ent_coef",
+        "vf_coef",
+        "max_grad_norm",
+        "n_epochs",
+    )
+    """See `Parameters.SCHEDULABLE`."""
 
     gamma: float = number(0.9, at_least=0.0, at_most=1.0)
     """Discount factor; planes are absolute, so later rewards matter little."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from armscan.agents.hyperparameters import Parameters, buffer_capacity, check_batch, check_updates, number
 from armscan.agents.protocols import AgentSetup
@@ -25,6 +25,9 @@ class Regression(Parameters):
     Raises:
         InvalidValueError: If a value is impossible.
     """
+
+    SCHEDULABLE: ClassVar[tuple[str, ...]] = (*Parameters.SCHEDULABLE, "utd_ratio", "own_planes_share")
+    """See `Parameters.SCHEDULABLE`."""
 
     buffer_size: int = 100_000
     """Number of latest slices to keep; never more than the whole training takes."""

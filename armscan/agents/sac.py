@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from armscan.agents.hyperparameters import (
+    Parameters,
     PolicyParameters,
     buffer_capacity,
     check_batch,
@@ -26,6 +27,16 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class SAC(PolicyParameters):
     """Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) with a learned entropy coefficient."""
+
+    SCHEDULABLE: ClassVar[tuple[str, ...]] = (
+        *Parameters.SCHEDULABLE,
+        "ent_coef_lr",
+        "target_entropy_per_dim",
+        "gamma",
+        "tau",
+        "utd_ratio",
+    )
+    """See `Parameters.SCHEDULABLE`."""
 
     ent_coef_init: float = number(0.1, above=0.0, at_most=1000.0)
     """Initial entropy coefficient; rewards here are small, so 1 would dominate them for long."""

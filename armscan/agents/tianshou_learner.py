@@ -194,7 +194,10 @@ class TianshouLearner(BaseLearner):
         """
         load_into(self._algorithm, dict(state["algorithm"]))
         if optimiser := _entropy_optimiser(self._algorithm):
+            # Its learning rate is the configuration's, which a schedule may have changed.
+            lr = optimiser.param_groups[0]["lr"]
             optimiser.load_state_dict(state["entropy_optimiser"])
+            optimiser.param_groups[0]["lr"] = lr
         self._replay.load_state(state["replay"])
         self._collector.collect_step = state["n_env_steps"]
         self._n_epochs = state["n_epochs"]

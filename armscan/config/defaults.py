@@ -28,6 +28,8 @@ MULTIRUN = ("-m", "--multirun")
 # What says where and how things are computed, kept and told, not what; and the seed, by which runs of the same thing
 # differ.
 NOT_COMPARED = ("tracking", "device", "compute.device", "seed", "evaluation.on_plane")
+# Keys that earlier versions did not have; null is what these did.
+ADDED = ("training.schedule",)
 # The phantoms, where a command asks for volumes.
 PHANTOM = "phantom"
 

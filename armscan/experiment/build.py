@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from armscan.agents import Agent, AgentSetup, Algorithm, Compute, Learner
+from armscan.agents import (
+    Agent,
+    AgentSetup,
+    Algorithm,
+    Compute,
+    Learner,
+    ScheduledLearner,
+    Segment,
+    scheduled_algorithms,
+)
 from armscan.config.defaults import CLUSTER, to_plain
 from armscan.config.trust import needs_trust
 from armscan.envs import EnvFactory
@@ -131,6 +140,7 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
         total_env_steps=budget.env_steps,
         seed=seed,
         validation=split.validation,
+        schedule=budget.segments,
     )
     return Experiment(
         split=split,
@@ -157,10 +167,10 @@ def check_words(config: DictConfig) -> None:
     check_seed("seed", config.seed)
     check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
     on_plane_of(config)
-    _made(config, "training", Budget)
+    budget = _made(config, "training", Budget)
     _made(config, "compute", Compute)
     instantiate(config.env, _convert_="object")
-    make_algorithm(config)
+    scheduled_algorithms(make_algorithm(config), budget.segments)
 
 
 def _made(config: DictConfig, section: str, kind: type[T]) -> T:
@@ -200,6 +210,7 @@ def make_agent(
     total_env_steps: int,
     seed: int,
     validation: Mapping[str, LabelVolume] | None = None,
+    schedule: Sequence[Segment] = (),
 ) -> Agent:
     """Return the agent, which has learned nothing yet, for environments on these volumes.
 
@@ -210,6 +221,7 @@ def make_agent(
         total_env_steps: Budget of its training, in environment steps.
         seed: Seed of all its random numbers.
         validation: Validation volumes of its training. Default: None, for an agent that does not learn.
+        schedule: Changes of its hyperparameters while it learns. Default: none.
     """
     algorithm = make_algorithm(config)
     env = env_factory.make_env(dict(volumes))
@@ -234,7 +246,11 @@ def make_agent(
             f"agent is {type(agent).__name__}, which learns, but it must have all methods of Learner: it has no "
             f"{listed(missing)}"
         )
-    return agent
+    # All of them now: what one refuses is told before anything is trained.
+    later: list[tuple[int, Any]] = [
+        (start, each.agent(setup)) for start, each in scheduled_algorithms(algorithm, schedule)
+    ]
+    return ScheduledLearner(cast(Learner, agent), later) if later else agent
 
 
 def make_algorithm(config: DictConfig) -> Algorithm:

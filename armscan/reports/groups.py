@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from armscan.config.defaults import NOT_COMPARED
+from armscan.config.defaults import ADDED, NOT_COMPARED
 from armscan.reports.load import TrackedTraining
 
 LEFT_OUT = (*NOT_COMPARED, "data.cache_dir")
@@ -74,7 +74,8 @@ def _one_for_each_seed(trainings: Iterable[TrackedTraining]) -> list[TrackedTrai
 
 
 def _compared(params: Mapping[str, str]) -> dict[str, str]:
-    return {key: value for key, value in params.items() if not _is_under(key, LEFT_OUT)}
+    kept = {key: value for key, value in params.items() if not _is_under(key, LEFT_OUT)}
+    return {key: value for key, value in kept.items() if key not in ADDED or value != str(None)}
 
 
 def _is_under(key: str, sections: Iterable[str]) -> bool:

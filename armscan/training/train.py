@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from armscan.agents.protocols import Learner
+from armscan.agents.schedule import Segment, read_schedule
 from armscan.errors import InvalidValueError
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint
@@ -55,6 +57,9 @@ class Budget:
         validation_episodes: Number of episodes of each validation.
         solved: Criterion that stops the training early; None spends the whole budget.
         best_by: Criterion that chooses the best epoch, `success` or `distance`; see `Evaluation.score`.
+        schedule: Changes of the agent's hyperparameters, a mapping for each: `from_env_steps` and values by keys, such
+            as `agent.lr`. Each applies from the first epoch that begins after so many environment steps, and lasts
+            until another changes it. None changes nothing.
     """
 
     env_steps: int
@@ -62,6 +67,7 @@ class Budget:
     validation_episodes: int
     solved: SolvedCriterion | None = None
     best_by: str = SUCCESS
+    schedule: Sequence[Mapping[str, Any]] | None = None
 
     def __post_init__(self) -> None:
         for name in ("env_steps", "eval_every_env_steps", "validation_episodes"):
@@ -69,6 +75,12 @@ class Budget:
         check_choice("training.best_by", self.best_by, BEST_BY)
         if self.solved is not None and not isinstance(self.solved, SolvedCriterion):
             raise InvalidValueError(f"training.solved is {self.solved!r}, but it must be a SolvedCriterion or null")
+        read_schedule("training.schedule", self.schedule, self.env_steps)
+
+    @property
+    def segments(self) -> tuple[Segment, ...]:
+        """The changes of `schedule`, in order."""
+        return read_schedule("training.schedule", self.schedule, self.env_steps)
 
 
 @dataclass(frozen=True)

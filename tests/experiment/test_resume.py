@@ -30,6 +30,8 @@ PPO = [*(each for each in LONGER if not each.startswith("agent.learning_starts")
 PPO += ["agent.env_steps_per_collection=100"]
 IMAGES = [*(each for each in LONGER if not each.startswith("network")), "obs=slice_channels", "obs.shape=[36,36]"]
 IMAGES += ["network=multimodal", "network.filters=[2,2,2]", "network.vector_sizes=[8]", "network.head_sizes=[8]"]
+CHANGES = "{from_env_steps:300,agent.lr:0.01,agent.ent_coef_lr:0.01},{from_env_steps:700,agent.utd_ratio:0.5}"
+SCHEDULED = [*LONGER, f"training.schedule=[{CHANGES}]"]
 TWO = ("00001_labels.nii.gz", "00002_labels.nii.gz")
 COMMAND = ["-m", "armscan.run"]
 # The same, but every checkpoint stays unfinished for a while.
@@ -128,7 +130,7 @@ def test_run_killed_while_it_writes_a_checkpoint_goes_on_and_ends_as_if_it_had_n
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arguments", [LONGER, PPO, IMAGES], ids=["sac", "ppo", "images"])
+@pytest.mark.parametrize("arguments", [LONGER, PPO, IMAGES, SCHEDULED], ids=["sac", "ppo", "images", "scheduled"])
 def test_run_killed_again_and_again_ends_as_if_it_had_not_been(tmp_path, arguments):
     drawn = random.Random(7)
 

@@ -8,7 +8,9 @@ from armscan.training import splits as data
 from tests.support.junk import SETTINGS, junk, refuses
 
 
-@pytest.mark.parametrize("changed", ["env_steps", "eval_every_env_steps", "validation_episodes", "solved", "best_by"])
+@pytest.mark.parametrize(
+    "changed", ["env_steps", "eval_every_env_steps", "validation_episodes", "solved", "best_by", "schedule"]
+)
 @SETTINGS
 @given(value=junk)
 def test_budget_with_junk(changed, value):

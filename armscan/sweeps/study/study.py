@@ -13,7 +13,7 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.pruners import BasePruner
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.config.defaults import NOT_COMPARED
+from armscan.config.defaults import ADDED, NOT_COMPARED
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST
@@ -82,6 +82,7 @@ def _wanted(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]
     of_trials = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
     left_out = tuple(f"{each}." for each in (*NOT_COMPARED, *(one.name for one in settings.space.parameters)))
     shared = {key: value for key, value in flattened(fixed).items() if not f"{key}.".startswith(left_out)}
+    shared = {key: value for key, value in shared.items() if key not in ADDED or value is not None}
     return {
         SPACE: settings.space.to_plain(),
         DASHBOARD_OBJECTIVES: dict(settings.objectives),

@@ -1,0 +1,107 @@
+"""A learner whose hyperparameters change at given environment steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+
+from armscan.agents.batch_agent import batch_agent
+from armscan.agents.protocols import Learner
+from armscan.envs.actions import ActionBounds
+from armscan.envs.rules import Observed
+from armscan.volumes.plane import FloatArray
+
+if TYPE_CHECKING:
+    from armscan.agents.policy import Policy
+
+
+class ScheduledLearner:
+    """A learner that another takes the place of from an environment step on.
+
+    At the first epoch that begins at or after that step, the next learner loads the state of the one before. Which
+    one learns follows from the environment steps alone, so that a training that is resumed at any epoch, or that goes
+    on from another's checkpoint, is the same bit for bit as one that was never interrupted.
+
+    Args:
+        first: Learner from the beginning on.
+        later: First environment step and learner of each segment, in order; each has learned nothing yet.
+    """
+
+    def __init__(self, first: Learner, later: Sequence[tuple[int, Learner]]) -> None:
+        self._use(first)
+        self._later = list(later)
+
+    def _use(self, learner: Learner) -> None:
+        self._learner, self._batch = learner, batch_agent(learner)
+
+    @property
+    def n_env_steps(self) -> int:
+        """See `Learner.n_env_steps`."""
+        return self._learner.n_env_steps
+
+    @property
+    def env_steps_at_once(self) -> int:
+        """See `Learner.env_steps_at_once`."""
+        return self._learner.env_steps_at_once
+
+    @property
+    def update_note(self) -> str | None:
+        """See `Learner.update_note`."""
+        return self._learner.update_note
+
+    @property
+    def validation_note(self) -> str | None:
+        """How the actions of evaluations are chosen, where the learner says so."""
+        return getattr(self._learner, "validation_note", None)
+
+    def warm_up(self) -> None:
+        """See `Learner.warm_up`."""
+        self._learner.warm_up()
+
+    def learn(self, n_env_steps: int) -> dict[str, float]:
+        """Learn with the hyperparameters of this moment; see `Learner.learn`."""
+        due = None
+        while self._later and self._later[0][0] <= self.n_env_steps:
+            due = self._later.pop(0)[1]
+        if due is not None:
+            due.load_state(self._learner.state())
+            self._use(due)
+        return self._learner.learn(n_env_steps)
+
+    def begin(self, *, seed: int, bounds: ActionBounds) -> None:
+        """See `Agent.begin`."""
+        self._learner.begin(seed=seed, bounds=bounds)
+
+    def act(self, observation: Observed, reward: float) -> NDArray[Any]:
+        """See `Agent.act`."""
+        return self._learner.act(observation, reward)
+
+    def begin_all(self, *, seeds: Sequence[int], bounds: Sequence[ActionBounds]) -> None:
+        """See `BatchAgent.begin_all`."""
+        self._batch.begin_all(seeds=seeds, bounds=bounds)
+
+    def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[Any]) -> NDArray[Any]:
+        """See `BatchAgent.act_all`."""
+        return self._batch.act_all(observations, rewards, episodes)
+
+    def policy(self) -> Policy:
+        """See `Learner.policy`."""
+        return self._learner.policy()
+
+    def weights(self) -> dict[str, Any]:
+        """See `Learner.weights`."""
+        return self._learner.weights()
+
+    def load_weights(self, weights: dict[str, Any]) -> None:
+        """See `Learner.load_weights`."""
+        self._learner.load_weights(weights)
+
+    def state(self) -> dict[str, Any]:
+        """See `Learner.state`."""
+        return self._learner.state()
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what `state` returned, also that of a learner without a schedule; see `Learner.load_state`."""
+        self._learner.load_state(state)
