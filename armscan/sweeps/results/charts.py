@@ -17,6 +17,7 @@ from plotly.graph_objects import Figure, Scatter
 from armscan.reports.chart_style import BLUE, GREY, ORANGE, RED, mode
 from armscan.reports.html import chart
 from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.reports import reports_of
 from armscan.training.titles import is_rate, title_of
 
 HEIGHT_PX, SMALL_PX, BAR_PX = 360, 260, 34
@@ -35,9 +36,12 @@ def charts_of(
         shares: importance of each key by objective; empty where too few trials have finished.
     """
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    if len(objectives) == 1 and any(trial.intermediate_values for trial in trials):
-        heading = f"While training: {title_of(objectives[0])}"
-        yield _titled(heading, _reports(trials, objectives[0]), "A line for each trial, seeds one after another.")
+    if any(map(reports_of, trials)):
+        for number, objective in enumerate(objectives):
+            heading = f"While training: {title_of(objective)}"
+            yield _titled(
+                heading, _reports(trials, number, objective), "A line for each trial, seeds one after another."
+            )
     if not complete:
         yield "<p>No trial has run to its end yet.</p>"
         return
@@ -115,7 +119,7 @@ def _slice(trials: Sequence[FrozenTrial], key: str, number: int, objective: str)
     return figure.update_layout(height=SMALL_PX, xaxis=axis, yaxis=_axis(objective))
 
 
-def _reports(trials: Sequence[FrozenTrial], objective: str) -> Figure:
+def _reports(trials: Sequence[FrozenTrial], number: int, objective: str) -> Figure:
     """Return what trials have reported while they trained: the finished in grey, the pruned to a cross, the running."""
     figure, named = Figure(), set()
     looks: dict[TrialState, tuple[str, dict[str, Any]]] = {
@@ -124,7 +128,7 @@ def _reports(trials: Sequence[FrozenTrial], objective: str) -> Figure:
         TrialState.RUNNING: ("running", {"line": {"color": BLUE, "width": 2.5}}),
     }
     for trial in sorted(trials, key=lambda trial: trial.state == TrialState.RUNNING):
-        points = sorted(trial.intermediate_values.items())
+        points = [(step, values[number]) for step, values in reports_of(trial).items()]
         if not points:
             continue
         name, style = looks.get(trial.state, ("failed", {"line": {"color": GREY, "width": 1, "dash": "dot"}}))

@@ -29,6 +29,7 @@ from armscan.sweeps.scheduling.state import (
     env_steps_of,
 )
 from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.reports import reports_of
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import FOLDER, RUN
 from armscan.training.titles import title_of, value_text
@@ -62,9 +63,10 @@ def write_report(
     tables = {
         "trials": [_trial_row(trial, objectives) for trial in trials],
         "reports": [
-            {"trial": trial.number, "step": step, "value": value}
+            {"trial": trial.number, "step": step, "objective": name, "value": value}
             for trial in trials
-            for step, value in trial.intermediate_values.items()
+            for step, values in reports_of(trial).items()
+            for name, value in zip(objectives, values, strict=True)
         ],
         "endings": _endings(trials),
         "failures": [
@@ -200,7 +202,7 @@ def _endings(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
         if trial.state == TrialState.FAIL:
             cause = _cause(trial) + (", retried" if RETRIED in trial.user_attrs else "")
         elif trial.state == TrialState.PRUNED:
-            cause = f"behind the others at environment step {trial.last_step}"
+            cause = f"behind the others at environment step {max(reports_of(trial), default='unknown')}"
             if STOP in trial.user_attrs:
                 cause = f"stopped: {trial.user_attrs[STOP]}"
         of_ending.setdefault((trial.state.name.lower(), cause), []).append(trial.number)

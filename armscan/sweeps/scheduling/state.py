@@ -10,6 +10,7 @@ from typing import Any, Self, TypeVar
 from optuna.trial import FrozenTrial, Trial, TrialState
 from pydantic import Field
 
+from armscan.sweeps.storage.reports import reports_of
 from armscan.utils.section import Section
 
 T = TypeVar("T")
@@ -125,7 +126,7 @@ class Limits(Section):
         failed = [trial for trial in state.failed if trial.number not in reset]
         if len(failed) > self.max_failures:
             return f"{len(failed)} trials have failed, and at most {self.max_failures} may: {_reason(failed[-1])}"
-        got_nowhere = not state.finished and not any(trial.intermediate_values for trial in state.all)
+        got_nowhere = not state.finished and not any(reports_of(trial) for trial in state.all)
         if len(failed) >= FAILURES_AT_ONCE and got_nowhere:
             return f"the first {len(failed)} trials failed before they reported anything: {_reason(failed[0])}"
         return None

@@ -14,6 +14,7 @@ from optuna.trial import FrozenTrial, TrialState
 from pydantic import ConfigDict, Field
 
 from armscan.errors import ArmscanError, StudyError, few
+from armscan.sweeps.storage.reports import REPORT
 from armscan.utils.section import Section
 from armscan.utils.validation import LARGEST_SEED
 
@@ -29,6 +30,7 @@ UNREADABLE = (*DAMAGED, LookupError)
 MAX_REASON_CHARS = 300
 # SQLite's largest whole number.
 LARGEST = 2**63 - 1
+MAX_STEP_DIGITS = 18
 Number = Annotated[int, Field(ge=0, le=LARGEST, description="a whole number of at least 0")]
 # Without what no path can have.
 Text = Annotated[str, Field(pattern=r"^[^\x00]*$", description="a text")]
@@ -196,7 +198,16 @@ def _wrong_numbers(trial: FrozenTrial, n_objectives: int) -> str | None:
     for step, value in trial.intermediate_values.items():
         if type(step) is not int or not isinstance(value, Real):
             return f"has the report {step!r}: {value!r}, but it must be a number at a whole number"
+    for name, reported in trial.system_attrs.items():
+        if name.startswith(REPORT) and not _is_report(name.removeprefix(REPORT), reported, n_objectives):
+            return f"has the system attribute {name}: {reported!r}, but it must be {n_objectives} numbers at a step"
     return None
+
+
+def _is_report(step: str, values: Any, n_objectives: int) -> bool:
+    is_step = step.isascii() and step.isdigit() and len(step) <= MAX_STEP_DIGITS
+    is_list = isinstance(values, list) and len(values) == n_objectives
+    return is_step and is_list and all(type(value) in (int, float) for value in values)
 
 
 def _is_finite(value: Any) -> bool:

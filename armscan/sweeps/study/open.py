@@ -40,7 +40,7 @@ class Phase:
         scheduler: the one of its trials.
         space: the keys that are searched.
         objectives: names of the metrics that are the trial's values, in order.
-        reported: metric that running trials report to the pruner; None without pruning.
+        reported: names of the metrics that running trials report to the pruner; none without pruning.
         run: runs an attempt at a trial and returns its metrics.
         seeds_of: returns the seeds that a trial is run with.
         sampler: see `StudySettings`.
@@ -56,7 +56,7 @@ class Phase:
     scheduler: TrialScheduler
     space: Space
     objectives: tuple[str, ...]
-    reported: str | None
+    reported: tuple[str, ...]
     run: Callable[[Attempt], dict[str, float]]
     seeds_of: Callable[[Trial], tuple[int, ...]]
     sampler: Mapping[str, Any]
@@ -161,7 +161,7 @@ def open_for_work(
         scheduler=TrialScheduler(study, storage, settings),
         space=settings.space,
         objectives=objectives,
-        reported=objectives[0] if len(objectives) == 1 else None,
+        reported=objectives,
         run=task.run,
         seeds_of=lambda _: settings.seeds,
         sampler=settings.sampler,
@@ -187,7 +187,7 @@ def _final_phase(search: Phase, settings: StudySettings, task: Task) -> Phase:
         name=name,
         scheduler=TrialScheduler(study, storage, limits, is_open=False),
         objectives=(task.final_metric,),
-        reported=None,
+        reported=(),
         run=task.evaluate,
         seeds_of=lambda trial: (int(trial.user_attrs[FINAL_SEED]),),
         folder=search.folder / "judged",

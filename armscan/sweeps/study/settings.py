@@ -20,7 +20,8 @@ NAME = re.compile(rf"(?!.*{FINAL_EVAL_SUFFIX}$)\w[\w\-.]{{0,99}}")
 # The first final seed is this much above the largest seed of the search.
 FIRST_SEED_ABOVE, MAX_FINAL_SEEDS = 1000, 1000
 LARGEST_SEARCH_SEED = LARGEST_SEED - FIRST_SEED_ABOVE - MAX_FINAL_SEEDS
-NO_PRUNER = "optuna.pruners.NopPruner"
+OPTUNA_PRUNERS = "optuna.pruners."
+NO_PRUNER = f"{OPTUNA_PRUNERS}NopPruner"
 
 
 def check_study_name(where: str, name: Any) -> str:
@@ -123,10 +124,12 @@ class StudySettings(Limits):
 
     @model_validator(mode="after")
     def _can_prune(self) -> Self:
-        if len(self.objectives) > 1 and self.pruner["_target_"] != NO_PRUNER:
+        target = self.pruner["_target_"]
+        # All of Optuna's compare one value.
+        if len(self.objectives) > 1 and target.startswith(OPTUNA_PRUNERS) and target != NO_PRUNER:
             raise InvalidValueError(
-                f"study.pruner is {self.pruner['_target_']}, but trials of several objectives cannot be pruned: give "
-                "study/pruner=none"
+                f"study.pruner is {target}, which compares one objective, but study.objectives has "
+                f"{len(self.objectives)}: give study/pruner=pareto, or study/pruner=none"
             )
         return self
 

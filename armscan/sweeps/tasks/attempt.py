@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from numbers import Real
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Protocol
 
 import optuna
@@ -20,6 +21,7 @@ from armscan.config.compose import compose
 from armscan.config.defaults import CLUSTER, to_plain
 from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.scheduling.state import ENV_STEPS, EPISODES, RETRY_OF, SEEDS, PendingWrites
+from armscan.sweeps.storage.reports import keep_report, reports_of
 from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
 from armscan.utils.validation import check_float
@@ -44,7 +46,7 @@ class Attempt:
         study_folder: the folder of the study.
         run_id: the ID of its tracked run.
         tags: tags of the tracked runs of its trainings, that say of which study and trial they are.
-        objective: the metric that it reports to the pruner while it runs; None without pruning.
+        objectives: names of the metrics that it reports to the pruner while it runs; none without pruning.
         report_progress: takes what is known of how far it is.
         opened: takes the tracked run of a training while it goes on, and None when it has ended.
         show_picture: takes a file that the dashboard is to show.
@@ -60,7 +62,7 @@ class Attempt:
     study_folder: Path
     run_id: str
     tags: Mapping[str, str]
-    objective: str | None
+    objectives: tuple[str, ...]
     report_progress: Callable[[dict[str, Any]], None]
     opened: Callable[[TrackedRun | None], None]
     show_picture: Callable[[Path], None]
@@ -74,8 +76,7 @@ class Attempt:
     def __post_init__(self) -> None:
         self._of_seeds = dict(self.trial.user_attrs.get(SEEDS, {}))
         is_resumed = RUN in self.trial.user_attrs
-        known = self.trial.storage.get_trial(self.trial._trial_id).intermediate_values if is_resumed else {}
-        self._reported = set(known)
+        self._reported = set(reports_of(self.trial.storage.get_trial(self.trial._trial_id))) if is_resumed else set()
 
     @property
     def folder(self) -> Path:
@@ -124,7 +125,8 @@ class Attempt:
         """Report how a training is going.
 
         Args:
-            metrics: the metrics of the last validation: the objective, and `mean_return` for the screen, if known.
+            metrics: the metrics so far: the objectives, and `mean_return` for the screen, if known. A trial that does
+                not report every objective is not pruned.
             seed: the seed of the training.
             n_env_steps: the environment steps that it has taken.
             grid: environment steps between two reports: trials are compared at the same steps.
@@ -137,20 +139,22 @@ class Attempt:
         self.env_steps = sum(int(one[ENV_STEPS]) for one in done) + n_env_steps
         progress = {"seed": seed, ENV_STEPS: self.env_steps}
         self.report_progress(progress | ({"return": metrics["mean_return"]} if "mean_return" in metrics else {}))
-        if self.objective is None or self.objective not in metrics:
+        if not self.objectives or any(name not in metrics for name in self.objectives):
             return
         step = self.seeds.index(seed) * total + n_env_steps // grid * grid
         if step in self._reported:
             return
         self._reported.add(step)
-        values = [one[self.objective] for one in done] + [metrics[self.objective]]
-        if self.writes.flush_with(self.transaction, partial(self._is_to_be_pruned, step, sum(values) / len(values))):
+        values = [fmean(one[name] for one in (*done, metrics)) for name in self.objectives]
+        if self.writes.flush_with(self.transaction, partial(self._is_to_be_pruned, step, values)):
             raise optuna.TrialPruned
 
-    def _is_to_be_pruned(self, step: int, value: float) -> bool:
-        # Not by the trial's own method, which reports nothing twice: the storage may have lost it with its connection.
-        self.trial.storage.set_trial_intermediate_value(self.trial._trial_id, step, value)
-        return self.trial.should_prune()
+    def _is_to_be_pruned(self, step: int, values: Sequence[float]) -> bool:
+        study, storage, trial_id = self.trial.study, self.trial.storage, self.trial._trial_id
+        # Not by the trial's own methods. They report nothing twice, though the storage may have lost it with its
+        # connection, and refuse several objectives.
+        keep_report(storage, trial_id, step, values)
+        return study.pruner.prune(study, storage.get_trial(trial_id))
 
 
 class Task(Protocol):

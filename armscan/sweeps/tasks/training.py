@@ -58,13 +58,24 @@ class _Reporter:
 
     def on_epoch(self, report: EpochReport) -> None:
         self.reports.append(report)
+        grid = self.budget.eval_every_env_steps
+        # On the grid: how far the environments of a vector step beyond it says nothing of a trial.
+        so_far = dict(zip(TRAINING_METRICS, (report.n_env_steps // grid * grid, report.wall_s, 0.0), strict=True))
         self.attempt.report(
-            report.evaluation.metrics(),
+            self._validation().metrics() | so_far,
             seed=self.seed,
             n_env_steps=report.n_env_steps,
-            grid=self.budget.eval_every_env_steps,
+            grid=grid,
             total=self.budget.env_steps,
         )
+
+    def _validation(self) -> Evaluation:
+        """Return the last validation; with several objectives the best, as if the training ended now.
+
+        Pruners of one objective take the best report themselves.
+        """
+        several = len(self.attempt.objectives) > 1
+        return [report for report in self.reports if report.is_best or not several][-1].evaluation
 
     def on_end(self) -> None:
         pass

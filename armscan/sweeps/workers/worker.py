@@ -143,7 +143,7 @@ class Worker:
             study_folder=phase.folder,
             run_id=self._tracked.run_id,
             tags=phase.tags_of(trial),
-            objective=phase.reported,
+            objectives=phase.reported,
             report_progress=self._heartbeat.report_progress,
             opened=self._opened,
             show_picture=lambda picture: writes.append(partial(show_picture, trial, picture, phase.artifacts)),

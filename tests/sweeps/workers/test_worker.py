@@ -14,8 +14,10 @@ from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.stop import stop_study, stop_trial
+from armscan.sweeps.storage.reports import reports_of
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.open import Phase
+from armscan.sweeps.study.pruners import ParetoPruner
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.workers import heartbeat
 from armscan.sweeps.workers.heartbeat import Heartbeat
@@ -37,10 +39,17 @@ def far_from_a_thousandth(attempt):
 def work(tmp_path, empty_database):
     """Lets one worker run a study in a folder of its own; returns the study."""
 
-    def run_study(folder, run=far_from_a_thousandth, *, sampler=RANDOM, seed=0, **limits):
+    def run_study(folder, run=far_from_a_thousandth, *, sampler=RANDOM, seed=0, objectives=("mean_steps",), **limits):
         folder = tmp_path / folder
         storage = open_storage(str(folder / "optuna.journal"))
-        study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
+        pruner = ParetoPruner(100) if len(objectives) > 1 else None
+        study = optuna.create_study(
+            study_name="a",
+            storage=storage.optuna,
+            load_if_exists=True,
+            directions=["minimize"] * len(objectives),
+            pruner=pruner,
+        )
         if not (folder / "a.db").exists():
             shutil.copy(empty_database, folder / "a.db")
         client, experiment_id = open_store(
@@ -53,8 +62,8 @@ def work(tmp_path, empty_database):
             name="a",
             scheduler=TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits)),
             space=Space.read(SPACE),
-            objectives=("mean_steps",),
-            reported=None,
+            objectives=objectives,
+            reported=objectives if pruner else (),
             run=run,
             seeds_of=lambda _: (0,),
             sampler=sampler,
@@ -84,6 +93,18 @@ def test_worker_alone_draws_the_same_points_again_from_the_same_seed_and_others_
     ]
     assert points[0] == points[1]
     assert len({point["agent.lr"] for point in points[0] + points[2]}) == 10
+
+
+def test_worker_prunes_a_trial_of_several_objectives_that_is_behind_in_all(work):
+    def first_is_best(attempt):
+        metrics = {"mean_steps": float(attempt.trial.number), "env_steps": float(attempt.trial.number)}
+        for step in (50, 100):
+            attempt.report(metrics, seed=0, n_env_steps=step, grid=50, total=100)
+        return metrics
+
+    study = work("a", first_is_best, objectives=("mean_steps", "env_steps"), n_trials=3)
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE", "PRUNED", "PRUNED"]
+    assert reports_of(study.trials[2]) == {50: (2.0, 2.0), 100: (2.0, 2.0)}
 
 
 def test_worker_goes_on_after_a_trial_that_raised_and_says_what_it_raised(work):

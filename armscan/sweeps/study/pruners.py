@@ -1,0 +1,116 @@
+"""Pruner of trials with several objectives, which Optuna's own refuse."""
+
+from __future__ import annotations
+
+import numpy as np
+import optuna
+from numpy.typing import NDArray
+from optuna.pruners import BasePruner
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, TrialState
+
+from armscan.errors import InvalidValueError
+from armscan.sweeps.storage.reports import reports_of
+
+Losses = NDArray[np.float64]
+
+
+class ParetoPruner(BasePruner):
+    """Asynchronous successive halving by Pareto fronts.
+
+    The rungs are `min_resource` steps and each `reduction_factor` times as many as the one before. A trial that reaches
+    a rung is compared with all trials that have reached it, and with those that ended before it by their final values.
+    It goes on unless so many are better as may go on. Better is a lower Pareto front, and within one the larger
+    crowding distance (Schmucker et al. 2021, arXiv:2106.12639; Deb et al. 2002, doi:10.1109/4235.996017). The first
+    front always goes on, however many it has.
+
+    Args:
+        min_resource: steps of the first rung, at least 1.
+        reduction_factor: one trial in so many goes on from a rung, at least 2. Default: 3.
+
+    Raises:
+        InvalidValueError: if a number is too small.
+    """
+
+    def __init__(self, min_resource: int, reduction_factor: int = 3) -> None:
+        for name, value, least in (("min_resource", min_resource, 1), ("reduction_factor", reduction_factor, 2)):
+            if type(value) is not int or value < least:
+                raise InvalidValueError(f"{name} is {value!r}, but it must be a whole number of at least {least}")
+        self._min_resource, self._reduction_factor = min_resource, reduction_factor
+
+    def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
+        """Return whether a trial is to be pruned, which it is at its first report on a rung at most."""
+        steps = list(reports_of(trial))
+        rung = self._rung_below(steps[-1]) if steps else None
+        if rung is None or any(step >= rung for step in steps[:-1]):
+            return False
+        reached = [_values_at(rung, each) for each in study.get_trials(deepcopy=False) if each.number != trial.number]
+        values = [_values_at(rung, trial), *filter(None, reached)]
+        signs = [-1.0 if direction == StudyDirection.MAXIMIZE else 1.0 for direction in study.directions]
+        # What is not known counts as worst.
+        losses = np.nan_to_num(np.array(values, dtype=float) * signs, nan=np.inf, posinf=np.inf, neginf=-np.inf)
+        return bool(n_better(losses) >= max(1, len(losses) // self._reduction_factor))
+
+    def _rung_below(self, step: int) -> int | None:
+        """Return the highest rung that is not above a step; None below the first."""
+        if step < self._min_resource:
+            return None
+        rung = self._min_resource
+        while (following := rung * self._reduction_factor) <= step:
+            rung = following
+        return rung
+
+
+def _values_at(rung: int, trial: FrozenTrial) -> tuple[float, ...] | None:
+    """Return the values of a trial at a rung, its final ones if it ended before; None if it has not come so far."""
+    at_rung = next((values for step, values in reports_of(trial).items() if step >= rung), None)
+    if at_rung is None and trial.state == TrialState.COMPLETE:
+        return tuple(trial.values)
+    return at_rung
+
+
+def n_better(losses: Losses) -> int:
+    """Return how many trials are better than the first: none if it is on the first front.
+
+    Args:
+        losses: values of shape (trials, objectives), of which lower ones are better.
+    """
+    fronts = front_numbers(losses)
+    beside = np.flatnonzero(fronts == fronts[0])
+    if fronts[0] == 0:
+        return 0
+    distances = crowding_distances(losses[beside])
+    return int(np.sum(fronts < fronts[0]) + np.sum(distances > distances[0]))
+
+
+def front_numbers(losses: Losses) -> NDArray[np.int64]:
+    """Return the number of the Pareto front of each trial, from 0, of losses of shape (trials, objectives)."""
+    numbers = np.full(len(losses), -1)
+    # dominates[i, j]: trial i is nowhere worse than trial j, and better in one objective.
+    no_worse: NDArray[np.bool_] = (losses[:, None] <= losses[None]).all(axis=2)
+    dominates = no_worse & ~no_worse.T
+    front = 0
+    while (left := numbers < 0).any():
+        numbers[left & ~dominates[left].any(axis=0)] = front
+        front += 1
+    return numbers
+
+
+def crowding_distances(losses: Losses) -> Losses:
+    """Return the crowding distance of each trial of one front: how far its neighbours are, over all objectives.
+
+    Args:
+        losses: values of shape (trials, objectives).
+
+    Returns:
+        Distances of shape (trials,); infinite for the best and the worst of an objective.
+    """
+    distances = np.zeros(len(losses))
+    for values in losses.T:
+        order = np.argsort(values, kind="stable")
+        ordered = values[order]
+        # Of objectives that are the same everywhere, or not known of some, there is none.
+        if np.isfinite(ordered[[0, -1]]).all() and ordered[0] < ordered[-1]:
+            inner = (ordered[2:] - ordered[:-2]) / (ordered[-1] - ordered[0])
+            distances[order] += np.concatenate([[np.inf], inner, [np.inf]])
+    return distances
