@@ -27,6 +27,7 @@ from armscan.sweeps.scheduling.state import (
     STOP,
     StudyState,
     env_steps_of,
+    is_feasible,
 )
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.reports import reports_of
@@ -97,8 +98,10 @@ def write_report(
 def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
     state, best = StudyState.of(trials), best_trials(study, 1)
     n_pruned = sum(trial.state == TrialState.PRUNED for trial in state.finished)
+    n_infeasible = sum(not is_feasible(trial) for trial in state.finished)
+    violating = f", {n_infeasible} infeasible" if n_infeasible else ""
     text = (
-        f"{len(state.finished)} trials finished, {n_pruned} of them pruned; {len(state.running)} running, "
+        f"{len(state.finished)} trials finished, {n_pruned} of them pruned{violating}; {len(state.running)} running, "
         f"{len(state.failed)} failed, {len(state.retried)} retried after their worker died. "
         f"{state.env_steps:,} environment steps, {state.busy_hours:.2g} hours."
     )
@@ -139,7 +142,7 @@ def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
         rows.append(
             {
                 "trial": trial.number,
-                "ended": _said(trial.state.name.lower()),
+                "ended": _said(trial.state.name.lower()) + ("" if is_feasible(trial) else ", infeasible"),
                 **dict.fromkeys(map(title_of, objectives), ""),
                 **{title_of(name): value_text(name, value) for name, value in values},
                 **_settings(trial),
@@ -185,6 +188,7 @@ def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> dict[str, Any]:
         "trial": trial.number,
         "state": trial.state.name.lower(),
         **values,
+        **({"feasible": is_feasible(trial)} if trial.constraints else {}),
         "seconds": seconds,
         "env_steps": trial.user_attrs.get(ENV_STEPS),
         "retry_of": trial.user_attrs.get(RETRY_OF),

@@ -94,6 +94,11 @@ def env_steps_of(trial: FrozenTrial) -> int:
     return int(max(reported))
 
 
+def is_feasible(trial: FrozenTrial) -> bool:
+    """Return whether a trial violates no constraint of its study."""
+    return all(violation <= 0 for violation in trial.constraints.values())
+
+
 class Limits(Section):
     """When a study ends.
 

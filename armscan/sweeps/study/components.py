@@ -70,6 +70,11 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
     for name in settings.objectives:
         if name not in returned:
             raise InvalidValueError(f"study.objectives names {name!r}, but a trial returns only {listed(returned)}")
+    for constraint in settings.constraints:
+        if constraint.metric not in returned:
+            raise InvalidValueError(
+                f"study.constraints has '{constraint}', but a trial returns only {listed(returned)}"
+            )
     return settings, task, of_trials
 
 

@@ -19,6 +19,7 @@ from armscan.sweeps.scheduling.state import FINAL_SEED, Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.constraints import constrained
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import STUDY_RUN, make_study, name_objectives
@@ -162,7 +163,7 @@ def open_for_work(
         space=settings.space,
         objectives=objectives,
         reported=objectives,
-        run=task.run,
+        run=constrained(task.run, settings.constraints),
         seeds_of=lambda _: settings.seeds,
         sampler=settings.sampler,
         seed=settings.seed,

@@ -13,6 +13,7 @@ from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX
+from armscan.sweeps.study.constraints import Constraint
 from armscan.utils.section import Section
 from armscan.utils.validation import LARGEST_SEED
 
@@ -47,6 +48,10 @@ def _objectives(objectives: Any) -> Any:
         directions = {name: direction for direction, _, name in (str(each).partition(" ") for each in objectives)}
         return directions if len(directions) == len(objectives) else None
     return objectives
+
+
+def _constraints(constraints: Any) -> Any:
+    return tuple(map(Constraint.read, constraints)) if isinstance(constraints, list | tuple) else constraints
 
 
 def _without_repetition(seeds: tuple[int, ...]) -> tuple[int, ...]:
@@ -90,6 +95,7 @@ class StudySettings(Limits):
         task: what makes a `Task`, as Hydra would instantiate it.
         space: what is searched.
         objectives: direction by the name of each metric.
+        constraints: bounds that metrics of a trial must keep. Default: none.
         sampler: what makes an Optuna sampler of a seed, as Hydra would instantiate it.
         pruner: an Optuna pruner, likewise.
         prune_after_env_steps: environment steps of a trial before it may be pruned.
@@ -108,6 +114,9 @@ class StudySettings(Limits):
     space: Space
     objectives: Annotated[dict[Metric, Direction], BeforeValidator(_objectives)] = Field(
         min_length=1, description="a list such as [minimize mean_steps, maximize solved], with no metric twice"
+    )
+    constraints: Annotated[tuple[Constraint, ...], BeforeValidator(_constraints)] = Field(
+        default=(), strict=False, description="a list such as ['training_s <= 60', 'env_steps <= 20000']"
     )
     sampler: Target
     pruner: Target

@@ -16,7 +16,7 @@ from optuna.trial import FrozenTrial, TrialState
 from armscan.config.defaults import ADDED, NOT_COMPARED
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError
-from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST
+from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, is_feasible
 from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.components import make
@@ -79,7 +79,9 @@ def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.
 
 def _wanted(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a study says of itself, by which it is compared."""
-    of_trials = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
+    of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
+    if settings.constraints:
+        of_trials["study.constraints"] = list(map(str, settings.constraints))
     left_out = tuple(f"{each}." for each in (*NOT_COMPARED, *(one.name for one in settings.space.parameters)))
     shared = {key: value for key, value in flattened(fixed).items() if not f"{key}.".startswith(left_out)}
     shared = {key: value for key, value in shared.items() if key not in ADDED or value is not None}
@@ -132,10 +134,12 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:
     """Return the best trials of a study, each with other values, the best first.
 
-    With several objectives these are the ones that no other is better than in all of them, by the first objective.
+    Trials that violate a constraint are left out. With several objectives these are those that no other is better than in
+    all of them, by the first objective.
     """
     several = len(study.directions) > 1
     trials = study.best_trials if several else study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    trials = list(filter(is_feasible, trials))
     is_down = study.directions[0] == optuna.study.StudyDirection.MINIMIZE
     ranked = sorted(trials, key=lambda trial: (trial.values[0] if is_down else -trial.values[0], trial.number))
     different: dict[str, FrozenTrial] = {}
