@@ -134,8 +134,8 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:
     """Return the best trials of a study, each with other values, the best first.
 
-    Trials that violate a constraint are left out. With several objectives these are those that no other is better than in
-    all of them, by the first objective.
+    Trials that violate a constraint are left out. With several objectives these are those that no other is better than
+    in all of them, by the first objective.
     """
     several = len(study.directions) > 1
     trials = study.best_trials if several else study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
