@@ -11,8 +11,13 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
+import warnings
+from pathlib import Path
+
+import optuna
 
 from benchmarks.sweeps.bench.collect import collect
+from benchmarks.sweeps.bench.report import report
 
 
 def main() -> None:
@@ -25,7 +30,24 @@ def main() -> None:
     collecting.add_argument("--seeds", type=int, default=8, help="trainings of each (default: 8)")
     collecting.add_argument("--workers", type=int, default=1, help="processes that train (default: 1)")
     collecting.add_argument("--allow-changes", action="store_true", help="although settings have changed since")
+    replaying = commands.add_parser("report", help="simulate studies, and print their tables")
+    replaying.add_argument("sweep", help="name of the sweep, such as sac_y")
+    replaying.add_argument("--studies", type=int, default=200, help="studies of each rule (default: 200)")
+    replaying.add_argument("--trainings", type=int, default=40, help="budget of each search (default: 40)")
+    replaying.add_argument("--resamples", type=int, default=50, help="resamples of importances (default: 50)")
+    replaying.add_argument("--picture", type=Path, help="a PNG file that is written")
     given = parser.parse_args()
+    if given.command == "report":
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        warnings.simplefilter("ignore")
+        report(
+            given.sweep,
+            n_studies=given.studies,
+            n_trainings=given.trainings,
+            n_resamples=given.resamples,
+            picture=given.picture,
+        )
+        return
     collect(given.sweep, given.configs, given.seeds, given.workers, allow_changes=given.allow_changes)
 
 

@@ -30,14 +30,14 @@ def collect(
     """Train what is missing in the table of a sweep: all seeds of a configuration before the next one.
 
     Args:
-        sweep: name of the sweep, such as `sac_y`.
-        n_configs: number of configurations, the default one included.
-        n_seeds: trainings of each, with the seeds from 0.
-        workers: processes that train. Default: 1, this one.
-        allow_changes: whether to add to a table although other settings than the searched ones have changed since.
+        sweep: Name of the sweep, such as `sac_y`.
+        n_configs: Number of configurations, the default one included.
+        n_seeds: Trainings of each, with the seeds from 0.
+        workers: Processes that train. Default: 1, this one.
+        allow_changes: Whether to add to a table although other settings than the searched ones have changed since.
             Default: False.
-        overrides: of the configuration of all trainings, as on the command line. Default: none.
-        file: the table. Default: None, the one of the bench.
+        overrides: Of the configuration of all trainings, as on the command line. Default: none.
+        file: The table. Default: None, the one of the bench.
     """
     file = file or table_file(sweep)
     design, rows = Design.of(sweep, n_configs, overrides), read_rows(file)
@@ -71,9 +71,9 @@ def trained_rows(words: Sequence[str], training: Mapping[str, Any], values: dict
     """Train a configuration with a seed to its end as a trial would, and return its rows of the table.
 
     Args:
-        words: overrides of the configuration, as on the command line.
-        training: what every row has, the seed among it.
-        values: values of the configuration by name.
+        words: Overrides of the configuration, as on the command line.
+        training: What every row has, the seed among it.
+        values: Values of the configuration by name.
     """
     from armscan.experiment.build import build_experiment
     from armscan.experiment.results import TEST_VOLUMES_SEED

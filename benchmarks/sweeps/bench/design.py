@@ -27,9 +27,9 @@ class Design:
     """The configurations of a bench.
 
     Args:
-        sweep: name of the sweep whose space it is.
-        space: the space.
-        configs: values by name of each configuration, the default one first.
+        sweep: Name of the sweep whose space it is.
+        space: The space.
+        configs: Values by name of each configuration, the default one first.
         fixed_sha256: sum of the configuration that the space is searched in.
     """
 

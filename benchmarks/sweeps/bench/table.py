@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gzip
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import methodcaller
 from pathlib import Path
 from typing import Any
@@ -62,14 +62,14 @@ class Curves:
     """The curves of the configurations that have been trained with enough seeds.
 
     Args:
-        sweep: name of the sweep.
-        space: the space that the configurations are of.
-        configs: values by name of each configuration; the first is the default one.
-        config_of: place of each training's configuration among them, shape (trainings,).
-        env_steps: environment steps at the end of each epoch, shape (epochs,).
-        validation: metrics of each epoch by name, shape (trainings, epochs).
-        test: metrics of the best epoch's weights on the test volumes by name, shape (trainings,).
-        processor_s: processor seconds of each training, shape (trainings,).
+        sweep: Name of the sweep.
+        space: The space that the configurations are of.
+        configs: Values by name of each configuration; the first is the default one.
+        config_of: Place of each training's configuration among them, shape (trainings,).
+        env_steps: Environment steps at the end of each epoch, shape (epochs,).
+        validation: Metrics of each epoch by name, shape (trainings, epochs).
+        test: Metrics of the best epoch's weights on the test volumes by name, shape (trainings,).
+        processor_s: Processor seconds of each training, shape (trainings,).
     """
 
     sweep: str
@@ -110,6 +110,19 @@ class Curves:
             {name: epochs[name].to_numpy(float).reshape(env_steps.shape) for name in METRICS},
             {name: tests[name].to_numpy(float) for name in METRICS},
             tests.processor_s.to_numpy(float),
+        )
+
+    def of(self, numbers: NDArray[np.intp]) -> Curves:
+        """Return the curves of some configurations, given by their places; one that is there twice counts twice."""
+        trainings = [np.flatnonzero(self.config_of == number) for number in numbers]
+        drawn = np.concatenate(trainings)
+        return replace(
+            self,
+            configs=tuple(self.configs[number] for number in numbers),
+            config_of=np.repeat(np.arange(len(numbers)), [len(each) for each in trainings]),
+            validation={name: values[drawn] for name, values in self.validation.items()},
+            test={name: values[drawn] for name, values in self.test.items()},
+            processor_s=self.processor_s[drawn],
         )
 
     def places(self) -> FloatArray:

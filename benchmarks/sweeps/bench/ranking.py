@@ -1,0 +1,103 @@
+"""Many simulated studies for each sampler, pruner and rule of seeds, ranked by what they choose."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+import pandas as pd
+
+from armscan.stats.aggregation import band_over_seeds, probability_of_improvement
+from armscan.volumes.plane import FloatArray
+from benchmarks.sweeps.bench.replay import Rule, choose, search
+from benchmarks.sweeps.bench.surrogate import Surrogate
+
+SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "halving")
+# The Gaussian process takes a hundred times longer than others to propose a trial: a tenth of the studies.
+SLOW = ("gp",)
+# What all are compared with.
+REFERENCE = Rule("random", "none")
+# Candidates of the final evaluation, and the fewest and most seeds of each.
+TOP_K = 3
+FINALS = {"search": None, "fixed": (5, 5), "race": (2, 6)}
+
+
+def rules() -> Iterator[Rule]:
+    """Yield the rules that are compared: each sampler with each pruner, then two samplers with two seeds a trial."""
+    for sampler, pruner in itertools.product((*SAMPLERS, *SLOW), PRUNERS):
+        yield Rule(sampler, pruner)
+    for sampler in ("random", "tpe"):
+        yield Rule(sampler, "median", 2)
+
+
+def studies_of(
+    surrogate: Surrogate, sweep: str, compared: Iterable[Rule], *, n_studies: int, n_trainings: int
+) -> pd.DataFrame:
+    """Simulate studies, each with the same budget of environment steps in its search.
+
+    Args:
+        surrogate: Simulates the trainings.
+        sweep: Name of the sweep.
+        compared: Rules of the studies.
+        n_studies: Studies of each rule; a tenth of them with a slow sampler.
+        n_trainings: Budget of each search, in whole trainings.
+
+    Returns:
+        A row of each study: how many mean steps what it chose is truly worse than the best of the space, by the best
+        value of the search and by each way of the final evaluation, and the trainings of these.
+    """
+    _, best = surrogate.best()
+    rows = []
+    for rule in compared:
+        for number in range(max(1, n_studies // 10) if rule.sampler in SLOW else n_studies):
+            found = search(surrogate, sweep, rule, n_trainings=n_trainings, seed=number)
+            tops = [candidate.config for candidate in found.candidates[:TOP_K]]
+            row = {**vars(rule), "study": number, "n_trials": found.n_trials, "search": tops[0].truth - best}
+            for name, n_seeds in FINALS.items():
+                if n_seeds is not None:
+                    low, high = n_seeds
+                    rng = np.random.default_rng([number, high])
+                    chosen = choose(tops, rng, min_seeds=low, max_seeds=high)
+                    row |= {name: tops[chosen.place].truth - best, f"{name}_trainings": chosen.n_trainings}
+            rows.append(row)
+        print(f"{rule}: simulated", flush=True)
+    return pd.DataFrame(rows)
+
+
+def ranked(studies: pd.DataFrame, by: str = "race") -> pd.DataFrame:
+    """Return a row of each rule, the best first.
+
+    Args:
+        studies: Rows of `studies_of`.
+        by: Column of the regret that they are ranked by. Default: `race`.
+
+    Returns:
+        The mean regret with its 95 % interval, and the probability that a study chooses better than one that searches
+        at random without pruning, with its own.
+    """
+    keys = list(vars(REFERENCE))
+    regrets = {Rule(*key): each[by].to_numpy() for key, each in studies.groupby(keys)}
+    rows = []
+    for rule, each in regrets.items():
+        of_rule = studies[(studies[keys] == pd.Series(vars(rule))).all(axis=1)]
+        regret = band_over_seeds(each[:, np.newaxis], np.mean)
+        better = probability_of_improvement(-each[:, np.newaxis], -regrets[REFERENCE][:, np.newaxis])
+        rows.append(
+            {
+                **vars(rule),
+                **dict(zip(("regret", "low", "high"), (float(end[0]) for end in regret), strict=True)),
+                **dict(zip(("better", "better_low", "better_high"), better, strict=True)),
+                **{
+                    name: float(of_rule[name].mean())
+                    for name in ("n_trials", *FINALS, "fixed_trainings", "race_trainings")
+                },
+                "n_studies": len(each),
+            }
+        )
+    return pd.DataFrame(rows).sort_values("regret", ignore_index=True)
+
+
+def curve_of(regrets: Sequence[FloatArray]) -> FloatArray:
+    """Return the mean regret of each column with its interval, shape (columns, 3)."""
+    return np.array(band_over_seeds(np.column_stack(regrets), np.mean)).T

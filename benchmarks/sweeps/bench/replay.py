@@ -1,0 +1,148 @@
+"""A study on simulated trainings, as armscan runs it: search, pruning, then a race of the best over fresh seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import optuna
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from optuna.trial import Trial, TrialState
+
+from armscan.config.compose import compose
+from armscan.stats.aggregation import interquartile_mean
+from armscan.sweeps.scheduling.racing import race
+from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
+
+# Of one study, a sampler that proposes pruned points again and again must not go on for ever.
+MOST_TRIALS_A_TRAINING = 5
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How a study searches.
+
+    Args:
+        sampler: Name of a group `study/sampler`, such as `tpe`.
+        pruner: Name of a group `study/pruner`, such as `median`.
+        n_seeds: Trainings of each trial. Default: 1.
+    """
+
+    sampler: str
+    pruner: str
+    n_seeds: int = 1
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A trial that ran to its end.
+
+    Args:
+        value: Interquartile mean over its seeds of the mean steps in the best validation.
+        config: Its configuration.
+    """
+
+    value: float
+    config: SimulatedConfig
+
+
+@dataclass(frozen=True)
+class Search:
+    """A search that has ended.
+
+    Args:
+        candidates: The trials that ran to their end, the best first.
+        n_trials: Number of all trials.
+        n_trainings: Environment steps of all trials, in whole trainings.
+    """
+
+    candidates: tuple[Candidate, ...]
+    n_trials: int
+    n_trainings: float
+
+
+def search(surrogate: Surrogate, sweep: str, rule: Rule, *, n_trainings: int, seed: int) -> Search:
+    """Search until the environment steps of so many whole trainings are spent.
+
+    Args:
+        surrogate: Simulates the trainings.
+        sweep: Name of the sweep, of which the pruner has its settings.
+        rule: How to search.
+        n_trainings: The budget; the last trial may exceed it.
+        seed: Seed of the sampler, and of the trainings.
+    """
+    settings = _settings(sweep, rule.sampler, rule.pruner)
+    study = optuna.create_study(
+        sampler=instantiate(settings.sampler, seed=seed), pruner=instantiate(settings.pruner), direction="minimize"
+    )
+    total, spent = surrogate.env_steps[-1], 0.0
+    rng, candidates, n_trials = np.random.default_rng(seed), [], 0
+    while spent < n_trainings * total and n_trials < MOST_TRIALS_A_TRAINING * n_trainings:
+        trial, n_trials = study.ask(), n_trials + 1
+        config = surrogate.config(surrogate.space.suggest(trial))
+        value, n_env_steps = _run(trial, config, rule.n_seeds, rng)
+        spent += n_env_steps
+        if value is None:
+            study.tell(trial, state=TrialState.PRUNED)
+        else:
+            study.tell(trial, value)
+            candidates.append(Candidate(value, config))
+    # The first of equal ones, as armscan sorts them.
+    candidates.sort(key=lambda each: each.value)
+    return Search(tuple(candidates), n_trials, float(spent / total))
+
+
+def _run(trial: Trial, config: SimulatedConfig, n_seeds: int, rng: np.random.Generator) -> tuple[float | None, float]:
+    """Return the value of a trial, None if it was pruned, and its environment steps; see `Attempt.report`."""
+    env_steps = config.surrogate.env_steps
+    total, best = env_steps[-1], []
+    for seed in range(n_seeds):
+        curve = config.train(rng).curve
+        for n_env_steps, steps in zip(env_steps, curve, strict=True):
+            trial.report(float(np.mean([*best, steps])), int(seed * total + n_env_steps))
+            if trial.should_prune():
+                return None, seed * total + n_env_steps
+        # The fewest steps stand for the best validation: its success rate hardly ever chooses another.
+        best.append(float(curve.min()))
+    return float(interquartile_mean(np.array(best))), n_seeds * total
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a final evaluation has chosen.
+
+    Args:
+        place: Place of the chosen candidate.
+        n_trainings: Number of its trainings.
+    """
+
+    place: int
+    n_trainings: int
+
+
+def choose(
+    candidates: Sequence[SimulatedConfig], rng: np.random.Generator, *, min_seeds: int, max_seeds: int
+) -> Choice:
+    """Let candidates race over fresh seeds, judged on the validation volumes; with as many seeds at first, none drops.
+
+    Args:
+        candidates: The configurations.
+        rng: Draws the trainings.
+        min_seeds: Seeds of all candidates.
+        max_seeds: Seeds of those that are never dropped.
+    """
+    scores: dict[int, dict[int, float]] = {place: {} for place in range(len(candidates))}
+    while not (stands := race(scores, range(max_seeds), min_seeds=min_seeds)).is_over:
+        for place, seed in stands.missing:
+            scores[place][seed] = -float(candidates[place].train(rng).curve.min())
+    assert stands.chosen is not None
+    return Choice(stands.chosen, sum(map(len, scores.values())))
+
+
+@lru_cache
+def _settings(sweep: str, sampler: str, pruner: str) -> DictConfig | Any:
+    return compose([f"sweep={sweep}", f"study/sampler={sampler}", f"study/pruner={pruner}"]).study

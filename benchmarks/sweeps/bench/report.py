@@ -1,0 +1,145 @@
+"""The tables of a bench, as Markdown, and its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from benchmarks.sweeps.bench.importance import Key, keys_of
+from benchmarks.sweeps.bench.picture import draw
+from benchmarks.sweeps.bench.races import FIXED, RACES, Choices, Comparison, candidates_of, choices_of, compare
+from benchmarks.sweeps.bench.ranking import ranked, rules, studies_of
+from benchmarks.sweeps.bench.replay import Rule
+from benchmarks.sweeps.bench.seeds import chance_of_good, needed_seeds, power_of
+from benchmarks.sweeps.bench.surrogate import Surrogate, fit_of
+from benchmarks.sweeps.bench.table import Curves
+
+# What a study of armscan does by default.
+DEFAULT = Rule("tpe", "median")
+# Candidates of the races: those of the default study, and more.
+TOP_KS = (3, 8)
+
+
+def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, picture: Path | None = None) -> None:
+    """Print the tables of a sweep, and draw the picture.
+
+    Args:
+        sweep: Name of the sweep.
+        n_studies: Simulated studies of each rule.
+        n_trainings: Budget of the search of each, in whole trainings.
+        n_resamples: Resamples of the importances' intervals.
+        picture: Where the picture is written. Default: None, nowhere.
+    """
+    curves = Curves.read(sweep)
+    surrogate = Surrogate.of(curves)
+    _print_table(curves, surrogate)
+    power = power_of(surrogate)
+    _print_power(power)
+    keys = keys_of(curves, n_resamples)
+    _print_keys(keys)
+    races = {}
+    for top_k in TOP_KS:
+        candidates = candidates_of(surrogate, sweep, DEFAULT, n_studies=n_studies, n_trainings=n_trainings, top_k=top_k)
+        fixed = [choices_of(candidates, n_seeds, n_seeds) for n_seeds in FIXED]
+        raced = {seeds: choices_of(candidates, *seeds) for seeds in RACES}
+        races[top_k] = fixed, raced
+        _print_races(top_k, fixed, compare(fixed, raced))
+    studies = studies_of(surrogate, sweep, rules(), n_studies=n_studies, n_trainings=n_trainings)
+    ranks = ranked(studies)
+    _print_ranks(ranks)
+    if picture is not None:
+        draw(ranks, races, keys, picture, title=f"{sweep}: {len(curves.configs)} configurations")
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Return a table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+
+
+def with_interval(estimate: Sequence[float], form: str = ".3f") -> str:
+    """Return an estimate with its interval, such as `0.12 (0.10 to 0.15)`."""
+    value, low, high = estimate
+    return f"{value:{form}} ({low:{form}} to {high:{form}})"
+
+
+def _print_table(curves: Curves, surrogate: Surrogate) -> None:
+    best, truth = surrogate.best()
+    correlation, explained = fit_of(curves)
+    default = float(curves.mean_over_seeds(curves.test["mean_steps"])[0])
+    rows = [
+        ("configurations, trainings", f"{len(curves.configs)}, {len(curves.config_of)}"),
+        ("processor hours", f"{curves.processor_s.sum() / 3600:.1f}"),
+        ("mean steps in the test: the default configuration, the best of the surrogate", f"{default:.2f}, {truth:.2f}"),
+        ("the best of the surrogate", ", ".join(f"`{name}={value:.3g}`" for name, value in best.items())),
+        ("configurations left out: rank correlation, variance explained", f"{correlation:.2f}, {explained:.2f}"),
+        (
+            "chance between seeds of good configurations, in % of the steps",
+            f"{100 * chance_of_good(surrogate).std():.0f}",
+        ),
+    ]
+    print(f"\n## {curves.sweep}\n\n{markdown(['', ''], rows)}", flush=True)
+
+
+def _print_power(power: pd.DataFrame) -> None:
+    needed = needed_seeds(power)
+    rows = [
+        (f"{difference:.0%}", *(f"{share:.0%}" for share in row), needed.get(float(difference), "") or "more")
+        for difference, row in power.iterrows()
+    ]
+    print(f"\n{markdown(['difference', *power.columns, 'seeds for 80 %'], rows)}", flush=True)
+
+
+def _print_keys(keys: dict[str, Key]) -> None:
+    rows = [
+        (
+            f"`{name}`",
+            with_interval(key.fanova, ".2f"),
+            with_interval(key.ped_anova, ".2f"),
+            with_interval(key.effect, ".2f"),
+        )
+        for name, key in keys.items()
+    ]
+    head = ["key", "fANOVA", "PED-ANOVA", "steps of the worst value / of the best"]
+    print(f"\n{markdown(head, rows)}", flush=True)
+
+
+def _print_races(top_k: int, fixed: Sequence[Choices], compared: Sequence[Comparison]) -> None:
+    rows = [
+        (n_seeds, f"{each.n_trainings.mean():.0f}", f"{each.regret.mean():.4f}")
+        for n_seeds, each in zip(FIXED, fixed, strict=True)
+    ]
+    print(f"\n{top_k} candidates\n\n{markdown(['seeds of each', 'trainings', 'regret'], rows)}")
+    rows = [
+        (
+            f"{each.seeds[0]} to {each.seeds[1]}",
+            f"{each.n_trainings:.1f}",
+            with_interval(each.regret, ".4f"),
+            f"{each.n_fixed:.1f}",
+            with_interval(each.share, ".2f"),
+        )
+        for each in compared
+    ]
+    head = ["seeds of a race", "trainings", "regret", "fixed seeds need", "share"]
+    print(f"\n{markdown(head, rows)}", flush=True)
+
+
+def _print_ranks(ranks: pd.DataFrame) -> None:
+    rows = [
+        (
+            f"{row.sampler}, {row.pruner}" + (f", {row.n_seeds} seeds" if row.n_seeds > 1 else ""),
+            with_interval((row.regret, row.low, row.high)),
+            f"{row.fixed:.3f}",
+            f"{row.search:.3f}",
+            f"{row.race_trainings:.1f}, {row.fixed_trainings:.0f}",
+            f"{row.n_trials:.0f}",
+            with_interval((row.better, row.better_low, row.better_high), ".2f"),
+            row.n_studies,
+        )
+        for row in ranks.itertuples()
+    ]
+    head = ["sampler, pruner", "regret, race", "fixed", "search alone", "trainings: race, fixed", "trials"]
+    print(f"\n{markdown([*head, 'better than random, none', 'studies'], rows)}", flush=True)

@@ -1,0 +1,49 @@
+"""How many seeds a comparison of two settings needs, by how much they truly differ."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from scipy.stats import ttest_ind
+
+from armscan.volumes.plane import FloatArray
+from benchmarks.sweeps.bench.surrogate import Surrogate
+
+N_SEEDS = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 30, 50)
+# How much more mean steps one of them takes; 0 counts the false alarms.
+DIFFERENCES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+# Of settings that take at most so many times the steps of the best: nobody compares others.
+COMPARED = 2.0
+N_COMPARISONS = 4000
+LEVEL, POWER = 0.05, 0.8
+
+
+def power_of(surrogate: Surrogate, n_comparisons: int = N_COMPARISONS) -> pd.DataFrame:
+    """Return how often a difference is seen, by how large it is (rows) and by seeds of each setting (columns).
+
+    Both settings have the chance of the table's good configurations in their tests. A difference is seen if Welch's t
+    test of the logarithms of the mean steps says so at 5 %.
+    """
+    chance = chance_of_good(surrogate)
+    rng = np.random.default_rng(0)
+    power = {}
+    for n_seeds in N_SEEDS:
+        ours, theirs = rng.choice(chance, size=(2, n_comparisons, n_seeds))
+        power[n_seeds] = [
+            float((ttest_ind(ours, theirs + np.log1p(each), axis=1, equal_var=False).pvalue < LEVEL).mean())
+            for each in DIFFERENCES
+        ]
+    return pd.DataFrame(power, index=pd.Index(DIFFERENCES, name="difference"))
+
+
+def needed_seeds(power: pd.DataFrame) -> dict[float, int | None]:
+    """Return the fewest seeds with which a difference is seen in four of five comparisons; None if more than all."""
+    enough = power >= POWER
+    return {float(each): int(row.idxmax()) if row.any() else None for each, row in enough.iterrows() if each > 0}
+
+
+def chance_of_good(surrogate: Surrogate) -> FloatArray:
+    """Return what the trainings of good configurations are off their means in the test, as logarithms."""
+    means = surrogate.means[:, -1]
+    is_good = means <= means.min() + np.log(COMPARED)
+    return surrogate.chance[is_good[surrogate.config_of], -1]

@@ -1,0 +1,178 @@
+"""Trainings of any configuration, simulated from the table: the mean by a random forest, chance from real trainings.
+
+A table alone has too few points for a sampler to search: mapped to the nearest of them, what samplers propose would be
+spoiled, those most that search locally (Pfisterer et al. 2022, YAHPO Gym). So a random forest over the configurations
+gives weights to those of the table (Meinshausen 2006), and the mean curve of a configuration is the weighted mean of
+theirs. A training adds what one real training, drawn by the same weights, was off its own configuration's mean: in all
+epochs and in the test at once, so that chance is as large, as skewed and as lasting as in the table. All of it is of
+the logarithm of the mean steps of an episode. What a configuration is truly worth is then known: the mean over all
+trainings that could be drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import spearmanr
+from sklearn.ensemble import RandomForestRegressor
+
+from armscan.sweeps.space.space import Space
+from armscan.volumes.plane import FloatArray
+from benchmarks.sweeps.bench.design import places_of, sobol, values_at
+from benchmarks.sweeps.bench.table import Curves
+
+N_TREES, N_FOLDS = 100, 10
+# Places at which the best of the space is looked for, a power of 2.
+N_PLACES = 2048
+
+
+class Training(NamedTuple):
+    """A simulated training.
+
+    Args:
+        curve: Mean steps in the validation of each epoch, shape (epochs,).
+        test: Mean steps of the best epoch's weights on the test volumes.
+    """
+
+    curve: FloatArray
+    test: float
+
+
+@dataclass(frozen=True)
+class Surrogate:
+    """A model of the mean steps of an episode in each epoch's validation, and in the test at the end.
+
+    Args:
+        space: The space.
+        env_steps: Environment steps at the end of each epoch, shape (epochs,).
+        low: Lower corner of the box in the space that each tree puts each configuration in, shape
+            (trees, configurations, dimensions); NaN for a configuration that is left out.
+        high: Its upper corner, likewise.
+        share: Inverse of the number of configurations in that box, shape (trees, configurations).
+        means: Mean logarithm of each configuration's epochs and test, shape (configurations, epochs + 1).
+        chance: What each training is off that mean, shape (trainings, epochs + 1).
+        config_of: Configuration of each training, shape (trainings,).
+        bounds: Smallest and largest logarithm of the table.
+    """
+
+    space: Space
+    env_steps: FloatArray
+    low: FloatArray
+    high: FloatArray
+    share: FloatArray
+    means: FloatArray
+    chance: FloatArray
+    config_of: NDArray[np.intp]
+    bounds: tuple[float, float]
+
+    @classmethod
+    def of(cls, curves: Curves, *, without: int | None = None, seed: int = 0) -> Surrogate:
+        """Return the model of a table.
+
+        Args:
+            curves: the table.
+            without: fold of the configurations that is left out. Default: None, all are in.
+            seed: seed of the forest. Default: 0.
+        """
+        logs = np.log(np.column_stack([curves.validation["mean_steps"], curves.test["mean_steps"]]))
+        means, n_seeds = curves.mean_over_seeds(logs), np.bincount(curves.config_of)[curves.config_of, np.newaxis]
+        # A mean over few seeds has moved towards each of them.
+        chance = (logs - means[curves.config_of]) * np.sqrt(n_seeds / (n_seeds - 1))
+        places = curves.places()
+        is_in = np.arange(len(places)) % N_FOLDS != (-1 if without is None else without)
+        forest = RandomForestRegressor(N_TREES, random_state=seed).fit(places[is_in], means[is_in])
+        corners = [_boxes(tree.tree_) for tree in forest.estimators_]
+        leaves = forest.apply(places).T
+        low, high = (
+            np.array([of_tree[end][of_places] for of_tree, of_places in zip(corners, leaves, strict=True)])
+            for end in (0, 1)
+        )
+        low[:, ~is_in] = np.nan
+        share = np.array([1.0 / np.bincount(each[is_in], minlength=each.max() + 1)[each] for each in leaves])
+        bounds = float(logs.min()), float(logs.max())
+        return cls(curves.space, curves.env_steps, low, high, share, means, chance, curves.config_of, bounds)
+
+    def weights(self, places: FloatArray) -> FloatArray:
+        """Return how much each configuration of the table counts at places, shape (places, configurations)."""
+        # Much quicker than the forest's own method, which takes milliseconds for one place.
+        are_in = (((place > self.low) & (place <= self.high)).all(axis=-1) for place in places)
+        return np.array([(self.share * is_in).sum(axis=0) for is_in in are_in]) / len(self.share)
+
+    def config(self, values: Mapping[str, Any]) -> SimulatedConfig:
+        """Return what stands for a configuration, given by its values by name."""
+        (weights,) = self.weights(np.array([places_of(self.space, values)]))
+        n_seeds = np.bincount(self.config_of)
+        return SimulatedConfig(self, weights @ self.means, (weights / n_seeds)[self.config_of])
+
+    def truth(self, places: FloatArray) -> FloatArray:
+        """Return the mean steps on the test volumes over all trainings that could be drawn, shape (places,)."""
+        weights, n_seeds = self.weights(places), np.bincount(self.config_of)
+        logs = (weights @ self.means[:, -1])[:, np.newaxis] + self.chance[:, -1]
+        drawn = (weights / n_seeds)[:, self.config_of]
+        return np.asarray((np.exp(logs.clip(*self.bounds)) * drawn).sum(axis=1))
+
+    def best(self) -> tuple[dict[str, Any], float]:
+        """Return the best configuration of a Sobol sequence through the space, and what it is truly worth."""
+        points = sobol(len(self.space.parameters), N_PLACES - 1)
+        configs = [values_at(self.space, row) for row in points]
+        truth = self.truth(np.array([places_of(self.space, values) for values in configs]))
+        return configs[int(truth.argmin())], float(truth.min())
+
+
+def _boxes(tree: Any) -> tuple[FloatArray, FloatArray]:
+    """Return the lower and the upper corner of each node of a tree of scikit-learn, each (nodes, dimensions)."""
+    low = np.full((tree.node_count, tree.n_features), -np.inf)
+    high = -low
+    # A node comes before its children.
+    for node in np.flatnonzero(tree.children_left >= 0):
+        left, right, split = tree.children_left[node], tree.children_right[node], tree.feature[node]
+        low[[left, right]], high[[left, right]] = low[node], high[node]
+        high[left, split] = low[right, split] = tree.threshold[node]
+    return low, high
+
+
+@dataclass(frozen=True)
+class SimulatedConfig:
+    """A configuration of a surrogate.
+
+    Args:
+        surrogate: The surrogate.
+        mean: Mean logarithm of its epochs and test, shape (epochs + 1,).
+        shares: How likely the chance of each training is drawn, shape (trainings,).
+    """
+
+    surrogate: Surrogate
+    mean: FloatArray
+    shares: FloatArray
+
+    def train(self, rng: np.random.Generator) -> Training:
+        """Return a training with a fresh seed."""
+        drawn = int(np.searchsorted(self.shares.cumsum(), rng.random() * self.shares.sum(), side="right"))
+        steps = np.exp((self.mean + self.surrogate.chance[drawn]).clip(*self.surrogate.bounds))
+        return Training(steps[:-1], float(steps[-1]))
+
+    @property
+    def truth(self) -> float:
+        """The mean steps on the test volumes over all trainings that could be drawn."""
+        logs = self.mean[-1] + self.surrogate.chance[:, -1]
+        return float(np.exp(logs.clip(*self.surrogate.bounds)) @ self.shares)
+
+
+def fit_of(curves: Curves) -> tuple[float, float]:
+    """Return how well a surrogate knows configurations that were left out, in ten folds.
+
+    Returns:
+        Spearman's rank correlation of its mean logarithm of the test's mean steps with the measured one, and the share
+        of the variance that it explains.
+    """
+    places, known = curves.places(), curves.mean_over_seeds(np.log(curves.test["mean_steps"]))
+    told = np.empty(len(known))
+    for fold in range(N_FOLDS):
+        is_out = np.arange(len(known)) % N_FOLDS == fold
+        if is_out.any():
+            told[is_out] = Surrogate.of(curves, without=fold).weights(places[is_out]) @ known
+    return float(spearmanr(told, known).statistic), float(1.0 - ((told - known) ** 2).mean() / known.var())

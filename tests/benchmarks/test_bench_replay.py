@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+
+from benchmarks.sweeps.bench.design import places_of, sobol, values_at
+from benchmarks.sweeps.bench.importance import keys_of
+from benchmarks.sweeps.bench.races import FIXED, Choices, candidates_of, choices_of, compare, needed_for
+from benchmarks.sweeps.bench.ranking import REFERENCE, ranked, studies_of
+from benchmarks.sweeps.bench.replay import Rule, choose, search
+from benchmarks.sweeps.bench.seeds import needed_seeds, power_of
+from benchmarks.sweeps.bench.surrogate import Surrogate, fit_of
+from tests.benchmarks.conftest import synthetic_curves, true_log
+
+
+def test_a_surrogate_finds_settings_that_are_truly_good(surrogate):
+    space = surrogate.space
+    values, _ = surrogate.best()
+    everywhere = [true_log(places_of(space, values_at(space, row))) for row in sobol(len(space.parameters), 1000)]
+    assert true_log(places_of(space, values)) < np.quantile(everywhere, 0.05)
+
+
+def test_a_surrogate_knows_configurations_that_it_has_not_seen(curves):
+    correlation, explained = fit_of(curves)
+    assert correlation > 0.9
+    assert explained > 0.8
+
+
+def test_each_place_has_weights_of_the_table_that_add_up_to_one(surrogate):
+    weights = surrogate.weights(np.random.default_rng(0).random((20, 4)))
+    assert weights.shape == (20, 100)
+    assert weights.sum(axis=1) == pytest.approx(np.ones(20))
+    assert (weights >= 0.0).all()
+
+
+def test_the_truth_is_the_mean_of_simulated_trainings(surrogate):
+    config = surrogate.config(surrogate.best()[0])
+    rng = np.random.default_rng(0)
+    tests = np.array([config.train(rng).test for _ in range(4000)])
+    assert tests.mean() == pytest.approx(config.truth, abs=4 * tests.std() / np.sqrt(len(tests)))
+    place = np.array([places_of(surrogate.space, surrogate.best()[0])])
+    assert surrogate.truth(place) == pytest.approx(config.truth)
+
+
+def test_chance_is_as_large_as_in_the_table(surrogate):
+    rng = np.random.default_rng(0)
+    places = sobol(len(surrogate.space.parameters), 30)
+    configs = [surrogate.config(values_at(surrogate.space, row)) for row in places]
+    logs = np.log([[config.train(rng).test for _ in range(200)] for config in configs])
+    # Of a seed 0.1, and of its test 0.025.
+    assert np.sqrt(logs.var(axis=1).mean()) == pytest.approx(0.103, rel=0.1)
+
+
+@pytest.mark.parametrize("pruner", ["none", "median", "halving"])
+def test_a_search_ends_when_its_budget_is_spent(surrogate, pruner):
+    found = search(surrogate, "sac_y", Rule("random", pruner), n_trainings=20, seed=0)
+    assert 20 <= found.n_trainings < 21
+    assert (found.n_trials == 20) == (pruner == "none")
+    values = [each.value for each in found.candidates]
+    assert values == sorted(values)
+
+
+def test_a_trial_with_two_seeds_takes_two_trainings(surrogate):
+    assert search(surrogate, "sac_y", Rule("random", "none", 2), n_trainings=20, seed=0).n_trials == 10
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_a_sampler_that_learns_beats_chance_on_a_smooth_function(surrogate):
+    rules = Rule("random", "none"), Rule("tpe", "none")
+    ranks = ranked(studies_of(surrogate, "sac_y", rules, n_studies=15, n_trainings=30))
+    assert list(ranks.sampler) == ["tpe", "random"]
+    assert (ranks.low <= ranks.regret).all()
+    assert (ranks.regret <= ranks.high).all()
+    of_reference = ranks[ranks.sampler == REFERENCE.sampler].iloc[0]
+    assert of_reference.better == pytest.approx(0.5)
+
+
+def test_a_choice_with_equal_seeds_drops_nobody_and_a_race_does(surrogate):
+    space = surrogate.space
+    places = sobol(len(space.parameters), 100)
+    configs = sorted((surrogate.config(values_at(space, row)) for row in places), key=lambda each: each.truth)
+    good_and_bad = configs[0], configs[-1], configs[-2]
+    rng = np.random.default_rng(0)
+    fixed = choose(good_and_bad, rng, min_seeds=5, max_seeds=5)
+    race = choose(good_and_bad, rng, min_seeds=2, max_seeds=10)
+    assert fixed.place == race.place == 0
+    assert fixed.n_trainings == 15
+    assert race.n_trainings == 6
+
+
+def test_trainings_that_a_regret_needs_are_interpolated():
+    n_trainings = np.array([3.0, 6.0, 12.0])
+    assert needed_for(0.3, np.array([0.4, 0.2, 0.1]), n_trainings) == pytest.approx(4.5)
+    # Chance lets a curve rise again.
+    assert needed_for(0.2, np.array([0.4, 0.2, 0.3]), n_trainings) == pytest.approx(6.0)
+    assert needed_for(0.05, np.array([0.4, 0.2, 0.1]), n_trainings) == np.inf
+    assert needed_for(0.5, np.array([0.4, 0.2, 0.1]), n_trainings) == pytest.approx(3.0)
+
+
+def test_a_race_that_chooses_as_well_with_half_the_trainings_has_a_share_of_half():
+    regret = np.random.default_rng(0).random(50)
+    fixed = [Choices(regret / n, np.full(50, 3.0 * n)) for n in FIXED]
+    (race,) = compare(fixed, {(2, 6): Choices(regret / 4, np.full(50, 6.0))})
+    assert race.share == pytest.approx((0.5, 0.5, 0.5))
+    assert race.n_fixed == pytest.approx(12.0)
+
+
+def test_more_seeds_choose_better(surrogate):
+    candidates = candidates_of(surrogate, "sac_y", Rule("random", "none"), n_studies=20, n_trainings=10, top_k=3)
+    few, many = (choices_of(candidates, n_seeds, n_seeds) for n_seeds in (1, 12))
+    assert many.regret.mean() < few.regret.mean()
+    assert many.n_trainings == pytest.approx(np.full(20, 36.0))
+
+
+@pytest.mark.filterwarnings("ignore:Precision loss")
+def test_seeds_that_a_comparison_needs_follow_from_chance():
+    power = power_of(Surrogate.of(synthetic_curves(40)), n_comparisons=2000)
+    assert power.loc[0.0, 20] == pytest.approx(0.05, abs=0.02)
+    assert power.loc[0.2, 10] > power.loc[0.1, 10] > power.loc[0.05, 10]
+    # Of a normal chance of 0.103, n = 2 (1.96 + 0.84)^2 (0.103 / log(1.2))^2 = 5 for large samples, and one for the t.
+    assert needed_seeds(power)[0.2] in (6, 8)
+
+
+def test_the_key_that_matters_most_is_found(curves):
+    keys = keys_of(curves, n_resamples=2)
+    assert max(keys, key=lambda name: keys[name].fanova.value) == "agent.lr"
+    assert max(keys, key=lambda name: keys[name].effect.value) == "agent.lr"
+    assert keys["agent.batch_size"].effect.value < 1.2
