@@ -36,7 +36,7 @@ def synthetic_curves(n_configs, chance=0.1):
 
 @pytest.fixture(scope="session")
 def curves():
-    return synthetic_curves(100)
+    return synthetic_curves(60)
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from benchmarks.sweeps.bench.surrogate import Surrogate
 from benchmarks.sweeps.bench.table import Curves
 
 # Values of a key, and places of all others that its effect is averaged over, a power of 2.
-N_VALUES, N_PLACES = 9, 64
+N_VALUES, N_PLACES = 9, 32
 
 
 class Key(NamedTuple):
