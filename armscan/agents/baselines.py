@@ -69,10 +69,10 @@ class Exhaustive:
     """
 
     step_mm: float = 5.0
-    """Distance between planes along swept translations, in mm."""
+    """Distance between planes along swept translations, in mm, from 0.01 to 1e6."""
 
     step_deg: float = 10.0
-    """Angle between planes about swept rotations, in degrees."""
+    """Angle between planes about swept rotations, in degrees, from 0.01 to 360."""
 
     def __post_init__(self) -> None:
         check_float("agent.step_mm", self.step_mm, at_least=0.01, at_most=1e6)

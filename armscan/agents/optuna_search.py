@@ -36,8 +36,8 @@ class OptunaSearch:
     """Sampler of Optuna: `tpe`, `cmaes`, or `gp`, which takes some 50 ms per plane where the others take one."""
 
     n_startup_trials: int | None = None
-    """Number of random planes before the sampler's model is used. None: the sampler's own number, 10 for TPE and GP, 1
-    for CMA-ES.
+    """Number of random planes before the sampler's model is used, 1 or more. None: the sampler's own number, 10 for TPE
+    and GP, 1 for CMA-ES.
     """
 
     def __post_init__(self) -> None:

@@ -78,11 +78,13 @@ class AgreementReward(LandmarkReward):
 
     Args:
         targets: Target counts of the published reward.
-        area_tolerance: Distance outside its range at which an area has its full cost, as a share of the nearer end.
-        distance_tolerance_mm: Distance outside its range, in mm, at which a distance has its full cost.
-        slack: Share of each end by which the range of an area is widened, because the pixels of the same plane differ
-            a little from one motion of the volume to another.
-        slack_mm: Width in mm by which the range of a distance is widened at both ends.
+        area_tolerance: Distance outside its range at which an area has its full cost, as a share of the nearer end,
+            from 0.001 to 1000.
+        distance_tolerance_mm: Distance outside its range, in mm, at which a distance has its full cost, from 0.001 to
+            1000.
+        slack: Share of each end by which the range of an area is widened, from 0 to 1, because the pixels of the same
+            plane differ a little from one motion of the volume to another.
+        slack_mm: Width in mm by which the range of a distance is widened at both ends, from 0 to 1000.
     """
 
     def __init__(

@@ -100,7 +100,7 @@ def application(run: Callable[[DictConfig], None]) -> Callable[[], None]:
 
 
 def compose(overrides: Sequence[str] = (), *, return_hydra_config: bool = False) -> DictConfig:
-    """Return the configuration that `python -m armscan.run` composes of these overrides.
+    """Return the configuration that `armscan run` composes of these overrides.
 
     Args:
         overrides: Overrides in the syntax of the command line, such as `["agent=ppo", "seed=1"]`.

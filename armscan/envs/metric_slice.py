@@ -32,8 +32,8 @@ class MetricSliceObservation:
     smoothly, and volumes of any spacing give the same image. Beside the slice there is nothing: 0.
 
     Args:
-        field_of_view_mm: Size (across, depth) of the image in mm.
-        pixel_mm: Size (across, depth) of a pixel in mm.
+        field_of_view_mm: Size (across, depth) of the image in mm, each above 0.
+        pixel_mm: Size (across, depth) of a pixel in mm, each above 0.
 
     Raises:
         InvalidValueError: If a size is not above 0, or the field of view is not 1 to 4096 whole pixels each way.

@@ -31,10 +31,10 @@ class RandomTransform:
     the landmarks of a larger wrist are larger, in pixels as in mm.
 
     Args:
-        rz_deg: Largest rotation about Z, in degrees, in both directions.
-        rx_deg: Largest rotation about X, in degrees, in both directions.
-        tx_mm: Largest translation along X, in mm, in both directions.
-        ty_mm: Largest translation along Y, in mm, in both directions.
+        rz_deg: Largest rotation about Z, in degrees, in both directions, from 0 to 180.
+        rx_deg: Largest rotation about X, in degrees, in both directions, from 0 to 180.
+        tx_mm: Largest translation along X, in mm, in both directions, 0 or more.
+        ty_mm: Largest translation along Y, in mm, in both directions, 0 or more.
         centre: Fixed point of the rotation: `middle` of the volume, or `first_voxel`, as published, which moves the
             hand out of the picture.
         scale: Largest change of the volume's size in all directions alike, as a share of it, from 0 to 0.3.

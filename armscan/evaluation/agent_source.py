@@ -69,7 +69,7 @@ def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trus
 
 
 def agent_of_overrides(words: Sequence[str], folder: str | None, changes: Mapping[str, Any]) -> TrainedAgent:
-    """Return the agent of a configuration, composed as `python -m armscan.run` composes it.
+    """Return the agent of a configuration, composed as `armscan run` composes it.
 
     Args:
         words: Overrides `key=value`, with `agent=NAME`, and with `data=nifti` if there is a folder.

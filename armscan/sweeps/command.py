@@ -1,4 +1,4 @@
-"""`python -m armscan.run -m sweep=NAME`: check a study, launch its workers, print its result."""
+"""`armscan run -m sweep=NAME`: check a study, launch its workers, print its result."""
 
 from __future__ import annotations
 

@@ -57,8 +57,8 @@ def open_store(
         uri: MLflow tracking URI, such as `sqlite:///mlruns.db` or the address of an MLflow server.
         experiment: Name of the experiment.
         artifacts: Folder of the artifacts if the store is a database; a server has its own place for them.
-        wait_s: Seconds for which a run waits for the store at its end.
-        system_metrics_s: Seconds between two measurements of the machine while a run trains. Default: None, no
+        wait_s: Seconds for which a run waits for the store at its end, 0 or more.
+        system_metrics_s: Seconds between two measurements of the machine while a run trains, above 0. Default: None, no
             measurements.
         policy: Whether runs store their policies; only checked here, with the rest of the section. Default: True.
         retry_s: Seconds to wait for an unavailable store at other times, also while it is opened. Default: None, no

@@ -76,11 +76,11 @@ def phantom_data(
     """Phantom wrists; those for validation and test come from seeds that no training phantom has.
 
     Args:
-        n_training: Number of phantoms to train on.
-        n_validation: Number of phantoms that choose the checkpoint.
-        n_test: Number of phantoms of the final evaluation.
-        first_seed: Seed of the first training phantom; the next ones follow.
-        cache_dir: Folder that keeps phantoms. None: the user's cache folder.
+        n_training: Number of phantoms to train on, 1 or more. Default: 16.
+        n_validation: Number of phantoms that choose the checkpoint, 1 or more. Default: 4.
+        n_test: Number of phantoms of the final evaluation, 1 or more. Default: 8.
+        first_seed: Seed of the first training phantom, 0 or more; the next ones follow. Default: 0.
+        cache_dir: Folder that keeps phantoms. Default: None, the user's cache folder.
         version: Version of the phantoms, 1 or 2; see `make_phantom`. Default: 1, as in runs that name none.
 
     Raises:
@@ -120,7 +120,7 @@ def nifti_data(
             splits; a quarter if it has none or `test` is given; the next fold with `folds`.
         test: Share of the subjects, in (0, 1), rounded up, or names of subjects or volumes. None: the manifest's
             splits; a quarter if it has none or `validation` is given. Must be None with `folds`.
-        split_seed: Seed that draws the subjects of shares and folds.
+        split_seed: Seed that draws the subjects of shares and folds. Default: 0.
         folds: Cross-validation: `leave_one_out` makes each subject a fold; a number gives the number of folds. Default:
             None, no cross-validation.
         fold: Number of the test fold, from 0. Default: None, no cross-validation.
@@ -152,18 +152,18 @@ def mixed_data(
 
     Args:
         path: Folder of the volumes.
-        n_volumes: Number of its volumes to use, the first by name. None: all.
-        n_training: Number of phantoms to train on beside the volumes, 0 or more.
-        n_validation: Number of phantoms that choose the checkpoint, with `validation=phantoms`.
-        n_test: Number of phantoms of the final evaluation, with `test=phantoms`.
-        first_seed: Seed of the first training phantom; the next ones follow.
-        cache_dir: Folder that keeps phantoms. None: the user's cache folder.
+        n_volumes: Number of its volumes to use, the first by name, 1 or more. Default: None, all.
+        n_training: Number of phantoms to train on beside the volumes, 0 or more. Default: 16.
+        n_validation: Number of phantoms that choose the checkpoint, with `validation=phantoms`, 1 or more. Default: 4.
+        n_test: Number of phantoms of the final evaluation, with `test=phantoms`, 1 or more. Default: 8.
+        first_seed: Seed of the first training phantom, 0 or more; the next ones follow. Default: 0.
+        cache_dir: Folder that keeps phantoms. Default: None, the user's cache folder.
         version: Version of the phantoms; see `phantom_data`. Default: 1.
         validation: Validation volumes; see `nifti_data`. `phantoms` spends no subject on them. Default: `phantoms`, as
             in runs that name none.
         test: Test volumes; see `nifti_data`. `phantoms` spends no subject on them. Default: `phantoms`, as in runs that
             name none.
-        split_seed: Seed that draws the subjects of shares and folds.
+        split_seed: Seed that draws the subjects of shares and folds. Default: 0.
         folds: Cross-validation; see `nifti_data`. Default: None.
         fold: Number of the test fold, from 0. Default: None.
 

@@ -25,8 +25,8 @@ class SolvedCriterion:
 
     Args:
         success_rate: Lowest success rate on the validation episodes, in [0, 1].
-        mean_steps: Largest mean number of steps on the validation episodes.
-        n_epochs: Number of consecutive epochs that must meet both.
+        mean_steps: Largest mean number of steps on the validation episodes, 1 or more.
+        n_epochs: Number of consecutive epochs that must meet both, 1 or more.
     """
 
     success_rate: float = 1.0
@@ -52,9 +52,10 @@ class Budget:
     """Budget of a training: its length, and its validations.
 
     Args:
-        env_steps: Largest number of environment steps; rounded up to the number that the agent takes at once.
-        eval_every_env_steps: Environment steps between two validations; rounded up in the same way.
-        validation_episodes: Number of episodes of each validation.
+        env_steps: Largest number of environment steps, 1 or more; rounded up to the number that the agent takes at
+            once.
+        eval_every_env_steps: Environment steps between two validations, 1 or more; rounded up in the same way.
+        validation_episodes: Number of episodes of each validation, 1 or more.
         solved: Criterion that stops the training early; None spends the whole budget.
         best_by: Criterion that chooses the best epoch, `success` or `distance`; see `Evaluation.score`.
         schedule: Changes of the agent's hyperparameters, a mapping for each: `from_env_steps` and values by keys, such

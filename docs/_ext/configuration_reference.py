@@ -1,5 +1,6 @@
 """The directive `configuration`: the keys of conf/, from the classes that they build and the comments beside them."""
 
+import dataclasses
 import inspect
 import json
 import re
@@ -14,10 +15,13 @@ from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.docutils import SphinxDirective, nodes
 
+from armscan.agents.hyperparameters import Parameters
 from armscan.config.sources import config_folder
 from armscan.envs import ArmscanEnv, EnvFactory
+from armscan.sweeps.study.settings import StudySettings
 
 TARGET = "_target_"
+STUDY = "study."
 
 
 def argument_texts(target: Any) -> dict[str, str]:
@@ -45,6 +49,29 @@ def argument_types(target: Any) -> dict[str, str]:
     }
 
 
+def argument_ranges(target: Any) -> dict[str, str]:
+    """Read the limits of a dataclass's numbers: the metadata of its fields, and 1 for whole numbers of learners."""
+    ranges = {}
+    for each in dataclasses.fields(target) if dataclasses.is_dataclass(target) else ():
+        if "limits" in each.metadata:
+            limits = each.metadata["limits"]
+            words = [f"{name.replace('_', ' ')} {limit:g}" for name, limit in limits.items()]
+            ranges[each.name] = f"Range: {', '.join(words)}."
+        elif inspect.isclass(target) and issubclass(target, Parameters) and each.type == "int":
+            ranges[each.name] = "Range: at least 1."
+    return ranges
+
+
+def study_range(key: str) -> str:
+    """Read what a key of the section `study` allows, as its errors name it."""
+    model: Any = StudySettings
+    *sections, name = key.split(".")
+    for section in sections:
+        model = model.model_fields[section].annotation
+    field = model.model_fields.get(name)
+    return f"Allowed: {field.description}." if field and field.description else ""
+
+
 def comments(keys: CommentedMap, source: list[str]) -> dict[str, str]:
     """Read the comments on the lines above each key."""
     texts = {}
@@ -62,7 +89,9 @@ def comments(keys: CommentedMap, source: list[str]) -> dict[str, str]:
 def rows(keys: CommentedMap, source: list[str], prefix: str) -> Iterator[tuple[str, str, str, str]]:
     """List the keys below a prefix: name, type, default, meaning."""
     target = get_object(keys[TARGET]) if TARGET in keys else None
-    texts, types = (argument_texts(target), argument_types(target)) if target else ({}, {})
+    texts, types, ranges = (
+        (argument_texts(target), argument_types(target), argument_ranges(target)) if target else ({}, {}, {})
+    )
     beside = comments(keys, source)
     for key, value in keys.items():
         if key in (TARGET, "defaults", "hydra", "_partial_", "_recursive_"):
@@ -71,7 +100,28 @@ def rows(keys: CommentedMap, source: list[str], prefix: str) -> Iterator[tuple[s
             yield from rows(value, source, f"{prefix}{key}.")
         # What only repeats another key is described there.
         elif not str(value).startswith("${"):
-            yield f"{prefix}{key}", types.get(key) or kind(value), json.dumps(value), texts.get(key) or beside[key]
+            of_study = study_range(f"{prefix}{key}".removeprefix(STUDY)) if prefix.startswith(STUDY) else ""
+            text = in_yaml(texts[key]) if texts.get(key) else beside[key]
+            words = " ".join(f"{text} {ranges.get(key, of_study)}".split())
+            yield f"{prefix}{key}", types.get(key) or kind(value), json.dumps(value), words
+
+
+def in_yaml(text: str) -> str:
+    """Write a Python argument's description for YAML, without its default: the table has that of the configuration."""
+    text = re.sub(r"Default: None, ", "null: ", text)
+    text = re.sub(r" *Default: (?:[^.]|\.(?=\S))*\.", "", text)
+    return re.sub(r"\b(?:None|True|False)\b", lambda word: {"None": "null"}.get(word[0], word[0].lower()), text)
+
+
+def sources(keys: CommentedMap) -> Iterator[Path]:
+    """List the source files of the classes that a file builds."""
+    if TARGET in keys:
+        target = get_object(keys[TARGET])
+        target = ArmscanEnv if target is EnvFactory else target
+        yield from (Path(inspect.getfile(each)) for each in getattr(target, "__mro__", [target])[:-1])
+    for value in keys.values():
+        if isinstance(value, CommentedMap):
+            yield from sources(value)
 
 
 def kind(value: Any) -> str:
@@ -99,8 +149,9 @@ class Configuration(SphinxDirective):
     def section(self, name: str) -> list[nodes.Node]:
         """Make a file's heading, first comment and table."""
         path = config_folder() / name
-        self.env.note_dependency(str(path))
         keys, source = load(path)
+        for dependency in (path, *sources(keys)):
+            self.env.note_dependency(str(dependency))
         group = Path(name).parent.name
         lines = [f"### `{group}={Path(name).stem}`" if group else "### All runs", ""]
         if group and source and source[0].startswith("# ") and "@package" not in source[0]:
