@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 
 from armscan.config.credentials import check_address
 from armscan.config.defaults import TRACKING_URI, to_plain
+from armscan.errors import printable
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher
 from armscan.sweeps.results.progress import print_result
 from armscan.sweeps.study.arguments import STORAGE, StudyCommand, words_of_trials
@@ -15,6 +16,7 @@ from armscan.sweeps.study.components import check_space, read_settings
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.study import existing_study
+from armscan.sweeps.study.warm_start import beginnings
 from armscan.sweeps.tasks.attempt import composed
 from armscan.sweeps.workers.launch import run_workers
 from armscan.utils.log import silence_library_warnings
@@ -40,10 +42,15 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     if not given.is_plan:
         check_launcher(launcher)
     check_space(settings, task, trial_words, config)
+    begins = beginnings(settings, trial_words, to_plain(config), existing)
     if given.is_plan:
-        print_plan(settings, existing)
+        print_plan(settings, existing, begins)
         return 0
     opened = open_for_work(settings, task, config, trial_words)
+    search = opened.search.scheduler
+    for beginning in begins:
+        if beginning.add(search.storage, search.study):
+            print(printable(beginning.told))
     for phase in opened.phases:
         if phase.scheduler.go_on():
             print(f"{phase.name}: was stopped, and goes on")

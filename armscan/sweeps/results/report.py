@@ -25,6 +25,7 @@ from armscan.sweeps.scheduling.state import (
     RETRIED,
     RETRY_OF,
     STOP,
+    TAKEN_FROM,
     StudyState,
     env_steps_of,
     is_feasible,
@@ -99,10 +100,11 @@ def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Seq
     state, best = StudyState.of(trials), best_trials(study, 1)
     n_pruned = sum(trial.state == TrialState.PRUNED for trial in state.finished)
     n_infeasible = sum(not is_feasible(trial) for trial in state.finished)
+    taken = f"; {len(state.taken)} were taken from other studies" if state.taken else ""
     violating = f", {n_infeasible} infeasible" if n_infeasible else ""
     text = (
         f"{len(state.finished)} trials finished, {n_pruned} of them pruned{violating}; {len(state.running)} running, "
-        f"{len(state.failed)} failed, {len(state.retried)} retried after their worker died. "
+        f"{len(state.failed)} failed, {len(state.retried)} retried after their worker died{taken}. "
         f"{state.env_steps:,} environment steps, {state.busy_hours:.2g} hours."
     )
     if best:
@@ -142,7 +144,7 @@ def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
         rows.append(
             {
                 "trial": trial.number,
-                "ended": _said(trial.state.name.lower()) + ("" if is_feasible(trial) else ", infeasible"),
+                "ended": _ended(trial),
                 **dict.fromkeys(map(title_of, objectives), ""),
                 **{title_of(name): value_text(name, value) for name, value in values},
                 **_settings(trial),
@@ -151,6 +153,13 @@ def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
             }
         )
     return table(rows, what="trials")
+
+
+def _ended(trial: FrozenTrial) -> str:
+    """Return how a trial has ended, whether it violates a constraint, and where it was run if elsewhere."""
+    infeasible = "" if is_feasible(trial) else ", infeasible"
+    elsewhere = f", in {trial.user_attrs[TAKEN_FROM]}" if TAKEN_FROM in trial.user_attrs else ""
+    return f"{_said(trial.state.name.lower())}{infeasible}{elsewhere}"
 
 
 def _failures(trials: Sequence[FrozenTrial]) -> str:
@@ -192,6 +201,7 @@ def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> dict[str, Any]:
         "seconds": seconds,
         "env_steps": trial.user_attrs.get(ENV_STEPS),
         "retry_of": trial.user_attrs.get(RETRY_OF),
+        **({"taken_from": trial.user_attrs[TAKEN_FROM]} if TAKEN_FROM in trial.user_attrs else {}),
         "mlflow_run": trial.user_attrs.get(RUN),
         **trial.params,
         **metrics,

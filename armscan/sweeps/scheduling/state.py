@@ -17,6 +17,8 @@ T = TypeVar("T")
 # User attributes of a trial.
 LEASE, ENV_STEPS, METRICS, FAILURE = "lease", "env_steps", "figures", "failure"
 RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
+# Of a trial that a study has begun with: where it was run, or what its settings are of.
+TAKEN_FROM, ENQUEUED_FROM = "taken_from", "enqueued_from"
 # In the study of final trainings: the trial whose configuration is trained, and the seed.
 FINALIST, FINAL_SEED = "judged", "judged_seed"
 # A system attribute: the episodes of the final evaluation.
@@ -24,7 +26,7 @@ EPISODES = "episodes"
 # Of a trial, or of a study: who asked it to stop, and when; an empty text where a study goes on again.
 STOP = "stop"
 # What a retry has from the attempt before.
-KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED, STOP)
+KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED, STOP, ENQUEUED_FROM)
 # Of a study: trials whose failures are ignored.
 RESET_FAILURES = "forgiven"
 # In a lease: the worker that holds the trial.
@@ -44,6 +46,7 @@ class StudyState:
         waiting: requeued trials, and enqueued retries.
         failed: trials that raised, or whose workers died too often.
         retried: attempts whose worker died, and that were retried.
+        taken: finished trials of other studies, which count nowhere.
     """
 
     finished: tuple[FrozenTrial, ...]
@@ -51,10 +54,13 @@ class StudyState:
     waiting: tuple[FrozenTrial, ...]
     failed: tuple[FrozenTrial, ...]
     retried: tuple[FrozenTrial, ...]
+    taken: tuple[FrozenTrial, ...]
 
     @classmethod
     def of(cls, trials: Sequence[FrozenTrial]) -> Self:
         """Sort trials."""
+        taken = [trial for trial in trials if TAKEN_FROM in trial.user_attrs]
+        trials = [trial for trial in trials if TAKEN_FROM not in trial.user_attrs]
         ended = [trial for trial in trials if trial.state == TrialState.FAIL]
         return cls(
             finished=tuple(trial for trial in trials if trial.state in FINISHED),
@@ -62,11 +68,12 @@ class StudyState:
             waiting=tuple(trial for trial in trials if trial.state == TrialState.WAITING),
             failed=tuple(trial for trial in ended if RETRIED not in trial.user_attrs),
             retried=tuple(trial for trial in ended if RETRIED in trial.user_attrs),
+            taken=tuple(taken),
         )
 
     @property
     def all(self) -> tuple[FrozenTrial, ...]:
-        """All trials."""
+        """All trials that were run here, or will be."""
         return self.finished + self.running + self.waiting + self.failed + self.retried
 
     @property

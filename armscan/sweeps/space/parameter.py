@@ -101,6 +101,14 @@ class Parameter:
         """Return whether it is searched where these values were chosen before."""
         return all(name in chosen and chosen[name] in values for name, values in self.when.items())
 
+    def contains(self, value: Any) -> bool:
+        """Return whether a value, as Optuna keeps it, lies in its range or is one of its choices."""
+        drawn: Any = self.distribution
+        if isinstance(drawn, CategoricalDistribution):
+            return any(type(value) is type(choice) and value == choice for choice in drawn.choices)
+        whole = isinstance(drawn, IntDistribution)
+        return type(value) in ((int,) if whole else (int, float)) and bool(drawn._contains(value))
+
     def suggest(self, trial: BaseTrial) -> Value:
         """Return the value of a trial.
 

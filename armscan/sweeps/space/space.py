@@ -10,7 +10,7 @@ from optuna.distributions import CategoricalDistribution, distribution_to_json
 from optuna.trial import BaseTrial
 
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.space.parameter import Parameter, Value, as_kept
+from armscan.sweeps.space.parameter import Parameter, Value, as_kept, written
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,29 @@ class Space:
             if parameter.applies(chosen):
                 chosen[parameter.name] = parameter.suggest(trial)
         return chosen
+
+    def fit(self, values: Mapping[str, Value], *, partly: bool = False) -> tuple[dict[str, Value], str | None]:
+        """Return the values of a trial that lie in the space, and what does not.
+
+        Args:
+            values: values by name, as Optuna keeps them; those of other keys are left out.
+            partly: whether values may be missing. Default: False.
+
+        Returns:
+            The values of the parameters that apply, and the first that is missing or lies outside, None if none is.
+        """
+        chosen: dict[str, Value] = {}
+        misfit = None
+        for parameter in self.parameters:
+            name = parameter.name
+            if not parameter.applies(chosen):
+                continue
+            if name in values and parameter.contains(values[name]):
+                chosen[name] = values[name]
+            elif misfit is None and (name in values or not partly):
+                value = f"{name}={written(values[name])}" if name in values else f"{name} has no value and"
+                misfit = f"{value} is not in the space"
+        return chosen, misfit
 
     def extremes(self) -> Iterator[dict[str, Value]]:
         """Yield values by name that between them have every choice and both ends of every range.

@@ -51,6 +51,7 @@ class StudyAttributes(_Attributes):
     mlflow_run: Text = ""
     stop: Text = ""
     forgiven: list[Number] = Field(default=[], description="a list of numbers of trials")
+    begun_with: list[Text] = Field(default=[], description="a list of texts")
 
 
 class _Lease(_Attributes):
@@ -75,6 +76,8 @@ class TrialAttributes(_Attributes):
     figures: dict[str, float] = Field(default={}, description="numbers by their names")
     failure: Text = ""
     stop: Text = ""
+    taken_from: Text = ""
+    enqueued_from: Text = ""
     retried: bool = Field(default=False, description="true or false")
     retry_of: Number = 0
     attempt: Number = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,17 @@ from optuna.distributions import CategoricalDistribution, IntDistribution
 from rich.table import Column, Table
 from rich.text import Text
 
+from armscan.errors import printable
 from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.space.parameter import Parameter
 from armscan.sweeps.study.settings import StudySettings
+from armscan.sweeps.study.warm_start import Beginning
 from armscan.utils.console import WHOLE_CHARS, wide_console
 
 BYTES_A_MIB = 2**20
 
 
-def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
+def print_plan(settings: StudySettings, study: optuna.Study | None, begins: Sequence[Beginning]) -> None:
     """Print the space, how far a study is, if it has been begun, what it has cost, and what the rest will take."""
     console = wide_console(WHOLE_CHARS)
     state = StudyState.of(study.get_trials(deepcopy=False) if study is not None else ())
@@ -40,7 +43,9 @@ def print_plan(settings: StudySettings, study: optuna.Study | None) -> None:
     n_final = settings.final_eval.top_k * settings.final_eval.n_seeds
     console.print(f"objective  {objectives}, over the seeds {', '.join(map(str, settings.seeds))}")
     console.print(f"limits     {', '.join(limits)}; {settings.workers} workers; then {n_final} final trainings")
-    others = (("failed", state.failed), ("requeued", state.waiting))
+    for each in begins:
+        console.print(printable(f"begins     {each.told}"), markup=False, highlight=False)
+    others = (("failed", state.failed), ("waiting", state.waiting))
     also = "".join(f", {len(trials)} {what}" for what, trials in others if trials)
     console.print(f"done       {(done := len(state.finished))} trials{also}")
     if not done:

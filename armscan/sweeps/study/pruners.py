@@ -87,7 +87,7 @@ def front_numbers(losses: Losses) -> NDArray[np.int64]:
     """Return the number of the Pareto front of each trial, from 0, of losses of shape (trials, objectives)."""
     numbers = np.full(len(losses), -1)
     # dominates[i, j]: trial i is nowhere worse than trial j, and better in one objective.
-    no_worse: NDArray[np.bool_] = (losses[:, None] <= losses[None]).all(axis=2)
+    no_worse = np.asarray((losses[:, None] <= losses[None]).all(axis=2))
     dominates = no_worse & ~no_worse.T
     front = 0
     while (left := numbers < 0).any():

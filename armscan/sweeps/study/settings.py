@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -21,6 +21,7 @@ NAME = re.compile(rf"(?!.*{FINAL_EVAL_SUFFIX}$)\w[\w\-.]{{0,99}}")
 # The first final seed is this much above the largest seed of the search.
 FIRST_SEED_ABOVE, MAX_FINAL_SEEDS = 1000, 1000
 LARGEST_SEARCH_SEED = LARGEST_SEED - FIRST_SEED_ABOVE - MAX_FINAL_SEEDS
+T = TypeVar("T")
 OPTUNA_PRUNERS = "optuna.pruners."
 NO_PRUNER = f"{OPTUNA_PRUNERS}NopPruner"
 
@@ -54,18 +55,20 @@ def _constraints(constraints: Any) -> Any:
     return tuple(map(Constraint.read, constraints)) if isinstance(constraints, list | tuple) else constraints
 
 
-def _without_repetition(seeds: tuple[int, ...]) -> tuple[int, ...]:
-    if len(set(seeds)) < len(seeds):
+def _without_repetition(given: tuple[T, ...]) -> tuple[T, ...]:
+    if len(set(given)) < len(given):
         raise ValueError
-    return seeds
+    return given
 
 
 Name = Annotated[str, BeforeValidator(lambda name: check_study_name("study.name", name))]
+Other = Annotated[str, BeforeValidator(lambda name: check_study_name("study.warm_start", name))]
 # Not blank, and without what no path can have.
 Place = Annotated[str, Field(pattern=r"^[^\x00]*[^\s\x00][^\x00]*$", description="a text that says where")]
 Target = Annotated[
     Mapping[str, Any], AfterValidator(_target), Field(description="a section with a _target_, the name of a class")
 ]
+Preset = Annotated[str, Field(pattern=r"^\w[\w\-/]*$")]
 Metric = Annotated[str, Field(pattern=r"^\S+$")]
 Direction = Literal["minimize", "maximize"]
 Positive = Annotated[int, Field(ge=1, description="a whole number of at least 1")]
@@ -99,6 +102,8 @@ class StudySettings(Limits):
         sampler: what makes an Optuna sampler of a seed, as Hydra would instantiate it.
         pruner: an Optuna pruner, likewise.
         prune_after_env_steps: environment steps of a trial before it may be pruned.
+        warm_start: names of studies of the same storage whose trials it begins with. Default: none.
+        enqueue: presets whose settings are tried first; `default` is the study's own configuration. Default: none.
         workers: trials at a time, of this start.
         seed: of the samplers.
         seeds: that each trial is run with, one after another.
@@ -121,6 +126,12 @@ class StudySettings(Limits):
     sampler: Target
     pruner: Target
     prune_after_env_steps: Positive
+    warm_start: Annotated[tuple[Other, ...], AfterValidator(_without_repetition)] = Field(
+        default=(), strict=False, description="a list of names of studies, none twice"
+    )
+    enqueue: Annotated[tuple[Preset, ...], AfterValidator(_without_repetition)] = Field(
+        default=(), strict=False, description="a list of names of presets, or 'default', none twice"
+    )
     workers: Positive
     seed: int = Field(ge=0, le=LARGEST_SEED, description=f"a whole number from 0 to {LARGEST_SEED}")
     seeds: Annotated[tuple[Seed, ...], AfterValidator(_without_repetition)] = Field(

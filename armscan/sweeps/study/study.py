@@ -35,7 +35,7 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
         StudyError: if the study that exists searches another space, has other objectives, or has trials with another
             configuration.
     """
-    wanted = _wanted(settings, fixed)
+    wanted = described(settings, fixed)
 
     def made() -> optuna.Study:
         study = optuna.create_study(
@@ -73,11 +73,11 @@ def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.
         return None
     study = optuna.load_study(study_name=settings.name, storage=storage.optuna)
     if not settings.allow_config_changes:
-        _check_same(settings, study, _wanted(settings, fixed))
+        _check_same(settings, study, described(settings, fixed))
     return study
 
 
-def _wanted(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
+def described(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a study says of itself, by which it is compared."""
     of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
     if settings.constraints:

@@ -3,6 +3,9 @@
 import optuna
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given
+from hypothesis import strategies as st
+from optuna.trial import FixedTrial
 
 from armscan.errors import InvalidValueError
 from armscan.sweeps.space.parameter import overrides_of, written
@@ -154,3 +157,22 @@ def test_space_refuses_what_is_none_in_one_line(described, line):
     with pytest.raises(InvalidValueError) as error:
         Space.read(described)
     assert line in str(error.value)
+
+
+@given(
+    st.one_of(st.integers(-3, 12), st.floats(-3, 12), st.booleans(), st.sampled_from(["a", "[8,8]", "1"]), st.none())
+)
+def test_values_fit_that_the_distribution_of_a_trial_would_accept(value):
+    described = {
+        "a": {"low": 1, "high": 9, "step": 2},
+        "b": {"low": 0.5, "high": 8.5, "step": 0.5},
+        "c": {"low": 1e-2, "high": 10.0, "log": True},
+        "d": {"choices": [1, "a", [8, 8], None, True]},
+    }
+    for name, each in described.items():
+        chosen, misfit = Space.read({name: each}).fit({name: value})
+        if misfit is None:
+            assert Space.read({name: each}).suggest(FixedTrial({name: value})) == {name: value}
+        else:
+            assert chosen == {}
+            assert misfit.endswith("is not in the space")

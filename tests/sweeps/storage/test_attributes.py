@@ -15,6 +15,7 @@ from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, LEASE, METRICS
 from armscan.sweeps.storage.attributes import StudyAttributes, TrialAttributes, check_trials
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, FIXED, SPACE, STUDY_RUN, make_study
+from armscan.sweeps.study.warm_start import BEGUN_WITH
 from armscan.sweeps.tasks import attempt
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from tests.sweeps.study.test_study import settings
@@ -61,9 +62,19 @@ def test_every_attribute_is_checked():
     ours = {
         getattr(names, name) for name in ("LEASE", "ENV_STEPS", "METRICS", "FAILURE", "RETRIED", "RETRY_OF", "STOP")
     }
-    ours |= {names.ATTEMPT, names.SEEDS, FINALIST, FINAL_SEED, attempt.RUN, attempt.FOLDER, attempt.CONFIG_SHA256}
+    ours |= {
+        names.TAKEN_FROM,
+        names.ENQUEUED_FROM,
+        names.ATTEMPT,
+        names.SEEDS,
+        FINALIST,
+        FINAL_SEED,
+        attempt.RUN,
+        attempt.FOLDER,
+        attempt.CONFIG_SHA256,
+    }
     assert set(OF_TRIAL) == ours
-    of_study = {SPACE, FIXED, DASHBOARD_OBJECTIVES, STUDY_RUN, names.RESET_FAILURES, names.STOP}
+    of_study = {SPACE, FIXED, DASHBOARD_OBJECTIVES, STUDY_RUN, BEGUN_WITH, names.RESET_FAILURES, names.STOP}
     assert set(StudyAttributes.model_fields) == of_study
 
 
@@ -108,7 +119,11 @@ def test_attribute_of_a_study_of_any_type_is_refused_in_one_line_or_harmless(tmp
         study.set_user_attr(name, value)
         # At most one of them is what it was.
         was_refused = is_refused(lambda storage=storage: make_study(storage, settings(), {}))
-        assert was_refused or name in (STUDY_RUN, names.RESET_FAILURES, names.STOP) or (name, value) == (FIXED, {})
+        assert (
+            was_refused
+            or name in (STUDY_RUN, BEGUN_WITH, names.RESET_FAILURES, names.STOP)
+            or (name, value) == (FIXED, {})
+        )
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,200 @@
+"""Trials that a study begins with: those of other studies, and settings of presets that are tried first."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import optuna
+from omegaconf import OmegaConf
+from optuna.trial import FrozenTrial, create_trial
+
+from armscan.config.defaults import to_plain
+from armscan.config.legacy import migrate, renamed
+from armscan.errors import StudyError, listed
+from armscan.sweeps.scheduling.state import ENQUEUED_FROM, ENV_STEPS, FINISHED, METRICS, SEEDS, TAKEN_FROM
+from armscan.sweeps.space.parameter import Value, as_kept, overrides_of, written
+from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX, check_trials
+from armscan.sweeps.storage.reports import REPORT
+from armscan.sweeps.storage.storage import Storage, existing_storage
+from armscan.sweeps.study.settings import StudySettings
+from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES as OBJECTIVES
+from armscan.sweeps.study.study import FIXED, SPACE, best_trials, described, is_ours
+from armscan.sweeps.tasks.attempt import composed
+
+# User attribute of a study: what it has begun with.
+BEGUN_WITH = "begun_with"
+PRESET, SOURCE = "preset {}", "study {}"
+# Best settings of a study with another configuration that are tried first.
+N_ENQUEUED = 5
+NO_LIMIT = 10**9
+# In `study.enqueue`: the configuration of the study itself.
+DEFAULT = "default"
+# User attributes that a taken trial keeps.
+KEPT = (METRICS, SEEDS, ENV_STEPS)
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """Trials that a study begins with, all of one origin.
+
+    Args:
+        origin: name of the study or the preset, with what it is.
+        told: what is taken from it and why the rest is not, in one line.
+        taken: finished trials, with their values.
+        enqueued: settings that are tried first.
+    """
+
+    origin: str
+    told: str
+    taken: tuple[FrozenTrial, ...] = ()
+    enqueued: tuple[dict[str, Value], ...] = ()
+
+    def add(self, storage: Storage, study: optuna.Study) -> bool:
+        """Add the trials to a study, once; returns whether this call has added them."""
+
+        def add() -> bool:
+            begun_with = study.user_attrs.get(BEGUN_WITH, [])
+            if self.origin in begun_with:
+                return False
+            # Those that a process has added that ended in between.
+            there = [trial.user_attrs for trial in study.get_trials(deepcopy=False)]
+            places = {attributes.get(TAKEN_FROM) for attributes in there}
+            n_enqueued = sum(attributes.get(ENQUEUED_FROM) == self.origin for attributes in there)
+            for trial in self.taken:
+                if trial.user_attrs[TAKEN_FROM] not in places:
+                    study.add_trial(trial)
+            for chosen in self.enqueued[n_enqueued:]:
+                study.enqueue_trial(chosen, user_attrs={ENQUEUED_FROM: self.origin})
+            study.set_user_attr(BEGUN_WITH, [*begun_with, self.origin])
+            return True
+
+        return storage.exclusive(add)
+
+
+def beginnings(
+    settings: StudySettings, words: Sequence[str], fixed: Mapping[str, Any], study: optuna.Study | None
+) -> list[Beginning]:
+    """Return what a study begins with: the presets of `study.enqueue`, then the studies of `study.warm_start`.
+
+    What it has begun with already is left out.
+
+    Args:
+        settings: settings of the study.
+        words: words that its trials are composed of.
+        fixed: configuration of its trials without what they try.
+        study: the study; None where there is none yet.
+
+    Raises:
+        StudyError: if the storage has no such study.
+    """
+    begun_with = study.user_attrs.get(BEGUN_WITH, ()) if study is not None else ()
+    presets = [name for name in settings.enqueue if PRESET.format(name) not in begun_with]
+    sources = [name for name in settings.warm_start if SOURCE.format(name) not in begun_with]
+    storage = existing_storage(settings.storage) if sources else None
+    return [
+        *(_of_preset(settings.space, name, words) for name in presets),
+        *(_of_study(settings, name, fixed, storage) for name in sources),
+    ]
+
+
+def _of_preset(space: Space, name: str, words: Sequence[str]) -> Beginning:
+    config, choices = composed(words if name == DEFAULT else [f"experiment={name}"])
+    # Of a group the name that was chosen, of any other key its value.
+    found = {each.name: choices.get(each.name, OmegaConf.select(config, each.name)) for each in space.parameters}
+    plain = {key: to_plain(value) if OmegaConf.is_config(value) else value for key, value in found.items()}
+    chosen, misfit = space.fit({key: as_kept(value) for key, value in plain.items()})
+    if misfit:
+        return Beginning(PRESET.format(name), f"preset {name} is not tried: {misfit}")
+    told = f"preset {name} is tried first: {' '.join(overrides_of(chosen))}"
+    return Beginning(PRESET.format(name), told, (), (chosen,))
+
+
+def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], storage: Storage | None) -> Beginning:
+    source, wanted = _source(settings, name, storage), described(settings, fixed)
+    trials = [trial for trial in source.get_trials(deepcopy=False) if trial.state in FINISHED]
+    difference = _difference(source.user_attrs, wanted)
+    before = migrate(source.user_attrs[FIXED])
+    fitting: list[tuple[FrozenTrial, dict[str, Value]]] = []
+    misfits = Counter[str]()
+    for trial in trials:
+        params = renamed(trial.params)
+        chosen, misfit = settings.space.fit(params if difference else _plain(before) | params, partly=bool(difference))
+        if not difference:
+            misfit = misfit or _not_searched(params, chosen, _plain(wanted[FIXED]))
+        if misfit:
+            misfits[misfit] += 1
+        else:
+            fitting.append((trial, chosen))
+    told = f"warm start from {name}, which has {len(trials)} finished trials: "
+    left = f"; {sum(misfits.values())} do not fit, such as: {misfits.most_common(1)[0][0]}" if misfits else ""
+    if difference is None:
+        taken = tuple(_taken(name, trial, chosen, settings.space) for trial, chosen in fitting)
+        return Beginning(SOURCE.format(name), f"{told}{len(taken)} taken with their values{left}", taken)
+    first = _best_different(source, {trial.number: chosen for trial, chosen in fitting if chosen})
+    told += f"none taken with its value, because {difference}; the settings of the best {len(first)} are tried first"
+    return Beginning(SOURCE.format(name), told + left, (), first)
+
+
+def _source(settings: StudySettings, name: str, storage: Storage | None) -> optuna.Study:
+    names = [] if storage is None else optuna.get_all_study_names(storage.optuna)
+    others = sorted(each for each in names if each != settings.name and not each.endswith(FINAL_EVAL_SUFFIX))
+    if storage is None or name not in others:
+        there = listed(others) if others else "none is there"
+        raise StudyError(f"study.warm_start names {name!r}, but it must be another study of the storage: {there}")
+    source = optuna.load_study(study_name=name, storage=storage.optuna)
+    if not is_ours(source):
+        raise StudyError(f"study.warm_start names {name!r}, but that study was not made by armscan")
+    check_trials(source)
+    return source
+
+
+def _difference(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
+    """Return why values of a study say nothing about another: what differs beside what either searches; else None."""
+    if there[OBJECTIVES] != wanted[OBJECTIVES]:
+        return f"its objectives are {' and '.join(there[OBJECTIVES])}"
+    searched = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE]))
+    before, now = migrate(there[FIXED]), wanted[FIXED]
+    keys = [key for key in {**before, **now} if not f"{key}.".startswith(searched)]
+    different = [key for key in keys if before.get(key) != now.get(key)]
+    if not different:
+        return None
+    shown = f"its {different[0]} is {before.get(different[0])}, and not {now.get(different[0])}"
+    return shown + (f" ({len(different) - 1} others differ)" if len(different) > 1 else "")
+
+
+def _not_searched(params: Mapping[str, Value], chosen: Mapping[str, Value], fixed: Mapping[str, Value]) -> str | None:
+    """Return which value of a trial this study neither searches nor has; None if there is none."""
+    other = [key for key, value in params.items() if key not in chosen and (key not in fixed or fixed[key] != value)]
+    return f"{other[0]}={written(params[other[0]])}, which this study does not try" if other else None
+
+
+def _plain(flat: Mapping[str, Any]) -> dict[str, Value]:
+    """Return the values of a flattened configuration as Optuna keeps them; its lists are JSON."""
+    is_list = {key: isinstance(value, str) and value.startswith("[") for key, value in flat.items()}
+    return {key: as_kept(json.loads(value) if is_list[key] else value) for key, value in flat.items()}
+
+
+def _best_different(source: optuna.Study, chosen: Mapping[int, dict[str, Value]]) -> tuple[dict[str, Value], ...]:
+    """Return the settings of the best trials of a study, each other ones, of those with the numbers in `chosen`."""
+    best = [chosen[trial.number] for trial in best_trials(source, NO_LIMIT) if trial.number in chosen]
+    return tuple({json.dumps(each, sort_keys=True): each for each in reversed(best)}.values())[::-1][:N_ENQUEUED]
+
+
+def _taken(name: str, trial: FrozenTrial, chosen: dict[str, Value], space: Space) -> FrozenTrial:
+    """Return a trial of another study as one of this study, with its place there."""
+    place = trial.user_attrs.get(TAKEN_FROM, f"{name}:{trial.number}")
+    return create_trial(
+        state=trial.state,
+        values=trial.values,
+        params=chosen,
+        distributions={each.name: each.distribution for each in space.parameters if each.name in chosen},
+        user_attrs={TAKEN_FROM: place} | {key: trial.user_attrs[key] for key in KEPT if key in trial.user_attrs},
+        system_attrs={key: value for key, value in trial.system_attrs.items() if key.startswith(REPORT)},
+        intermediate_values=trial.intermediate_values,
+        constraints=trial.constraints,
+    )

@@ -1,0 +1,162 @@
+"""What a study begins with: trials of others whose configuration is the same, else their best settings; and presets."""
+
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from armscan.config.defaults import to_plain
+from armscan.config.sources import sweeps_folder
+from armscan.errors import StudyError
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import TAKEN_FROM, Limits, StudyState
+from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
+from armscan.sweeps.study.components import read_settings
+from armscan.sweeps.study.study import best_trials, make_study
+from armscan.sweeps.study.warm_start import N_ENQUEUED, beginnings
+from tests.sweeps.study.test_study import settings
+
+LR = {"low": 1e-4, "high": 1e-2, "log": True}
+STACK = {"choices": [1, 4]}
+FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9, "tau": 0.005}, "stack": 1, "projection": "y"}
+ZY = FIXED | {"projection": "zy"}
+
+
+@pytest.fixture
+def study_in(tmp_path):
+    """Makes a study of a space in the storage, with a finished trial of each of some values."""
+
+    def make(name, space, fixed=FIXED, rows=(), **changes):
+        asked = settings(name=name, storage=str(tmp_path / "a.journal"), space=Space.read(space), **changes)
+        storage = open_storage(asked.storage)
+        study = make_study(storage, asked, fixed)
+        for params, value in rows:
+            study.enqueue_trial(params)
+            trial = study.ask()
+            asked.space.suggest(trial)
+            if value is None:
+                study.tell(trial, state=TrialState.PRUNED)
+            else:
+                study.tell(trial, value)
+        return asked, storage, study
+
+    return make
+
+
+def begin(made, fixed=FIXED):
+    """Lets a study begin; returns what is told."""
+    asked, storage, study = made
+    begins = beginnings(asked, [], fixed, study)
+    for each in begins:
+        assert each.add(storage, study)
+    return [each.told for each in begins]
+
+
+def test_trials_of_the_same_configuration_are_taken_with_their_values_and_count_nowhere(study_in):
+    study_in("before", {"agent.lr": LR}, rows=[({"agent.lr": 1e-3}, 3.0), ({"agent.lr": 2e-3}, None)])
+    made = study_in("now", {"agent.lr": LR}, warm_start=["before"])
+    assert begin(made) == ["warm start from before, which has 2 finished trials: 2 taken with their values"]
+    _, storage, study = made
+    assert [trial.user_attrs[TAKEN_FROM] for trial in study.trials] == ["before:0", "before:1"]
+    assert [trial.number for trial in best_trials(study, 3)] == [0]
+    state = StudyState.of(study.trials)
+    assert (len(state.finished), len(state.taken), state.env_steps, state.busy_hours) == (0, 2, 0, 0.0)
+    scheduler = TrialScheduler(study, storage, Limits(n_trials=1))
+    assert scheduler.claim({"worker": "a"}).number == 2
+
+
+def test_edited_space_takes_what_fits(study_in):
+    rows = [
+        ({"agent.lr": 2e-3, "agent.gamma": 0.9}, 1.0),
+        ({"agent.lr": 2e-4, "agent.gamma": 0.9}, 2.0),
+        ({"agent.lr": 2e-3, "agent.gamma": 0.5}, 3.0),
+    ]
+    study_in("before", {"agent.lr": LR, "agent.gamma": {"choices": [0.5, 0.9]}}, rows=rows)
+    # A narrower range, a key less, and one more, which had a value in the configuration.
+    space = {"agent.lr": LR | {"low": 1e-3}, "agent.tau": {"low": 0.001, "high": 0.1}}
+    made = study_in("now", space, warm_start=["before"])
+    (told,) = begin(made)
+    assert "3 finished trials: 1 taken with their values; 2 do not fit, such as: agent.lr=0.0002 is not in" in told
+    (trial,) = made[2].trials
+    assert (trial.params, trial.value) == ({"agent.lr": 2e-3, "agent.tau": 0.005}, 1.0)
+
+
+def test_value_of_a_key_that_is_searched_no_more_must_be_the_fixed_one(study_in):
+    study_in("before", {"agent.lr": LR, "stack": STACK}, rows=[({"agent.lr": 2e-3, "stack": 4}, 1.0)])
+    (told,) = begin(study_in("now", {"agent.lr": LR}, warm_start=["before"]))
+    assert told.endswith("0 taken with their values; 1 do not fit, such as: stack=4, which this study does not try")
+
+
+@pytest.mark.parametrize(
+    ("changes", "fixed", "why"),
+    [
+        ({}, ZY, "its projection is y, and not zy"),
+        ({"seeds": (0, 1)}, FIXED, "its study.seeds is [0], and not [0, 1]"),
+        ({"objectives": {"solved": "maximize"}}, FIXED, "its objectives are mean_steps"),
+    ],
+    ids=["task", "seeds", "objectives"],
+)
+def test_best_settings_of_another_configuration_are_tried_first_without_their_values(study_in, changes, fixed, why):
+    rows = [({"agent.lr": 1e-3 * (10 - each), "stack": 1}, float(each)) for each in range(8)]
+    study_in("before", {"agent.lr": LR, "stack": STACK}, rows=rows)
+    # Settings that differ only in what this study does not try are one.
+    made = study_in("now", {"agent.lr": LR, "agent.gamma": {"choices": [0.5]}}, fixed, warm_start=["before"], **changes)
+    (told,) = begin(made, fixed)
+    assert f"none taken with its value, because {why}; the settings of the best {N_ENQUEUED} are tried first" in told
+    queued = [trial.system_attrs["fixed_params"] for trial in made[2].trials]
+    assert queued == [{"agent.lr": pytest.approx(1e-3 * (10 - each))} for each in range(N_ENQUEUED)]
+    assert {trial.state for trial in made[2].trials} == {TrialState.WAITING}
+
+
+def test_study_begins_once_also_where_a_process_ended_in_between(study_in, monkeypatch):
+    study_in("before", {"agent.lr": LR}, rows=[({"agent.lr": 1e-3}, 3.0), ({"agent.lr": 2e-3}, 2.0)])
+    asked, storage, study = study_in("now", {"agent.lr": LR}, warm_start=["before"])
+    (beginning,) = beginnings(asked, [], FIXED, study)
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(optuna.Study, "set_user_attr", killed)
+        with pytest.raises(KeyboardInterrupt):
+            beginning.add(storage, study)
+    assert beginning.add(storage, study)
+    assert not beginning.add(storage, study)
+    assert len(study.trials) == 2
+    assert beginnings(asked, [], FIXED, study) == []
+
+
+@pytest.mark.parametrize("name", ["elsewhere", "now"])
+def test_study_that_is_not_there_is_refused_with_those_that_are(study_in, name):
+    study_in("before", {"agent.lr": LR})
+    asked, _, study = study_in("now", {"agent.lr": LR}, warm_start=[name])
+    with pytest.raises(StudyError, match=f"warm_start names '{name}', but it must be .* of the storage: before$"):
+        beginnings(asked, [], FIXED, study)
+
+
+def test_preset_whose_values_lie_in_the_space_is_tried_first():
+    words = ["sweep=sac_zy", "study.enqueue=[default,best_zy]"]
+    asked, _, config = read_settings(words)
+    own, best = beginnings(asked, words, to_plain(config), None)
+    assert own.enqueued[0]["agent.lr_end_factor"] == 1.0
+    other = {"agent.lr_end_factor": 0.1, "stack": 4, "memory": 2, "agent.target_entropy_per_dim": -3.0}
+    assert best.enqueued == (own.enqueued[0] | other,)
+    assert best.told.startswith("preset best_zy is tried first: agent.lr=0.001 agent.lr_end_factor=0.1 ")
+
+
+def test_preset_whose_values_do_not_lie_in_the_space_is_not_tried():
+    given = StudyCommand.read(["-m", "sweep=sac_y", "study.space.agent.lr.low=5e-3"])
+    words = words_of_trials(given.words)
+    asked, _, config = read_settings(words)
+    (beginning,) = beginnings(asked, words, to_plain(config), None)
+    assert beginning.told == "preset best_y is not tried: agent.lr=0.001 is not in the space"
+    assert beginning.enqueued == ()
+
+
+@pytest.mark.parametrize("sweep", sorted(path.stem for path in sweeps_folder().glob("*.yaml")))
+def test_presets_of_each_sweep_lie_in_its_space(sweep):
+    words = [f"sweep={sweep}"]
+    asked, _, config = read_settings(words)
+    begins = beginnings(asked, words, to_plain(config), None)
+    assert [len(each.enqueued) for each in begins] == [1] * len(asked.enqueue)
