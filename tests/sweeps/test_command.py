@@ -217,7 +217,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
         ),
         (
             ["-m", "sweep=sac_y", "study.objectives=[minimize mean_steps,maximize success_rate]"],
-            "study.pruner is optuna.pruners.MedianPruner, but trials of several objectives cannot be pruned",
+            "study.pruner is optuna.pruners.MedianPruner, which compares one objective, but study.objectives has 2",
         ),
         (["-m", "sweep=sac_y", "study/sampler=best"], "study/sampler is 'best', but it must be cmaes, "),
         (["-m", "sweep=sac_y", "study.name=a/b"], "study.name is 'a/b', but it must begin with a letter"),
