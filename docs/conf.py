@@ -27,7 +27,7 @@ extensions = [
 exclude_patterns = ["_build", "_ext"]
 
 # Markdown
-myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 # Notebooks are run by tests/test_docs.py and kept with their outputs.
 nb_execution_mode = "off"

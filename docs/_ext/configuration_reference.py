@@ -41,9 +41,9 @@ def argument_texts(target: Any) -> dict[str, str]:
 
 
 def argument_types(target: Any) -> dict[str, str]:
-    """Read the arguments' types as they are written."""
+    """Read the arguments' types, as YAML has them: a sequence is a list."""
     return {
-        name: str(argument.annotation).removeprefix("typing.")
+        name: re.sub(r"\b(?:Sequence|tuple)\[.*\]", "list", str(argument.annotation)).replace("None", "null")
         for name, argument in inspect.signature(target).parameters.items()
         if argument.annotation is not inspect.Parameter.empty
     }
@@ -103,7 +103,16 @@ def rows(keys: CommentedMap, source: list[str], prefix: str) -> Iterator[tuple[s
             of_study = study_range(f"{prefix}{key}".removeprefix(STUDY)) if prefix.startswith(STUDY) else ""
             text = in_yaml(texts[key]) if texts.get(key) else beside[key]
             words = " ".join(f"{text} {ranges.get(key, of_study)}".split())
-            yield f"{prefix}{key}", types.get(key) or kind(value), json.dumps(value), words
+            yield f"{prefix}{key}", types.get(key) or kind(value), shown(value), words
+
+
+def shown(value: Any) -> str:
+    """Write a default; of a section that builds an object, only the name of its class."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(shown, value))}]"
+    if isinstance(value, CommentedMap) and TARGET in value:
+        return str(value[TARGET]).rpartition(".")[2]
+    return json.dumps(value)
 
 
 def in_yaml(text: str) -> str:
@@ -159,7 +168,7 @@ class Configuration(SphinxDirective):
         prefix = f"{group}." if group and "@package" not in source[0] else ""
         table = list(rows(keys, source, prefix))
         if table:
-            lines += ["| key | type | default | meaning |", "| --- | --- | --- | --- |"]
+            lines += ["{.configuration}", "| key | type | default | meaning |", "| --- | --- | --- | --- |"]
             for key, type_, value, text in table:
                 cells = (f"`{key}`", type_ and f"`{type_}`", f"`{value}`", text)
                 lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
