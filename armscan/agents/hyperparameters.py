@@ -27,7 +27,7 @@ class Parameters:
     """
 
     SCHEDULABLE: ClassVar[tuple[str, ...]] = ("lr", "lr_end_factor", "batch_size")
-    """What a schedule may change during a training: neither networks nor what is kept of the environments."""
+    """Keys that a schedule may change during a training: neither networks nor buffer sizes and environments."""
 
     network: NetworkChoice
     """Network of the actor, and of the critics if the algorithm has critics."""

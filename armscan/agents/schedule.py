@@ -36,7 +36,7 @@ def read_schedule(where: str, described: Any, total_env_steps: int) -> tuple[Seg
         total_env_steps: Budget of the training, in environment steps; each segment begins before it.
 
     Raises:
-        InvalidValueError: if it is no such list, or its segments are not in order.
+        InvalidValueError: If it is no such list, or its segments are not in order.
     """
     if described is None:
         return ()
@@ -60,7 +60,7 @@ def scheduled_algorithms(algorithm: Algorithm, schedule: Sequence[Segment]) -> l
     A value lasts until another segment changes it.
 
     Raises:
-        InvalidValueError: if a segment changes what cannot change during a training, or a value is not allowed.
+        InvalidValueError: If a segment changes what cannot change during a training, or a value is not allowed.
     """
     allowed = getattr(algorithm, "SCHEDULABLE", ())
     algorithms: list[tuple[int, Algorithm]] = []

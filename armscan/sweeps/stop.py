@@ -19,7 +19,7 @@ STOPPED_BY = "at {:%Y-%m-%d %H:%M:%S} by {}"
 
 
 def reason() -> str:
-    """Return who stops it, and when."""
+    """Return the user who stops it, and the time."""
     return STOPPED_BY.format(datetime.now(), getpass.getuser())
 
 
@@ -31,7 +31,7 @@ def is_study(storage: Storage | None, name: str) -> bool:
 
 
 def stop_study(uri: str, name: str) -> str:
-    """Stop a study: its trials are requeued, and its command resumes it; returns what will happen, in one line."""
+    """Stop a study: its trials are requeued, and its command resumes it; return the consequence in one line."""
     storage = _storage_with(uri, name)
     names, n_running = optuna.get_all_study_names(storage.optuna), 0
     for each in (name, name + FINAL_EVAL_SUFFIX):
@@ -46,15 +46,15 @@ def stop_study(uri: str, name: str) -> str:
 
 
 def stop_trial(uri: str, name: str, number: int) -> str:
-    """Stop a trial of a study: it ends as pruned, and counts as finished; returns what will happen, in one line.
+    """Stop a trial of a study: it ends as pruned, and counts as finished; return the consequence in one line.
 
     Args:
-        uri: storage of the study.
-        name: name of the study.
-        number: number of the trial.
+        uri: Storage of the study.
+        name: Name of the study.
+        number: Number of the trial.
 
     Raises:
-        StudyError: if there is no such trial, or it has ended.
+        StudyError: If there is no such trial, or it has ended.
     """
     storage = _storage_with(uri, name)
     trials = optuna.load_study(study_name=name, storage=storage.optuna).get_trials(deepcopy=False)

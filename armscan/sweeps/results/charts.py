@@ -30,10 +30,10 @@ def charts_of(
     """Yield the charts of a study with their headings, as HTML.
 
     Args:
-        study: the study.
-        trials: all of its trials.
-        objectives: names of the metrics that are its values, in order.
-        shares: importance of each key by objective; empty where too few trials have finished.
+        study: Study to draw.
+        trials: All of its trials.
+        objectives: Names of the metrics that are its values, in order.
+        shares: Importance of each key by objective; empty if too few trials have finished.
     """
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     if any(map(reports_of, trials)):
@@ -76,7 +76,7 @@ def _axis(metric: str) -> dict[str, Any]:
 
 
 def _said(trial: FrozenTrial) -> str:
-    """Return what is said of a trial under the pointer."""
+    """Return the hover text of a trial."""
     return "<br>".join(map(html.escape, (f"trial {trial.number}", *overrides_of(trial.params))))
 
 
@@ -120,7 +120,7 @@ def _slice(trials: Sequence[FrozenTrial], key: str, number: int, objective: str)
 
 
 def _reports(trials: Sequence[FrozenTrial], number: int, objective: str) -> Figure:
-    """Return what trials have reported while they trained: the finished in grey, the pruned to a cross, the running."""
+    """Return a chart of the trials' reports: finished trials in grey, pruned ones to a cross, and running ones."""
     figure, named = Figure(), set()
     looks: dict[TrialState, tuple[str, dict[str, Any]]] = {
         TrialState.COMPLETE: ("finished", {"line": {"color": GREY, "width": 1}, "opacity": 0.6}),

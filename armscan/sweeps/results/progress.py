@@ -32,11 +32,11 @@ REFRESH_S = 2.0
 
 @contextmanager
 def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
-    """Show inside the context how a study is going, from what stands in its storage.
+    """Show the progress of a study inside the context, from its storage.
 
     Args:
-        opened: the study.
-        folder: the folder of the workers of this start.
+        opened: Study to show.
+        folder: Folder of the workers that this command started.
     """
     shown, stopped = {key for key, *_ in _ended(opened)}, threading.Event()
 
@@ -71,8 +71,8 @@ def repeat(show: Callable[[], None], stopped: threading.Event) -> None:
     """Show how a study is going again and again; where its storage is away or damaged, that it is, and nothing new.
 
     Args:
-        show: shows it once.
-        stopped: ends the repetition, once it is shown for the last time.
+        show: Function that shows it once.
+        stopped: Event that ends the repetition, after it is shown a last time.
     """
     told, is_last = "", False
     while not is_last:
@@ -134,7 +134,7 @@ def _summary(opened: OpenedStudy, state: StudyState) -> str:
 
 
 def _describe(trial: FrozenTrial, objectives: Iterable[str]) -> str:
-    """Return what became of a trial in one line."""
+    """Return the outcome of a trial in one line."""
     attributes, tried = trial.user_attrs, " ".join(overrides_of(trial.params))
     name = f"trial {trial.number}"
     if FINALIST in attributes:
@@ -148,7 +148,7 @@ def _describe(trial: FrozenTrial, objectives: Iterable[str]) -> str:
 
 
 def print_result(opened: OpenedStudy) -> int:
-    """Print what a study has found; returns the exit code."""
+    """Print the result of a study; return the exit code."""
     scheduler, settings = opened.search.scheduler, opened.settings
     state = scheduler.state()
     print(_summary(opened, state))

@@ -51,10 +51,10 @@ def write_report(
     """Write the report of a study.
 
     Args:
-        study: in its storage.
-        final_trials: those of the final evaluation; empty without one.
-        folder: takes `report.html` and the CSV files.
-        refresh_s: seconds after which a browser reads the page again. Default: None, never.
+        study: Study in its storage.
+        final_trials: Trials of the final evaluation; empty without one.
+        folder: Folder that takes `report.html` and the CSV files.
+        refresh_s: Seconds after which a browser reads the page again. Default: None, never.
 
     Returns:
         The HTML file.

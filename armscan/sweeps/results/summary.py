@@ -30,9 +30,9 @@ class ConfigResult:
     """Final evaluation of one configuration.
 
     Args:
-        number: of the trial that found it.
-        figures: figures over all final trainings, with their intervals.
-        baselines: those of the baselines on the same volumes, by their names.
+        number: Number of the trial that found the configuration.
+        figures: Metrics over all final trainings, with their intervals.
+        baselines: Metrics of the baselines on the same volumes, by their names.
     """
 
     number: int
@@ -63,7 +63,7 @@ def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
     that have kept no episodes, which older ones have not, they are of the means of seeds and volumes.
 
     Args:
-        trials: of the final evaluation; unfinished ones are left out.
+        trials: Trials of the final evaluation; unfinished ones are left out.
     """
     of_number: dict[int, list[FrozenTrial]] = {}
     for trial in trials:
@@ -76,8 +76,8 @@ def best_metrics(search: optuna.Study, final: Sequence[FrozenTrial]) -> dict[str
     """Return the leading metrics of a study's best trial and of its best final evaluation, by the names that runs use.
 
     Args:
-        search: study of the search.
-        final: trials of the final evaluation; empty without one.
+        search: Study of the search.
+        final: Trials of the final evaluation; empty without one.
     """
     found: dict[str, float] = {}
     if best := best_trials(search, 1):

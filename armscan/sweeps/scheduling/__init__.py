@@ -1,1 +1,1 @@
-"""Which trial runs next, and what becomes of it."""
+"""Scheduling of trials: the next trial, and its outcome."""

@@ -31,9 +31,9 @@ class Standing:
     """Standing of a configuration in a race.
 
     Args:
-        estimate: mean score with its 95 % interval; NaN before the first round is complete.
-        n_seeds: number of seeds that the estimate is over.
-        is_in: whether it may still be the best.
+        estimate: Mean score with its 95 % interval; NaN before the first round is complete.
+        n_seeds: Number of seeds that the estimate is over.
+        is_in: Whether it can still be the best.
     """
 
     estimate: Estimate = UNKNOWN
@@ -51,11 +51,11 @@ class Race:
     """A race as it stands.
 
     Args:
-        missing: trainings of this round without a score, as pairs of a configuration and a seed; those that are running
-            are among them. Empty: the race is over.
-        chosen: the configuration that was chosen; None while the race goes on, or if all configurations have
-            failed in the first round.
-        standings: the standing of each configuration.
+        missing: Trainings of this round without a score, the running ones included, as pairs of a configuration and a
+            seed. Empty if the race is over.
+        chosen: Configuration that was chosen; None while the race goes on, or if all configurations have failed in the
+            first round.
+        standings: Standing of each configuration.
     """
 
     missing: tuple[tuple[int, int], ...]
@@ -64,7 +64,7 @@ class Race:
 
     @property
     def is_over(self) -> bool:
-        """Whether no training is missing."""
+        """Return whether no training is missing."""
         return not self.missing
 
 
@@ -77,12 +77,12 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, drop_level: fl
     chosen; the first of equal ones.
 
     Args:
-        scores: score of each finished training by configuration and seed, the higher the better; NaN for a training
-            that has failed, which drops its configuration at the end of the round. A configuration without any score is
-            a key, too.
-        seeds: all seeds of the race, in the order in which they are used.
-        min_seeds: number of seeds of all configurations, from 1 to the number of seeds.
-        drop_level: confidence at which a configuration is dropped, from 0.5 to below 1. Default: 0.8.
+        scores: Score of each finished training by configuration and seed, the higher the better. NaN for a failed
+            training, which drops its configuration at the end of the round. A configuration without any score is a key
+            too.
+        seeds: All seeds of the race, in the order in which they are used.
+        min_seeds: Number of seeds that all configurations get, from 1 to the number of seeds.
+        drop_level: Confidence at which a configuration is dropped, from 0.5 to below 1. Default: 0.8.
     """
     left, standings = list(scores), {configuration: Standing() for configuration in scores}
     for n_seeds in range(min_seeds, len(seeds) + 1):

@@ -51,8 +51,8 @@ class TrialScheduler:
         """Tell the outcome of a trial, and claim the next: a waiting one if there is one, else a new one.
 
         Args:
-            lease: of the worker that claims it.
-            outcome: of the worker's trial before, if any; its `is_told` is set.
+            lease: Lease of the worker that claims the trial.
+            outcome: Outcome of the worker's trial before, if any; its `is_told` is set.
 
         Returns:
             The trial; None if there is none now, because enough are running or the study has ended.
@@ -113,7 +113,7 @@ class TrialScheduler:
         return self.limits.broken(state, reset)
 
     def look_for_stop(self) -> str:
-        """Return who asked the study to stop; an empty string if nobody has."""
+        """Return the user who stopped the study; an empty string if it was not stopped."""
         self.stopped = str(self.study.user_attrs.get(STOP, ""))
         return self.stopped
 
@@ -138,7 +138,7 @@ class TrialScheduler:
         return len(state.failed)
 
     def requeue(self, trial: Trial, lease: Mapping[str, Any], writes: PendingWrites | None = None) -> None:
-        """Requeue a worker's own trial, with its lease and what is still to be written, for any worker to resume."""
+        """Requeue a worker's own trial, with its lease and pending writes, for any worker to resume."""
         storage, trial_id = self.study._storage, trial._trial_id
 
         def requeue() -> None:
@@ -158,9 +158,9 @@ class TrialScheduler:
         """Renew the lease of a worker's trial.
 
         Args:
-            trial: the worker's trial; None if it has none.
-            lease: of the worker, with the trial's progress.
-            is_checking: whether to return the state of the study. Default: True.
+            trial: Trial of the worker; None if it has none.
+            lease: Lease of the worker, with the trial's progress.
+            is_checking: Whether to return the state of the study. Default: True.
 
         Returns:
             The state of the study; None without `is_checking`.
@@ -182,8 +182,8 @@ class TrialScheduler:
         """Fail the trials of dead workers, enqueue a retry of each that has one left, and return those that failed.
 
         Args:
-            is_dead: whether the worker of a running trial is dead.
-            seen: state of the study a moment ago. Default: None, to read it now.
+            is_dead: Function that returns whether the worker of a running trial is dead.
+            seen: State of the study a moment ago. Default: None, read it now.
         """
 
         def lost(state: StudyState) -> list[FrozenTrial]:

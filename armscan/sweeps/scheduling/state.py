@@ -1,4 +1,4 @@
-"""State of a study: the attributes of its trials, what is still to be written of one, and when the study ends."""
+"""State of a study: the attributes of its trials, their pending writes, and the study's limits."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class StudyState:
     """State of a study.
 
     Args:
-        finished: trials that ran to their end or were pruned.
-        running: trials that workers run.
-        waiting: requeued trials, and enqueued retries.
-        failed: trials that raised, or whose workers died too often.
-        retried: attempts whose worker died, and that were retried.
-        taken: finished trials of other studies, which count nowhere.
+        finished: Number of trials that ran to their end or were pruned.
+        running: Number of trials that workers run.
+        waiting: Number of requeued trials and enqueued retries.
+        failed: Number of trials that raised, or whose workers died too often.
+        retried: Number of attempts whose worker died, and that were retried.
+        taken: Finished trials of other studies, which count nowhere.
     """
 
     finished: tuple[FrozenTrial, ...]
@@ -107,14 +107,14 @@ def is_feasible(trial: FrozenTrial) -> bool:
 
 
 class Limits(Section):
-    """When a study ends.
+    """Limits at which a study ends.
 
     Args:
-        n_trials: number of trials that finish.
-        max_failures: failed trials, retried ones not counted, after which the study ends. Default: 10.
-        max_retries: retries of a trial whose worker died. Default: 1.
-        timeout_hours: wall time in which trials run, for the whole study. Default: None, for no limit.
-        max_env_steps: environment steps of all trials together. Default: None, for no limit.
+        n_trials: Number of trials to finish.
+        max_failures: Number of failed trials, without retried ones, after which the study ends. Default: 10.
+        max_retries: Number of retries of a trial whose worker died. Default: 1.
+        timeout_hours: Wall time of the whole study, in hours. Default: None, no limit.
+        max_env_steps: Environment steps of all trials together. Default: None, no limit.
     """
 
     n_trials: int = Field(ge=1, description="a whole number of at least 1")
@@ -166,8 +166,8 @@ class PendingWrites(list[Callable[[], object]]):
         """Write all in one transaction with an operation, forget them, and return what the operation returns.
 
         Args:
-            transaction: see `Storage.transaction`.
-            operate: the operation, which may be called several times.
+            transaction: Function that runs a transaction; see `Storage.transaction`.
+            operate: Operation to run, which may be called several times.
         """
         n_written: int
         done: T
@@ -181,11 +181,11 @@ class TrialOutcome:
     """Outcome of a trial, told to Optuna with the next claim.
 
     Args:
-        trial: the trial that has ended.
-        state: COMPLETE, PRUNED or FAIL.
-        writes: pending writes of the trial's attributes.
-        values: values of the objectives; used for a complete trial only.
-        attributes: user attributes of the trial.
+        trial: Trial that has ended.
+        state: State of the trial: COMPLETE, PRUNED or FAIL.
+        writes: Pending writes of the trial's attributes.
+        values: Values of the objectives, for a complete trial only.
+        attributes: User attributes of the trial.
     """
 
     trial: Trial

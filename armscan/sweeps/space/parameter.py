@@ -17,7 +17,7 @@ from armscan.config.legacy import renamed
 from armscan.errors import InvalidValueError
 from armscan.utils.section import Section
 
-# Whatever begins with one of these.
+# Prefixes of keys that are not searched.
 NOT_SEARCHED = ("study", "sweep", "tracking", "hydra", "seed")
 KEY = re.compile(r"[A-Za-z_][\w/]*(\.\w+)*")
 PLAIN_TEXT = re.compile(r"(?!(?i:true|false|null|nan|inf)$)[A-Za-z_][\w./\-]*")
@@ -64,9 +64,9 @@ class Parameter:
     """One dimension of a search space.
 
     Args:
-        name: the key or group of the configuration.
-        distribution: its range or its choices.
-        when: the choices of parameters before it that it needs, by their names; it is searched only where all hold.
+        name: Key or group of the configuration.
+        distribution: Range or choices.
+        when: Required choices of earlier parameters, by their names; it is searched only if all of them hold.
     """
 
     name: str
@@ -113,7 +113,7 @@ class Parameter:
         """Return the value of a trial.
 
         Raises:
-            InvalidValueError: if the storage has another value for it than the space has.
+            InvalidValueError: If the storage has another value for it than the space has.
         """
         drawn: Any = self.distribution
         refused = f"{self.name} has a value in the study's storage that is not in study.space"

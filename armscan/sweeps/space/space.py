@@ -49,11 +49,11 @@ class Space:
         return chosen
 
     def fit(self, values: Mapping[str, Value], *, partly: bool = False) -> tuple[dict[str, Value], str | None]:
-        """Return the values of a trial that lie in the space, and what does not.
+        """Return the values of a trial that lie in the space, and those that do not.
 
         Args:
-            values: values by name, as Optuna keeps them; those of other keys are left out.
-            partly: whether values may be missing. Default: False.
+            values: Values by name, as Optuna stores them; those of other keys are left out.
+            partly: Whether values may be missing. Default: False.
 
         Returns:
             The values of the parameters that apply, and the first that is missing or lies outside, None if none is.
@@ -101,7 +101,7 @@ class Space:
         return {each: values[0] for each, values in reversed(allowed.items())}
 
     def without(self, fixed: Mapping[str, Any]) -> Space:
-        """Return the space without keys that somebody has given values, and without what needs other values."""
+        """Return the space without keys that have fixed values, and without keys that require other values."""
         kept: dict[str, Parameter] = {}
         for each in self.parameters:
             can_apply = all(

@@ -95,12 +95,12 @@ def check_trials(study: optuna.Study, *, n_searched: int | None = None) -> None:
     """Check that the trials of a study in its storage can be worked with.
 
     Args:
-        study: the study.
-        n_searched: number of trials of the search, if these are its final trainings. Default: None, the search itself.
+        study: Study to check.
+        n_searched: Number of trials of the search, if these are its final trainings. Default: None, the search itself.
 
     Raises:
-        InvalidValueError: if a user attribute of a trial is of another type than armscan writes.
-        StudyError: if Optuna cannot read the trials, or one lacks what it must have.
+        InvalidValueError: If a user attribute of a trial is of another type than armscan writes.
+        StudyError: If Optuna cannot read the trials, or one lacks what it must have.
     """
     try:
         trials = study.get_trials(deepcopy=False)
@@ -119,9 +119,9 @@ def check_trial(trial: FrozenTrial, study_name: str, n_objectives: int) -> None:
     """Check one trial; see `check_trials`.
 
     Args:
-        trial: the trial.
-        study_name: name of its study.
-        n_objectives: number of values that it has when it is complete.
+        trial: Trial to check.
+        study_name: Name of its study.
+        n_objectives: Number of values of a complete trial.
     """
     where = place_of(study_name, trial)
     TrialAttributes.read(f"{where}.user_attrs", trial.user_attrs)
@@ -143,7 +143,7 @@ def unreadable(what: str, error: Exception) -> StudyError:
 
 
 class ReadChecks:
-    """Checks of what is read from a storage: others may write to it at any time."""
+    """Checks of data read from a storage, to which others may write at any time."""
 
     def __init__(self) -> None:
         # Optuna's dashboard shows attributes of any type.
@@ -194,7 +194,7 @@ def _in_one_line(what: str, errors: tuple[type[Exception], ...] = UNREADABLE) ->
 
 
 def _wrong_numbers(trial: FrozenTrial, n_objectives: int) -> str | None:
-    """Return what is wrong with the values and reports of a trial; None if nothing is."""
+    """Return the fault of a trial's values and reports; None if there is none."""
     values: Sequence[Any] = trial.values or ()
     if trial.state == TrialState.COMPLETE and (len(values) != n_objectives or not all(map(_is_finite, values))):
         return f"has the values {few(map(repr, values)) or 'None'}, but it must have {n_objectives} finite numbers"

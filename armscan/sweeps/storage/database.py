@@ -67,7 +67,7 @@ def why_away(error: BaseException) -> str | None:
 
 
 class _CheckedStorage(_CachedStorage):
-    """A cache of a database that checks what it reads."""
+    """A cache of a database that checks all data it reads."""
 
     def __init__(self, database: RDBStorage) -> None:
         super().__init__(database)
@@ -110,8 +110,8 @@ class DatabaseStorage(_CheckedStorage):
         """Run an operation in one transaction, and again where the database went away in the middle.
 
         Args:
-            operate: reads and writes through this storage, in this thread.
-            is_exclusive: whether to hold the lock of a PostgreSQL database. Default: False.
+            operate: Function that reads and writes through this storage, in this thread.
+            is_exclusive: Whether to hold the lock of a PostgreSQL database. Default: False.
 
         Returns:
             What the operation returns.

@@ -35,8 +35,8 @@ def open_journal(path: Path, *, is_written: bool) -> CheckedJournal:
     """Open a journal; one that is written is created if there is none, and loses a torn last line.
 
     Raises:
-        OSError: if no file can be used there.
-        StudyError: if the file is no journal, or if a line of it but the last was lost or changed.
+        OSError: If no file can be used there.
+        StudyError: If the file is no journal, or if a line of it but the last was lost or changed.
     """
     journal = JournalFile(path)
     if is_written:
@@ -57,7 +57,7 @@ def open_journal(path: Path, *, is_written: bool) -> CheckedJournal:
 
 
 class CheckedJournal(JournalStorage):
-    """A journal that checks what it reads."""
+    """A journal that checks all data it reads."""
 
     def __init__(self, file: JournalFile) -> None:
         self.checks = ReadChecks()

@@ -18,10 +18,10 @@ def keep_report(storage: BaseStorage, trial_id: int, step: int, values: Sequence
     intermediate values in such a study: these reports are system attributes.
 
     Args:
-        storage: storage of the study.
+        storage: Storage of the study.
         trial_id: ID of the running trial in the storage.
-        step: step of the trial.
-        values: value of each objective.
+        step: Step of the trial.
+        values: Value of each objective.
     """
     if len(values) == 1:
         storage.set_trial_intermediate_value(trial_id, step, values[0])

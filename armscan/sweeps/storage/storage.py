@@ -31,9 +31,9 @@ class Storage:
     """A storage that several processes use at once.
 
     Args:
-        uri: where it is, without a password.
-        optuna: the storage, for Optuna.
-        lock_file: of exclusive operations; None if the database has a lock.
+        uri: Address of the storage, without a password.
+        optuna: Storage of Optuna.
+        lock_file: Lock file of exclusive operations; None if the database has a lock.
     """
 
     uri: str
@@ -41,10 +41,10 @@ class Storage:
     lock_file: Path | None
 
     def exclusive(self, decide: Callable[[], T]) -> T:
-        """Run an operation that excludes all other processes, and return what it returns.
+        """Run an operation that excludes all other processes, and return its result.
 
         Args:
-            decide: short, because the others wait. If the storage goes away in the middle, it is called again when the
+            decide: Short, because the others wait. If the storage goes away in the middle, it is called again when the
                 storage is back: then all of its writes are there, or none.
         """
         if self.lock_file is None:
@@ -54,10 +54,10 @@ class Storage:
             return decide()
 
     def transaction(self, operate: Callable[[], T]) -> T:
-        """Run several reads and writes in one round trip to a PostgreSQL database, and return what they return.
+        """Run several reads and writes in one round trip to a PostgreSQL database, and return their result.
 
         Args:
-            operate: may be called again, as `decide` of `exclusive`.
+            operate: Function that reads and writes; it may be called again, as `decide` of `exclusive`.
         """
         if self.lock_file is None:
             assert isinstance(self.optuna, DatabaseStorage)
@@ -69,12 +69,12 @@ def open_storage(uri: str, *, where: str = "study.storage", retry: bool = False)
     """Open a storage, and create it if there is none.
 
     Args:
-        uri: the path of a journal file, `sqlite:///FILE`, or the URL of a PostgreSQL database.
-        where: key that named it, for messages.
-        retry: whether to wait for a database that is away while opening it; an open one is always waited for.
+        uri: Path of a journal file, `sqlite:///FILE`, or the URL of a PostgreSQL database.
+        where: Key that named the storage, for messages.
+        retry: Whether to wait for an unavailable database while opening it; an open one is always waited for.
 
     Raises:
-        StudyError: if it cannot be reached or used.
+        StudyError: If it cannot be reached or used.
     """
     with _refused_in_one_line(uri, where):
         file = _file_of(uri)

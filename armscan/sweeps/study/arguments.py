@@ -28,14 +28,14 @@ NO_RANGE = ",low:null,high:null,log:null,step:null"
 
 @dataclass(frozen=True)
 class StudyCommand:
-    """The words of a study's command line, checked, without options; whether only to show what would be run."""
+    """The checked command line of a study, without options, and whether to show the plan only."""
 
     words: tuple[str, ...]
     is_plan: bool
 
     @classmethod
     def read(cls, words: Sequence[str]) -> Self:
-        """Return what the words of the command line say."""
+        """Parse the words of the command line."""
         own = [word for word in words if word not in (*MULTIRUN, PLAN)]
         overrides = OverridesParser.create().parse_overrides(own)
         keys = [each.key_or_group for each in overrides]

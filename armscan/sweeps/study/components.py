@@ -31,7 +31,7 @@ TASK_MEMBERS = ("metrics", "final_metric", "check", "run", "evaluate")
 
 
 def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig]:
-    """Return what a command line asks of a study, what a trial does, and its configuration without what it tries."""
+    """Return a study's settings from its command line, the task, and the configuration without searched values."""
     config = compose(words, return_hydra_config=True)
     if config.get(SWEEP) is not None:
         raise InvalidValueError(
@@ -91,12 +91,12 @@ def make(name: str, described: Mapping[str, Any], kind: type[Any], **arguments: 
 
 
 def check_space(settings: StudySettings, task: Task, words: Sequence[str], config: DictConfig) -> None:
-    """Build what is run as it is without the space, then with each choice and both ends of each range.
+    """Build the experiment without the space, then with each choice and both ends of each range.
 
     Choices of groups and of keys at the top are tried beside values of all others, too, as a trial has them.
 
     Raises:
-        InvalidValueError: if a key is unknown, or a value not allowed.
+        InvalidValueError: If a key is unknown, or a value not allowed.
     """
     tried = list(settings.space.extremes())
     # Of groups, or at the top: what the last of the values changes may leave no place for another.

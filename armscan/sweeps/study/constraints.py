@@ -23,9 +23,9 @@ class Constraint:
     """A bound that a metric must keep.
 
     Args:
-        metric: name of the metric.
-        is_upper: whether the bound is the highest value allowed, and not the lowest.
-        bound: the bound; a value equal to it is allowed.
+        metric: Name of the metric.
+        is_upper: Whether the bound is the largest allowed value, instead of the smallest.
+        bound: Allowed limit; a value equal to it is allowed.
     """
 
     metric: str
@@ -37,7 +37,7 @@ class Constraint:
         """Return the constraint of a text such as `training_s <= 60`.
 
         Raises:
-            InvalidValueError: if the text is none.
+            InvalidValueError: If the text is none.
         """
         found = CONSTRAINT.fullmatch(text) if isinstance(text, str) else None
         try:
@@ -68,11 +68,11 @@ class Constraint:
 
 
 def constrained(run: Run, constraints: Sequence[Constraint]) -> Run:
-    """Return what runs a trial and tells Optuna by how much its metrics violate each constraint.
+    """Return a function that runs a trial and tells Optuna by how much its metrics violate each constraint.
 
     Args:
-        run: runs an attempt at a trial and returns its metrics.
-        constraints: constraints of the study.
+        run: Function that runs an attempt at a trial and returns its metrics.
+        constraints: Constraints of the study.
     """
 
     def run_constrained(attempt: Attempt) -> dict[str, float]:

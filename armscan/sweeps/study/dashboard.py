@@ -32,12 +32,12 @@ def note_run(
     """Leave a note with the link to the tracked run of a study or a trial, and its folder.
 
     Args:
-        target: the study or the trial.
-        client: the tracking store.
-        experiment_id: the MLflow experiment of the run.
-        run_id: the ID of the run.
-        folder: the folder of the study or the trial.
-        of_seeds: metrics by the seeds of a trial that has ended. Default: None, nothing is said of them.
+        target: Study or trial to note it at.
+        client: Client of the tracking store.
+        experiment_id: MLflow experiment ID of the run.
+        run_id: MLflow run ID.
+        folder: The folder of the study or the trial.
+        of_seeds: Metrics by the seeds of a trial that has ended. Default: None, no metrics.
     """
     # Deferred: it takes a second, and only who works at a study needs it.
     from optuna_dashboard import save_note
@@ -63,8 +63,8 @@ def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float
     """Return the leading metrics of a trial, rounded and called as people call them: user attributes of their own.
 
     Args:
-        metrics: metrics by name; of a final training, those of the test are taken.
-        n_seeds: number of seeds that they are the interquartile means of.
+        metrics: Metrics by name; of a final training, those of the test are shown.
+        n_seeds: Number of seeds of their interquartile means.
     """
     tested = {name.removeprefix(TEST): value for name, value in metrics.items() if name.startswith(TEST)}
     of, statistic = "test volumes: " if tested else "", f" (IQM of {n_seeds} seeds)" if n_seeds > 1 else ""

@@ -34,23 +34,23 @@ WORKER_DIED = "its worker died"
 
 @dataclass(frozen=True, kw_only=True)
 class Phase:
-    """A phase of a study, and what its trials share.
+    """A phase of a study: the settings that its trials share.
 
     Args:
-        name: the name of its study in the storage.
-        scheduler: the one of its trials.
-        space: the keys that are searched.
-        objectives: names of the metrics that are the trial's values, in order.
-        reported: names of the metrics that running trials report to the pruner; none without pruning.
-        run: runs an attempt at a trial and returns its metrics.
-        seeds_of: returns the seeds that a trial is run with.
-        sampler: see `StudySettings`.
-        seed: what the samplers are seeded with, beside a trial's number.
-        folder: the folder of its study.
-        artifacts: see `StudySettings`.
-        client: the tracking store.
-        experiment_id: the MLflow experiment of the tracked runs.
-        run_id: the ID of the study's tracked run.
+        name: Name of its study in the storage.
+        scheduler: Scheduler of its trials.
+        space: Search space.
+        objectives: Names of the metrics that are a trial's values, in order.
+        reported: Names of the metrics that running trials report to the pruner; none without pruning.
+        run: Function that runs an attempt at a trial and returns its metrics.
+        seeds_of: Function that returns the training seeds of a trial.
+        sampler: Sampler; see `StudySettings`.
+        seed: Seed of the samplers, beside a trial's number.
+        folder: Folder of its study.
+        artifacts: Folder of the plots; see `StudySettings`.
+        client: Client of the tracking store.
+        experiment_id: MLflow experiment ID of the tracked runs.
+        run_id: MLflow run ID of the study.
     """
 
     name: str
@@ -99,10 +99,10 @@ class OpenedStudy:
     """A study that workers can run.
 
     Args:
-        settings: what it is asked to do.
-        config: the configuration of its trials, without the searched values.
-        search: the phase in which configurations are searched.
-        final_eval: the phase in which the best are trained with other seeds; None without one.
+        settings: Settings of the study.
+        config: Configuration of its trials, without the searched values.
+        search: Phase that searches configurations.
+        final_eval: Phase that trains the best again with other seeds; None without one.
     """
 
     settings: StudySettings
@@ -127,8 +127,8 @@ def open_for_work(
     """Open a study, as `read_settings` has read it from these words, and make it where there is none.
 
     Raises:
-        StudyError: if the storage cannot be used, or the study that exists is another.
-        TrackingError: if the tracking store cannot be used.
+        StudyError: If the storage cannot be used, or the study that exists is another.
+        TrackingError: If the tracking store cannot be used.
     """
     retry_s = RETRY_S if retry else None
     client, experiment_id = open_store(**to_plain(config.tracking), retry_s=retry_s)

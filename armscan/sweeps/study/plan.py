@@ -1,4 +1,4 @@
-"""Plan of a study, without running it: what is searched, how far it is, and what the rest will take."""
+"""Plan of a study, without running it: its space, its progress, and the cost of the rest."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BYTES_A_MIB = 2**20
 
 
 def print_plan(settings: StudySettings, study: optuna.Study | None, begins: Sequence[Beginning]) -> None:
-    """Print the space, how far a study is, if it has been begun, what it has cost, and what the rest will take."""
+    """Print the space, the progress and cost of a started study, and the cost of the rest."""
     console = wide_console(WHOLE_CHARS)
     state = StudyState.of(study.get_trials(deepcopy=False) if study is not None else ())
     table = Table(

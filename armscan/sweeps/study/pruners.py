@@ -25,11 +25,11 @@ class ParetoPruner(BasePruner):
     front always goes on, however many it has.
 
     Args:
-        min_resource: steps of the first rung, at least 1.
-        reduction_factor: one trial in so many goes on from a rung, at least 2. Default: 3.
+        min_resource: Environment steps of the first rung, 1 or more.
+        reduction_factor: Factor of reduction, 2 or more: one trial in so many continues from a rung. Default: 3.
 
     Raises:
-        InvalidValueError: if a number is too small.
+        InvalidValueError: If a number is too small.
     """
 
     def __init__(self, min_resource: int, reduction_factor: int = 3) -> None:
@@ -73,7 +73,7 @@ def n_better(losses: Losses) -> int:
     """Return how many trials are better than the first: none if it is on the first front.
 
     Args:
-        losses: values of shape (trials, objectives), of which lower ones are better.
+        losses: Losses, shape (trials, objectives); lower is better.
     """
     fronts = front_numbers(losses)
     beside = np.flatnonzero(fronts == fronts[0])
@@ -100,7 +100,7 @@ def crowding_distances(losses: Losses) -> Losses:
     """Return the crowding distance of each trial of one front: how far its neighbours are, over all objectives.
 
     Args:
-        losses: values of shape (trials, objectives).
+        losses: Losses, shape (trials, objectives).
 
     Returns:
         Distances of shape (trials,); infinite for the best and the worst of an objective.

@@ -79,8 +79,8 @@ class FinalEvalSettings(Section):
     """The final evaluation of the best configurations.
 
     Args:
-        top_k: number of configurations; 0 for no final evaluation.
-        n_seeds: trainings of each, with seeds that no search trial was run with.
+        top_k: Number of configurations to train again, 0 or more; 0 for no final evaluation.
+        n_seeds: Number of trainings of each, with seeds that no search trial has used.
     """
 
     top_k: int = Field(ge=0, description="a whole number of at least 0")
@@ -91,24 +91,24 @@ class StudySettings(Limits):
     """Settings of a study.
 
     Args:
-        name: of the study, in its storage and of its folder.
-        storage: where it is kept, as `open_storage` takes it.
-        folder: of its trials.
-        artifacts: folder of the plots for Optuna's dashboard.
-        task: what makes a `Task`, as Hydra would instantiate it.
-        space: what is searched.
-        objectives: direction by the name of each metric.
-        constraints: bounds that metrics of a trial must keep. Default: none.
-        sampler: what makes an Optuna sampler of a seed, as Hydra would instantiate it.
-        pruner: an Optuna pruner, likewise.
-        prune_after_env_steps: environment steps of a trial before it may be pruned.
-        warm_start: names of studies of the same storage whose trials it begins with. Default: none.
-        enqueue: presets whose settings are tried first; `default` is the study's own configuration. Default: none.
-        workers: trials at a time, of this start.
-        seed: of the samplers.
-        seeds: that each trial is run with, one after another.
-        final_eval: of the best at the end.
-        allow_config_changes: whether to resume although the fixed configuration has changed.
+        name: Name of the study, in its storage and of its folder.
+        storage: Address of the storage; see `open_storage`.
+        folder: Folder of the trials.
+        artifacts: Folder of the plots for Optuna's dashboard.
+        task: Config of a `Task`, which Hydra instantiates.
+        space: Search space.
+        objectives: Direction of each objective, by the name of its metric.
+        constraints: Bounds that metrics of a trial must keep. Default: none.
+        sampler: Config of an Optuna sampler, which Hydra instantiates with a seed.
+        pruner: Config of an Optuna pruner, which Hydra instantiates.
+        prune_after_env_steps: Environment steps of a trial before it may be pruned, 1 or more.
+        warm_start: Names of studies of the same storage that provide the first trials. Default: none.
+        enqueue: Presets whose settings are tried first; `default` is the study's own configuration. Default: none.
+        workers: Number of workers that this command starts, 1 or more.
+        seed: Seed of the samplers.
+        seeds: Training seeds of each trial, used one after another.
+        final_eval: Final evaluation of the best configurations.
+        allow_config_changes: Whether to resume although the fixed configuration has changed.
     """
 
     name: Name

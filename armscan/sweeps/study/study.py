@@ -1,4 +1,4 @@
-"""A study in its storage: made, or found and compared with what is asked for now, and its final trainings."""
+"""A study in its storage, created or compared with the requested settings, and its final trainings."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ N_SHOWN = 5
 
 
 def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study:
-    """Make a study, or find the one that exists; `fixed` is the configuration of trials without what they try.
+    """Make a study, or find the existing one; `fixed` is the configuration of trials without searched values.
 
     Raises:
-        StudyError: if the study that exists searches another space, has other objectives, or has trials with another
+        StudyError: If the study that exists searches another space, has other objectives, or has trials with another
             configuration.
     """
     wanted = described(settings, fixed)
@@ -78,7 +78,7 @@ def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.
 
 
 def described(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a study says of itself, by which it is compared."""
+    """Return the description of a study, by which it is compared."""
     of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
     if settings.constraints:
         of_trials["study.constraints"] = list(map(str, settings.constraints))
@@ -93,10 +93,10 @@ def described(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, An
 
 
 def is_ours(study: optuna.Study) -> bool:
-    """Return whether a study was made here, and not by somebody else's program in the same storage.
+    """Return whether armscan made a study, and not another program in the same storage.
 
     Raises:
-        InvalidValueError: if a user attribute of it is of another type than armscan writes.
+        InvalidValueError: If a user attribute of it is of another type than armscan writes.
     """
     there = study.user_attrs
     if not {SPACE, FIXED, DASHBOARD_OBJECTIVES} <= there.keys():

@@ -43,10 +43,10 @@ class Beginning:
     """Trials that a study begins with, all of one origin.
 
     Args:
-        origin: name of the study or the preset, with what it is.
-        told: what is taken from it and why the rest is not, in one line.
-        taken: finished trials, with their values.
-        enqueued: settings that are tried first.
+        origin: Name of the study or the preset, and its kind.
+        told: Line about the part that is taken, and why the rest is not.
+        taken: Finished trials, with their values.
+        enqueued: Settings to try first.
     """
 
     origin: str
@@ -79,18 +79,18 @@ class Beginning:
 def beginnings(
     settings: StudySettings, words: Sequence[str], fixed: Mapping[str, Any], study: optuna.Study | None
 ) -> list[Beginning]:
-    """Return what a study begins with: the presets of `study.enqueue`, then the studies of `study.warm_start`.
+    """Return the beginnings of a study: the presets of `study.enqueue`, then the studies of `study.warm_start`.
 
     What it has begun with already is left out.
 
     Args:
-        settings: settings of the study.
-        words: words that its trials are composed of.
-        fixed: configuration of its trials without what they try.
-        study: the study; None where there is none yet.
+        settings: Settings of the study.
+        words: Overrides that its trials are composed from.
+        fixed: Configuration of its trials without the searched values.
+        study: Study; None if it does not exist yet.
 
     Raises:
-        StudyError: if the storage has no such study.
+        StudyError: If the storage has no such study.
     """
     begun_with = study.user_attrs.get(BEGUN_WITH, ()) if study is not None else ()
     presets = [name for name in settings.enqueue if PRESET.format(name) not in begun_with]
@@ -154,7 +154,7 @@ def _source(settings: StudySettings, name: str, storage: Storage | None) -> optu
 
 
 def _difference(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
-    """Return why values of a study say nothing about another: what differs beside what either searches; else None."""
+    """Return the difference that makes a study's values useless for another, apart from searched keys; else None."""
     if there[OBJECTIVES] != wanted[OBJECTIVES]:
         return f"its objectives are {' and '.join(there[OBJECTIVES])}"
     searched = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE]))

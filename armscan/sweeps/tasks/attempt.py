@@ -38,20 +38,20 @@ class Attempt:
     """One attempt at a trial.
 
     Args:
-        trial: the trial as it stands in the storage.
-        overrides: what tells its configuration from that of other trials.
-        composed: its configuration, but for the seed, and what was chosen of each group.
-        command: the command that started the worker.
-        seeds: the seeds that it is run with, one after another.
-        study_folder: the folder of the study.
-        run_id: the ID of its tracked run.
-        tags: tags of the tracked runs of its trainings, that say of which study and trial they are.
-        objectives: names of the metrics that it reports to the pruner while it runs; none without pruning.
-        report_progress: takes what is known of how far it is.
-        opened: takes the tracked run of a training while it goes on, and None when it has ended.
-        show_picture: takes a file that the dashboard is to show.
-        writes: the pending writes about the trial.
-        transaction: see `Storage.transaction`.
+        trial: Trial as it is in the storage.
+        overrides: Overrides that distinguish its configuration from that of other trials.
+        composed: Configuration without the seed, and the choice of each group.
+        command: Command that started the worker.
+        seeds: Training seeds, used one after another.
+        study_folder: Folder of the study.
+        run_id: MLflow run ID of the trial.
+        tags: Tags of the tracked runs of its trainings, which name their study and trial.
+        objectives: Names of the metrics that it reports to the pruner while it runs; none without pruning.
+        report_progress: Function that takes the progress of the trial.
+        opened: Function that takes the tracked run of a training at its start, and None at its end.
+        show_picture: Function that takes a file for the dashboard.
+        writes: Pending writes about the trial.
+        transaction: Function that runs a transaction; see `Storage.transaction`.
     """
 
     trial: Trial
@@ -80,17 +80,17 @@ class Attempt:
 
     @property
     def folder(self) -> Path:
-        """Where it leaves its files."""
+        """Folder of its files."""
         return trial_folder(self.study_folder, self.trial.number)
 
     @property
     def folder_before(self) -> Path | None:
-        """That of the attempt whose place it takes; None where it is the first."""
+        """Folder of the attempt that it replaces; None for the first attempt."""
         number = self.trial.user_attrs.get(RETRY_OF)
         return None if number is None else trial_folder(self.study_folder, number)
 
     def config(self, seed: int) -> tuple[DictConfig, dict[str, str]]:
-        """Return the configuration of one of its trainings, and what was chosen of each group."""
+        """Return the configuration of one of its trainings, and the choice of each group."""
         config, choices = self.composed
         # Much quicker than to compose it once more.
         seeded = config.copy()
@@ -111,7 +111,7 @@ class Attempt:
             self.writes.flush_with(self.transaction, lambda: True)
 
     def keep_episodes(self, evaluations: Mapping[str, Evaluation]) -> None:
-        """Keep the episodes of the final evaluation, by what they are of, in the storage.
+        """Store the episodes of the final evaluation in the storage, by the name of their volumes.
 
         They are no user attributes, which the dashboard would show in full.
         """
@@ -125,15 +125,15 @@ class Attempt:
         """Report how a training is going.
 
         Args:
-            metrics: the metrics so far: the objectives, and `mean_return` for the screen, if known. A trial that does
-                not report every objective is not pruned.
-            seed: the seed of the training.
-            n_env_steps: the environment steps that it has taken.
-            grid: environment steps between two reports: trials are compared at the same steps.
-            total: environment steps of a whole training.
+            metrics: Metrics so far: the objectives, and `mean_return` for the screen, if known. A trial that does not
+                report every objective is not pruned.
+            seed: Seed of the training.
+            n_env_steps: Environment steps so far.
+            grid: Environment steps between two reports, so that trials are compared at the same steps.
+            total: Environment steps of a whole training.
 
         Raises:
-            optuna.TrialPruned: if the trial is pruned.
+            optuna.TrialPruned: If the trial is pruned.
         """
         done = [one for each, one in self.seeds_done.items() if each in self.seeds]
         self.env_steps = sum(int(one[ENV_STEPS]) for one in done) + n_env_steps
@@ -165,20 +165,20 @@ class Task(Protocol):
 
     @property
     def final_metric(self) -> str:
-        """Of the metrics that `evaluate` returns, the name of the one that says most."""
+        """Name of the leading metric that `evaluate` returns."""
 
     def check(self, config: DictConfig) -> None:
         """Check that a trial with this configuration could begin; called for many before the first trial.
 
         Raises:
-            ArmscanError: if it could not.
+            ArmscanError: If it could not.
         """
 
     def run(self, attempt: Attempt) -> dict[str, float]:
         """Run a trial, or resume one, and return its metrics.
 
         Raises:
-            optuna.TrialPruned: if the trial is not worth going on with.
+            optuna.TrialPruned: If the trial is not worth going on with.
         """
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
@@ -194,12 +194,12 @@ def trial_folder(study_folder: Path, number: int) -> Path:
 
 
 def composed(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
-    """Return the configuration of a run, without the section of the study, and what was chosen of each group."""
+    """Return the configuration of a run, without the section of the study, and the choice of each group."""
     return of_run(compose(words, return_hydra_config=True))
 
 
 def of_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
-    """Take from a composed configuration what is not of a run; returns it, and what was chosen of each group."""
+    """Return a composed configuration without the parts that are not of a run, and the choice of each group."""
     choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
     with open_dict(config):
         # The store is the same, however it was given.
@@ -227,7 +227,7 @@ def _volumes(data: str) -> Split:
 
 
 def check_metrics(metrics: Any, objectives: Sequence[str]) -> dict[str, float]:
-    """Return what a task has returned, if these are metrics by their names, those that are objectives finite."""
+    """Return the metrics of a task by name, checked: objectives must be finite."""
     if not isinstance(metrics, Mapping):
         raise InvalidValueError(f"the task has returned {metrics!r}, but it must be metrics by their names")
     if missing := [name for name in objectives if name not in metrics]:

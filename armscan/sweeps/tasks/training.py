@@ -45,7 +45,7 @@ Conclude = Callable[[Experiment, TrainingResult, TrackedRun, Path], dict[str, fl
 
 @dataclass
 class _Reporter:
-    """A training callback that reports to the study, also what an attempt before has reported."""
+    """A training callback that reports to the study, with the reports of an earlier attempt."""
 
     attempt: Attempt
     seed: int
@@ -119,7 +119,7 @@ class TrainingTask:
 def _concluded(
     attempt: Attempt, setup: Experiment, result: TrainingResult, tracked: TrackedRun, folder: Path
 ) -> dict[str, float]:
-    """Judge a trained agent beside the baselines, and keep what comes of it; returns the metrics of the test."""
+    """Evaluate a trained agent beside the baselines, and store the results; return the metrics of the test."""
     reached = RunResult.of(setup, result)
     reached.write(folder, title=tracked.name)
     tested = reached.evaluations[TEST]
@@ -202,7 +202,7 @@ def _begun(
 
 
 def _take_over(attempt: Attempt, folder: Path) -> None:
-    """Copy what the attempt before has left, where this one has nothing of its own yet."""
+    """Copy the files of the earlier attempt that this one does not have yet."""
     before = attempt.folder_before / folder.name if attempt.folder_before else None
     if before is None or (folder / RUN_FILE).exists() or not (before / RUN_FILE).exists():
         return

@@ -64,12 +64,14 @@ class Heartbeat:
     """Renews the lease of the current trial, reclaims the trials of dead workers, and leaves when asked to.
 
     Args:
-        scheduler: of the study.
-        worker: name of this worker.
-        is_told_to_leave: polled several times a second.
-        leave: ends the process, once the current trial is requeued; mostly called in another thread than the worker's.
-        on_death: called with each reclaimed trial.
-        is_told_to_leave_soon: polled when a trial is claimed and when it reports progress, where it loses nothing.
+        scheduler: Scheduler of the study.
+        worker: Name of this worker.
+        is_told_to_leave: Function that is polled several times a second.
+        leave: Function that ends the process, once the current trial is requeued; mostly called in another thread than
+            the worker's.
+        on_death: Function that is called with each reclaimed trial.
+        is_told_to_leave_soon: Function that is polled when a trial is claimed and when it reports progress, where
+            leaving loses nothing.
     """
 
     def __init__(
@@ -134,8 +136,8 @@ class Heartbeat:
         """Keep the trial's progress for the next renewal of the lease.
 
         Raises:
-            LimitReachedError: if the study's time or environment steps are spent, or it was stopped.
-            optuna.TrialPruned: if the trial was stopped.
+            LimitReachedError: If the study's time or environment steps are spent, or it was stopped.
+            optuna.TrialPruned: If the trial was stopped.
         """
         self._lease = self._lease | progress
         self._leave_if_told_to()
@@ -174,7 +176,7 @@ class Heartbeat:
         while True:
             try:
                 self._renew()
-            # Whatever a storage raises that is away for long: the next heartbeat may find it there again.
+            # Any error of a storage that is away for long: the next heartbeat may reach it again.
             except Exception as error:
                 log(f"heartbeat failed: {error!r}")
             if self._stopped.wait(HEARTBEAT_S):

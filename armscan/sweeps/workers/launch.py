@@ -1,4 +1,4 @@
-"""Launch the workers of a study, wait for them wherever they run, and leave none behind."""
+"""Launch the workers of a study on any launcher, wait for them, and leave none behind."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     """Launch the workers of a study, and wait for their end.
 
     Raises:
-        KeyboardInterrupt: if it is interrupted; the workers have been asked to leave.
-        StudyError: if the launcher has failed, and no worker is alive.
+        KeyboardInterrupt: If it is interrupted; the workers have been asked to leave.
+        StudyError: If the launcher has failed, and no worker is alive.
     """
     started = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
     folder = working_folder() / opened.folder / "workers" / started
@@ -97,7 +97,7 @@ def _launch_elsewhere(opened: OpenedStudy, folder: Path, launcher: str, launch: 
     # What a worker's machine has said, after all of them have ended.
     except ArmscanError as error:
         print(f"error: {error}", file=sys.stderr)
-    # Whatever a launcher raises: for one job that was cancelled, too, while all others go on.
+    # Any error of a launcher, also for one cancelled job while all others go on.
     except Exception as error:
         line = one_line_message(error) or " ".join(str(error).split()) or repr(error)
         failed = StudyError(f"{LAUNCHER} is {launcher!r}, which has failed: {line[:MAX_REASON_CHARS]}")

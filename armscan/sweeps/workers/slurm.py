@@ -22,7 +22,7 @@ class Notice:
     """A signal of Slurm, if there was one, and how the job reacts.
 
     Args:
-        requeue: submitit's own handler, which requeues this job and leaves; None outside of Slurm.
+        requeue: Submitit's own handler, which requeues this job and leaves; None outside of Slurm.
     """
 
     def __init__(self, requeue: Any) -> None:
@@ -62,7 +62,7 @@ class Notice:
         Returns if it does: then the job has a result, and its launcher waits only for the others.
 
         Raises:
-            SystemExit: if it is requeued: without a result the launcher waits on.
+            SystemExit: If it is requeued: without a result the launcher waits on.
         """
         state, n_restarts = _state()
         if n_restarts > int(os.environ.get("SLURM_RESTART_COUNT", 0)):

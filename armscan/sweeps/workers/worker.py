@@ -104,7 +104,7 @@ class Worker:
             raise
         except StorageAwayError:
             raise
-        # Whatever else a trial raises fails the trial, not the study; this process is told to leave in other ways.
+        # Any other error of a trial fails the trial, not the study; this process is told to leave in other ways.
         except (Exception, SystemExit, KeyboardInterrupt) as error:
             line = one_line_message(error)
             if line is None:
@@ -229,11 +229,11 @@ def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None
     """Work at a study until it is over.
 
     Args:
-        words: the words of the study.
-        make_heartbeat: makes the heartbeat of this worker in a phase, from what depends on the phase.
+        words: Command line of the study, as words.
+        make_heartbeat: Function that makes the heartbeat of this worker in a phase.
 
     Raises:
-        AwayError: if the storage or the tracking store is away for longer than a worker waits.
+        AwayError: If the storage or the tracking store is away for longer than a worker waits.
     """
     silence_library_warnings()
     opened = open_for_work(*read_settings(words), words, retry=True)
