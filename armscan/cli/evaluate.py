@@ -106,7 +106,7 @@ def evaluate(
     RUN is an MLflow run ID or its first four or more characters. With --agent, any KEY=VALUE of armscan run configures
     the agent instead, experiment=PRESET included.
 
-    The rules of the episodes and --device are the agent's own by default. docs/evaluation.md explains the metrics,
+    The rules of the episodes and --device are the agent's own by default. docs/metrics.md explains the metrics,
     docs/seeing.md the video.
     """
     changes = {name: value for name, value in rules.items() if value is not None}

@@ -39,7 +39,7 @@ TITLES = {
 # Metrics of evaluations have this among them, below the name of their group, which a run shortens.
 EVALUATED = "/success_rate"
 NAMES = {name.replace(" ", "_"): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
-# With fewer volumes intervals are clearly too narrow: docs/evaluation.md.
+# With fewer volumes intervals are clearly too narrow: docs/metrics.md.
 FEWEST_VOLUMES = 8
 WHAT_HELPS = "more wrists, data=mixed, or cross-validation (data.folds=leave_one_out) would help"
 
