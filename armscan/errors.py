@@ -16,7 +16,7 @@ class ArmscanError(Exception):
     """Base of every error that armscan raises on purpose."""
 
     def __str__(self) -> str:
-        """One line, also where a received value, such as an array, is written in several."""
+        """Return the message in one line, even if a received value, such as an array, has several."""
         return printable(" ".join(line.strip() for line in super().__str__().splitlines()))
 
 

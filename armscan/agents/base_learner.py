@@ -84,7 +84,7 @@ class SupervisedLearner(BaseLearner):
         return self._n_env_steps
 
     def warm_up(self) -> None:
-        """Do nothing: the first planes can be learned from."""
+        """Do nothing: the first planes already count for learning."""
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
         """Learn for one epoch of at least `n_env_steps`; returns its training metrics by name.
@@ -180,7 +180,7 @@ def load_into(module: nn.Module, weights: dict[str, Any]) -> None:
 
 
 def spare_dynamo() -> None:
-    """Have torch's optimisers be made without torch's compiler, which they load only to be left alone by it.
+    """Make torch's optimisers without torch's compiler, which they would load without using it.
 
     That takes one and a half seconds. Code that compiles must load it first.
     """
@@ -193,7 +193,7 @@ def spare_dynamo() -> None:
 
 
 def prepare_torch(seed: int) -> None:
-    """Have torch compute on one thread, on which small networks are fastest, and seed the networks made next."""
+    """Make torch compute on one thread, where small networks are fastest, and seed the networks made next."""
     spare_dynamo()
     torch.set_num_threads(1)
     torch.manual_seed(seed)

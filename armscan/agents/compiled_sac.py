@@ -128,7 +128,7 @@ class CompiledSAC(sac.SAC[Any]):
 
 
 def why_tianshou(algorithm: sac.SAC[Any], compute: Compute, replay: ReplayBuffer) -> str | None:
-    """Return why the updates of an algorithm are left to Tianshou; None where they can be compiled."""
+    """Return why the updates of an algorithm are left to Tianshou; None if they can be compiled."""
     optimisers: list[Any] = [*algorithm._optimizers]
     entropy = [algorithm.alpha._optim] if isinstance(algorithm.alpha, sac.AutoAlpha) else []
     sizes = [layer_sizes(network) for network in (algorithm.policy.actor, algorithm.critic, algorithm.critic2)]

@@ -101,7 +101,7 @@ def check_collection(n_asked: int, num_envs: int, setup: AgentSetup, *, learning
 
 
 def check_updates(utd_ratio: float, setup: AgentSetup, *, learning_starts: int = 0) -> None:
-    """Raise `InvalidValueError` where a whole training would come to no gradient step."""
+    """Raise `InvalidValueError` if a whole training would come to no gradient step."""
     n_left = setup.total_env_steps - learning_starts
     if utd_ratio * n_left < 1:
         raise InvalidValueError(

@@ -126,7 +126,7 @@ class _ImageStore:
         self.forget_last()
 
     def forget_last(self) -> None:
-        """Forget which frames every environment has shown last."""
+        """Forget the last frames of every environment."""
         self._last: list[Seen] = [[] for _ in range(self._n_envs)]
 
     def take_in(self, env: int, image: Pixels, image_next: Pixels) -> tuple[list[int], list[int]]:

@@ -100,7 +100,7 @@ class Inference:
 
 
 def _layers_of(actor: nn.Module) -> list[nn.Module] | None:
-    """Return the layers of an actor's mean, None where they are not all linear or ReLU."""
+    """Return the layers of an actor's mean, None if they are not all linear or ReLU."""
     if type(actor) is not ContinuousActorProbabilistic or type(actor.preprocess) is not Net:
         return None
     layers = [*actor.preprocess.model.model, *actor.mu.model]

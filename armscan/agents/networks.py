@@ -134,7 +134,7 @@ def linear_weights(sizes: Sequence[int]) -> int:
 
 
 def check_weights(network: Network, n_weights: int) -> None:
-    """Raise `InvalidValueError` where a network has too many weights."""
+    """Raise `InvalidValueError` if a network has too many weights."""
     if n_weights > MOST_WEIGHTS:
         raise InvalidValueError(
             f"network is {type(network).__name__.lower()} with {n_weights} weights, but there must be at most "

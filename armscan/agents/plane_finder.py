@@ -58,7 +58,7 @@ class PlaneFinder(FinderParameters):
 
 
 def check_observed(space: spaces.Space[Any], n_looks: int) -> None:
-    """Raise `InvalidValueError` where observations are not stacks of as many looks, with images and actions."""
+    """Raise `InvalidValueError` if observations are not stacks of as many looks, with images and actions."""
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
     for part, choice in PARTS.items():
         if part not in parts:

@@ -24,7 +24,7 @@ class Replay(VectorReplayBuffer):
     """At most `total_size` transitions of `buffer_num` environments, each environment's in a ring of its own."""
 
     def hasnull(self) -> bool:
-        """Say that nothing is NaN.
+        """Return False: nothing is NaN.
 
         Tianshou's collectors ask at every collection, and searching all that is kept costs more the fuller it is; the
         environment's observations are clipped counts and finite by construction.
@@ -56,7 +56,7 @@ class Replay(VectorReplayBuffer):
         return places, returns, lengths, starts + self._offset[ids]
 
     def seed(self, seed: int) -> None:
-        """Seeds the drawing of samples; every ring has a generator of its own, all with the same seed as they come."""
+        """Seed the drawing of samples; every ring has a generator of its own, all with the same seed."""
         children = np.random.SeedSequence(seed).spawn(1 + len(self.buffers))
         for ring, child in zip((self, *self.buffers), children, strict=True):
             ring._random_state.seed(child.generate_state(1))

@@ -76,7 +76,7 @@ class TianshouVectorEnv(BaseVectorEnv):
         return observations, rewards, terminated, truncated
 
     def seed(self, seed: int | list[int] | None = None) -> list[list[int] | None]:
-        """Seeds the next reset and the random actions, from a seed for each environment."""
+        """Seed the next reset and the random actions, with a seed for each environment."""
         assert isinstance(seed, list)
         self._seeds = list(seed)
         for space, one_seed in zip(self._action_spaces, seed, strict=True):

@@ -135,7 +135,7 @@ class TianshouLearner(BaseLearner):
         return metrics
 
     def _begin_epoch(self) -> None:
-        """Begin episodes anew, and everything that is drawn; the learning rates are those of this moment."""
+        """Restart episodes and random numbers, with the current learning rates."""
         self._replay.cut_off()
         for_numpy, for_replay, for_envs = self._epoch_seeds()
         # Tianshou shuffles with NumPy's global generator.

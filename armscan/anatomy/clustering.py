@@ -186,7 +186,7 @@ def bounding_boxes(slice_xz: Pixels) -> IntArray:
 def _cluster(
     slice_xz: Pixels, label: int, box: IntArray, half_widths: IntArray, min_samples: int
 ) -> tuple[Pixels, RunArray, IntArray]:
-    """Clusters a label's pixels, all in the box: their mask and clusters in it.
+    """Cluster a label's pixels, all in the box; return their mask and clusters in it.
 
     Last, for each cluster, noise at the end, the number of its pixels and the sums of their rows and columns.
     """
@@ -227,7 +227,7 @@ def _cluster(
 def cluster_label(
     slice_xz: Pixels, label: int, half_widths: IntArray, min_samples: int
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], IntArray]:
-    """Clusters the pixels of a label as scikit-learn's DBSCAN does their coordinates in row-major order.
+    """Cluster the pixels of a label as scikit-learn's DBSCAN does with their coordinates in row-major order.
 
     Args:
         slice_xz: Labels of the slice, indexed [across, depth].

@@ -16,7 +16,7 @@ from armscan.volumes.labelmap import TISSUE_LABELS
 
 Landmarks = NDArray[np.float64]
 """Summary of a slice, shape (3, 4): a row for bones, tendons and artery, each with the number of clusters, the number
-of pixels in them, and the mean of the clusters' centres, (across, depth) in pixels, 0 where there is no cluster."""
+of pixels in them, and the mean of the clusters' centres, (across, depth) in pixels, 0 if there is no cluster."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class TissueClusters:
         tissues: str | Tissues = PIXEL_TISSUES,
         pixel_mm: tuple[float, float] = USUAL_PIXEL_MM,
     ) -> Self:
-        """Clusters a slice of labels, indexed [across, depth].
+        """Cluster a slice of labels, indexed [across, depth].
 
         Args:
             slice_xz: Integer labels of the slice, indexed [across, depth].
@@ -94,7 +94,7 @@ class TissueClusters:
 def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) -> dict[str, float]:
     """Return the Dice coefficient of each landmark tissue in two slices of one shape, by its name.
 
-    It is twice the pixels that both have of the tissue, over the pixels that either has: 1 where they are the same, 0
+    It is twice the pixels that both have of the tissue, over the pixels that either has: 1 if they are the same, 0
     where none is shared. Where neither slice shows the tissue, they agree: 1.
 
     Args:
@@ -120,7 +120,7 @@ def nerve_area_error(
         pixel_mm: Pixel size of both slices, (across, depth) in mm.
 
     Returns:
-        The two, at least 0; None and None where the reference shows no nerve.
+        The two, at least 0; None and None if the reference shows no nerve.
     """
     shown, wanted = (int(np.count_nonzero(each == TISSUE_LABELS["nerve"])) for each in (slice_xz, reference_xz))
     if wanted == 0:

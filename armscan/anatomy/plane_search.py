@@ -88,7 +88,7 @@ class PlaneGrid:
         return pose
 
     def rewards(self, judge: PlaneScorer) -> FloatArray:
-        """Return the reward of each plane; -1 where no plane within the bounds of an action has the pose."""
+        """Return the reward of each plane; -1 if no plane within the bounds of an action has the pose."""
         rewards = np.full(self.shape, -1.0)
         for index in np.ndindex(self.shape):
             plane = plane_at(judge.volume, self.pose(np.array(index)))

@@ -36,7 +36,7 @@ class LandmarkReward:
     """The published reward: 0 where every landmark is there and in its place.
 
     The mean of three terms, each 0 at best: how far the cluster counts are from their targets (over the targets' sum),
-    the share of tissues with no cluster, and 1 where the tendons are not between the bones and the single artery in
+    the share of tissues with no cluster, and 1 if the tendons are not between the bones and the single artery in
     depth.
 
     Args:
@@ -185,7 +185,7 @@ class Range(NamedTuple):
 
 
 def _features(landmarks: Landmarks, pixel_mm: tuple[float, float]) -> list[float | None]:
-    """Areas of bones, tendons and artery in mm2; distances in mm of tendons and artery from the bones; None: absent."""
+    """Return areas of bones, tendons, artery in mm2, distances of tendons, artery from bones in mm; None: absent."""
     across_mm, depth_mm = pixel_mm
     bones, *others = landmarks.tolist()
     features: list[float | None] = [n_pixels * across_mm * depth_mm for _, n_pixels, _, _ in (bones, *others)]

@@ -57,7 +57,7 @@ def _look_all(
     slices: Pixels,
     landmarks: FloatArray,
 ) -> None:
-    """As `_look`, for the planes i of the volumes `which[i]`; row i of `slices` begins with the pixels of slice i."""
+    """Look at the planes i of the volumes `which[i]`, as `_look`; row i of `slices` begins with slice i."""
     rules = spacings_mm, tissue_labels, half_widths, min_samples
     for i in range(which.size):
         labels_xyz = volumes[which[i]]
@@ -119,7 +119,7 @@ class Scanner:
     def look_all(
         self, which: IntArray, matrices: FloatArray, offsets_mm: FloatArray
     ) -> tuple[list[Pixels], FloatArray]:
-        """Look at n planes on as many threads as NUMBA_NUM_THREADS says, default: one for each core.
+        """Look at n planes on NUMBA_NUM_THREADS threads; default: one for each core.
 
         Args:
             which: Index of each plane's volume, shape (n,).

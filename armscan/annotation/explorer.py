@@ -88,12 +88,12 @@ class Explorer:
         self.go_to(ManipulatorAction((0.0, 0.0), (0.0, along_mm / 2)))
 
     def next_volume(self, n_further: int = 1) -> None:
-        """Go to the volume that comes `n_further` after the current one, in a circle."""
+        """Go to the volume `n_further` places after the current one, in a circle."""
         names = list(self.volumes)
         self.choose(names[(names.index(self.volume.name) + n_further) % len(names)])
 
     def go_to_optimum(self) -> None:
-        """Go to the optimal plane, where one is known."""
+        """Go to the optimal plane, if it is known."""
         if self.optimum is not None:
             self.go_to(self.optimum)
 
@@ -196,7 +196,7 @@ def explore(
 
 
 def reachable_optimum(volume: LabelVolume) -> ManipulatorAction | None:
-    """Return a volume's optimal plane with its origin within the volume, None where there is none of that kind."""
+    """Return a volume's optimal plane with its origin within the volume, None if there is none of that kind."""
     sampler = SceneSampler(rotation_bounds_deg=(BOUND_DEG, BOUND_DEG), translation_bounds_mm=None, transform=None)
     try:
         return sampler.unmoved(volume).optimum

@@ -130,7 +130,7 @@ storage_option = partial(
 
 
 def import_from_here() -> None:
-    """Let classes of the user's own be imported from the current folder, as `python -m` does."""
+    """Allow imports of the user's own classes from the current folder, as `python -m` does."""
     sys.path.insert(0, str(Path.cwd()))
 
 

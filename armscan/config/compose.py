@@ -79,7 +79,7 @@ class OwnFolders(SearchPathPlugin):
 
 @functools.cache
 def _print_replaced(names: tuple[str, ...]) -> None:
-    """Say once which of armscan's own files are not used."""
+    """Print once which of armscan's own files are not used."""
     if names:
         more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
         print(f"using {', '.join(names[:MAX_NAMED])}{more} instead of armscan's own", file=sys.stderr)

@@ -99,7 +99,7 @@ def untrusted_word(words: Sequence[str], uri: str) -> str | None:
 
 
 def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
-    """Raise `UntrustedError` where a stored command line could execute code, or send results elsewhere.
+    """Raise `UntrustedError` if a stored command line could execute code, or send results elsewhere.
 
     Args:
         words: Overrides of the command line.
@@ -114,7 +114,7 @@ def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
 
 
 def check_stored_address(uri: str) -> None:
-    """Raise `UntrustedError` where a stored address would be sent a password that is meant for another server."""
+    """Raise `UntrustedError` if a stored address would be sent a password that is meant for another server."""
     secrets = [name for name in SERVER_SECRETS if os.environ.get(name)]
     if uri.startswith("http") and secrets and uri != default_tracking()["uri"]:
         raise UntrustedError(f"{uri} would be sent this user's {secrets[0]}: give --tracking {uri} if it is yours")

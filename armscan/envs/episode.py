@@ -93,7 +93,7 @@ def info_of(episode: Episode) -> dict[str, Any]:
 
 
 def begin(rules: Rules, rngs: Sequence[np.random.Generator], volume_names: Sequence[str | None]) -> list[Episode]:
-    """Begin an episode for each generator, which everything of it is drawn from.
+    """Begin an episode for each generator, the source of all its random numbers.
 
     The episodes have been started but not seen: their first planes are still to be looked at.
 
@@ -138,7 +138,7 @@ def check_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def wanted_volume(rules: Rules, options: Any) -> str | None:
-    """Return the volume that the options of a reset name, None where they name none; refuse all other options."""
+    """Return the volume that the options of a reset name, None if they name none; refuse all other options."""
     if options is None:
         return None
     if not isinstance(options, dict):

@@ -114,7 +114,7 @@ class ClusterObservation:
     """For each tissue (bones, tendons, artery): clusters, clustered pixels, mean of the centres; shape (12,).
 
     Normalised, the counts are over their targets, the pixels over the tissue's usual area, and the centre is in mm
-    from the slice's middle over (25, 12) mm, 0 where the tissue is absent: all near [-1, 1]. Raw, they are the plain
+    from the slice's middle over (25, 12) mm, 0 if the tissue is absent: all near [-1, 1]. Raw, they are the plain
     numbers, the centre in pixels. Agents learn in a minute with the normalised form what they never learn with the raw.
 
     Args:

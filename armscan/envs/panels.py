@@ -129,7 +129,7 @@ def side_panels(
 
 
 def _first_seen(labels_xyz: NDArray[np.uint8], axis: int) -> NDArray[np.uint8]:
-    """Return the first label along an axis that is not background, 0 where there is none."""
+    """Return the first label along an axis that is not background, 0 if there is none."""
     first = np.expand_dims((labels_xyz > 0).argmax(axis=axis), axis)
     return np.take_along_axis(labels_xyz, first, axis).squeeze(axis)
 
@@ -183,7 +183,7 @@ def _size(size_mm: tuple[float, float], scale: float) -> Size:
 
 
 def _resized(pixels: NDArray[Pixel], size: Size) -> NDArray[Pixel]:
-    """Pixels, shape (rows, columns, ...), as many as a picture of (width, height) has: the nearest to each of them."""
+    """Return pixels resized to a picture of (width, height) by nearest neighbour, shape (rows, columns, ...)."""
     rows, columns = ((np.arange(n) * 2 + 1) * m // (2 * n) for n, m in zip(size[::-1], pixels.shape[:2], strict=True))
     resized: NDArray[Pixel] = pixels[rows[:, None], columns]
     return resized

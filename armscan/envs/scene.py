@@ -176,7 +176,7 @@ class SceneSampler:
         return scene
 
     def propose(self, volume: LabelVolume, rng: np.random.Generator) -> Scene | None:
-        """Draw a motion of the volume; None where it takes the optimal plane out of the bounds."""
+        """Draw a motion of the volume; None if it takes the optimal plane out of the bounds."""
         return self._scene(volume, self.transform.draw(volume, rng) if self.transform else None)
 
     def _scene(self, volume: LabelVolume, transform: RigidTransform | None) -> Scene | None:

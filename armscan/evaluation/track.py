@@ -99,7 +99,7 @@ def evaluate_and_track(
 
 
 def _check_out(out: Path | None) -> None:
-    """Look whether the JSON file can be written, and would replace nothing but an evaluation."""
+    """Check that the JSON file can be written, and would replace only an evaluation."""
     file = out or FOLDER / "evaluation.json"
     if file.suffix != SUFFIX:
         raise InvalidValueError(f"--out is {str(file)!r}, but it must be a file whose name ends with {SUFFIX}")

@@ -268,7 +268,7 @@ def make_algorithm(config: DictConfig) -> Algorithm:
 
 
 def check_keys(config: DictConfig) -> None:
-    """Raise `InvalidValueError` where a key was added that nothing reads.
+    """Raise `InvalidValueError` if a key was added that nothing reads.
 
     Sections that objects are made of refuse such keys by themselves.
     """
@@ -284,7 +284,7 @@ def check_keys(config: DictConfig) -> None:
 
 
 def check_sections(config: DictConfig) -> None:
-    """Raise `InvalidValueError` where a whole section of the configuration was replaced by a value."""
+    """Raise `InvalidValueError` if a whole section of the configuration was replaced by a value."""
     for section in SECTIONS:
         if not isinstance(config.get(section), DictConfig):
             raise InvalidValueError(

@@ -87,7 +87,7 @@ def _tag(run: Run, name: str) -> str:
 
 
 def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
-    """Raise `UntrustedError` where a grid's command line, or its working folder, may be a stranger's."""
+    """Raise `UntrustedError` if a grid's command line, or its working folder, may be a stranger's."""
     where = f"run {run.info.run_id}"
     check_stored_words(words, uri, where=where)
     # Its `conf/` and `sweeps/` are part of the configuration.
@@ -102,7 +102,7 @@ def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
 def resume_run(
     client: TrackingStore, run_id: str, *, job_label: str | None = None, trust: bool = False
 ) -> dict[str, dict[str, float]]:
-    """Go on with a run; see `resume`. The lines that a job of a multirun prints begin with its label."""
+    """Resume a run; see `resume`. The printed lines of a multirun's job begin with its label."""
     folder = _folder_of(client.get_run(run_id))
     with folder_lock(folder):
         # What it has left because the store was away; it may have ended just before the folder was free.
@@ -189,7 +189,7 @@ def _started_with(run: Run, file: Path, what: str) -> bytes:
 
 
 def _check_last_checkpoint(run: Run, folder: Path) -> None:
-    """Raise `ResumeError` where a training would begin again whose epochs are tracked already."""
+    """Raise `ResumeError` if a training would begin again whose epochs are tracked already."""
     last = folder / LAST_CHECKPOINT
     if not last.exists() and any(name.startswith("validation/") for name in run.data.metrics):
         raise ResumeError(
@@ -199,7 +199,7 @@ def _check_last_checkpoint(run: Run, folder: Path) -> None:
 
 
 def _check_volumes(run: Run, folder: Path, now: Fingerprints) -> None:
-    """Raise `ChangedVolumesError` where a run would go on with other volumes, whether it has a checkpoint or not."""
+    """Raise `ChangedVolumesError` if a run would go on with other volumes, whether it has a checkpoint or not."""
     # Of runs that were started before it was kept, the checkpoint says so.
     if SHA256_TAGS[VOLUMES_FILE] in run.data.tags:
         record = folder / VOLUMES_FILE
@@ -208,7 +208,7 @@ def _check_volumes(run: Run, folder: Path, now: Fingerprints) -> None:
 
 
 def _enter_working_folder(run: Run) -> None:
-    """Go to where the run was started, from where its configuration names files."""
+    """Change to the working folder of the run, from where its configuration names files."""
     folder = _tag(run, "working_folder")
     try:
         os.chdir(folder)

@@ -27,7 +27,7 @@ def best_of(runs: Sequence[Run]) -> Run | None:
 
 
 def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:
-    """Give the run of a grid the leading figures of its best job, in the columns that jobs have them in."""
+    """Log the leading figures of the best job to the run of a grid, in the columns of its jobs."""
     if (best := best_of(jobs)) is None:
         return
     tested = {name.removeprefix(TESTED): value for name, value in best.data.metrics.items() if name.startswith(TESTED)}

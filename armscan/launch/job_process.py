@@ -30,7 +30,7 @@ def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
 
 
 def run_job() -> None:
-    """One job of a multirun, handed over on standard input: a failure is noted, and does not stop the others."""
+    """Run one job of a multirun, passed on standard input; a failure is noted and does not stop the others."""
     on_parent_exit(partial(os.kill, os.getpid(), signal.SIGTERM))
     config, invocation = pickle.load(sys.stdin.buffer)
     job: Job = invocation.job

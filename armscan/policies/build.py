@@ -39,7 +39,7 @@ FIRST_SEED, N_OBSERVED = 6 * 10**6, 8
 
 
 def save_policy(agent: Learner, env: Env, tracked: TrackedRun, folder: Path, tell: Callable[[str], None]) -> None:
-    """Keep the policy of a trained agent as a model of its run, where its configuration does not say otherwise.
+    """Store the policy of a trained agent as a model of its run, unless its configuration disables it.
 
     What cannot be kept stops no run: it is told, and noted in a tag.
     """
@@ -129,7 +129,7 @@ def _played(agent: Learner, env: Env) -> list[tuple[Observed, FloatArray]]:
 
 
 def _check(folder: Path, policy: Policy, played: list[tuple[Observed, FloatArray]]) -> None:
-    """Raise `ExportError` where a model does not answer as the agent did."""
+    """Raise `ExportError` if a model does not answer as the agent did."""
     batch = batch_of([observation for observation, _ in played])
     model = mlflow.pyfunc.load_model(str(folder))
     answers = model.predict(arrays_of(batch))

@@ -42,7 +42,7 @@ NOTHING = Curve(np.empty(0), Band(*[np.empty(0)] * 3), 0, {})
 
 
 def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
-    """Return the curve of a group over one of `AXES`; None where none of its trainings has measured the figure.
+    """Return the curve of a group over one of `AXES`; None if none of its trainings has measured the figure.
 
     Between two validations a seed's line is straight. A training that has run to its end is carried on with its last
     value for as long as others of its group go on; where one has not, the curve ends with it. It begins where all are

@@ -50,7 +50,7 @@ class Difference:
         return abs(self.largest / self.then) if self.largest is not None and self.then else math.inf
 
     def __str__(self) -> str:
-        """Say it in a line."""
+        """Return the difference in one line."""
         if self.largest is None:
             return f"{self.metric}: none of its {self.n_missing} points is there again"
         missing = f"; {self.n_missing} points are not there again" if self.n_missing else ""

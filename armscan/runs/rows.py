@@ -118,12 +118,12 @@ class RunRow:
 
     @property
     def success_rate(self) -> float | None:
-        """Success rate on the test volumes; None where it was not evaluated."""
+        """Success rate on the test volumes; None if it was not evaluated."""
         return self.run.data.metrics.get("test_volumes/success_rate")
 
     @property
     def mean_steps(self) -> float | None:
-        """Mean steps on the test volumes; None where it was not evaluated."""
+        """Mean steps on the test volumes; None if it was not evaluated."""
         return self.run.data.metrics.get("test_volumes/mean_steps")
 
     def unfolded(self, depth: int = 0) -> Iterator[RunRow]:

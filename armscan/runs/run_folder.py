@@ -95,7 +95,7 @@ class OwnFolder:
 
     @contextlib.contextmanager
     def held(self, *, is_planned: bool = False) -> Iterator[None]:
-        """Context in which no other process works in the folder or delivers from it.
+        """Return a context in which no other process works in the folder or delivers from it.
 
         Args:
             is_planned: Whether the removal is only planned: a folder that was never locked is not locked then.

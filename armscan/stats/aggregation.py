@@ -26,7 +26,7 @@ Mean = Callable[..., Any]
 
 
 class Band(NamedTuple):
-    """A figure at several points with its interval at each, shape (points,); the ends are NaN where there is none."""
+    """A figure at several points with its interval at each, shape (points,); the ends are NaN if there is none."""
 
     values: FloatArray
     lows: FloatArray

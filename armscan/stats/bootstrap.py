@@ -31,7 +31,7 @@ Statistic = Callable[[FloatArray], FloatArray]
 
 
 class Estimate(NamedTuple):
-    """A figure, and the interval that it lies in at 95 % confidence; all NaN where nothing was measured."""
+    """A figure, and the interval that it lies in at 95 % confidence; all NaN if nothing was measured."""
 
     value: float
     low: float

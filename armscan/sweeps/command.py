@@ -26,7 +26,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     """Run a study, or show what it would run.
 
     Returns:
-        The exit code: 0 where there is a result, 1 where too many trials failed.
+        The exit code: 0 if there is a result, 1 where too many trials failed.
     """
     given = StudyCommand.read(words)
     silence_library_warnings()

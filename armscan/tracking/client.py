@@ -89,7 +89,7 @@ class TrackingStore:
 
 
 def why_away(error: BaseException) -> str | None:
-    """Return why a store cannot be reached or written to for now; None where an error says anything else."""
+    """Return why a store cannot be reached or written to for now; None if an error says anything else."""
     from mlflow.exceptions import MlflowException
     from requests import RequestException
     from sqlalchemy.exc import DBAPIError, OperationalError

@@ -79,11 +79,11 @@ class FoundRun:
         return stored_config(config, where=f"run {self.run_id}", trust=trust)
 
     def checkpoint(self, folder: Path) -> Path | None:
-        """Return the best checkpoint, fetched into `folder`; None where the run has kept none."""
+        """Return the best checkpoint, fetched into `folder`; None if the run has kept none."""
         return self._fetched(BEST_CHECKPOINT, folder) if BEST_CHECKPOINT in self.files else None
 
     def volumes(self, folder: Path) -> Fingerprints | None:
-        """Return the fingerprints of its volumes; None where the run was made before these were kept."""
+        """Return the fingerprints of its volumes; None if the run was made before these were kept."""
         if SHA256_TAGS[VOLUMES_FILE] not in self.tags:
             return None
         # Deferred: a mistake on the command line is answered before it is loaded.
@@ -191,7 +191,7 @@ def run_of_study(
 
 
 def check_run_id(run_id: str) -> None:
-    """Raise `TrackingError` where a text cannot be an MLflow run ID or its beginning."""
+    """Raise `TrackingError` if a text cannot be an MLflow run ID or its beginning."""
     if not ID.fullmatch(run_id):
         raise TrackingError(
             f"the run is {run_id!r}, but it must be an id as MLflow shows it, or its beginning: up to 32 of 0-9 and a-f"
@@ -199,7 +199,7 @@ def check_run_id(run_id: str) -> None:
 
 
 def check_version(run: Run) -> None:
-    """Raise `TrackingError` where a run was made by a newer version, which may have kept it otherwise, or by none."""
+    """Raise `TrackingError` if a run was made by a newer version, which may have kept it otherwise, or by none."""
     version = run.data.tags.get(VERSION_TAG, armscan.__version__)
     try:
         is_newer = Version(version).release > Version(armscan.__version__).release

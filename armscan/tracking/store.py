@@ -124,7 +124,7 @@ def open_existing_store(uri: str) -> TrackingStore:
 
 
 def _check_is_store(uri: str, database: Path) -> None:
-    """Raise `TrackingError` where a database holds something else, into which MLflow would write its own tables."""
+    """Raise `TrackingError` if a database holds something else, into which MLflow would write its own tables."""
     wanted = "SELECT count(*) FROM sqlite_master WHERE name IN ('alembic_version', 'experiments', 'runs')"
     try:
         with contextlib.closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as connection:
@@ -227,18 +227,18 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
 
 
 def _keep_view(store: TrackingStore, experiment_id: str, tags: Mapping[str, str]) -> None:
-    """Give an experiment the saved view of its runs, unless it has it."""
+    """Add the saved view of runs to an experiment, unless it exists."""
     if tags.get(VIEW_TAG) != VIEW:
         store.set_experiment_tag(experiment_id, VIEW_TAG, VIEW)
 
 
 def check_artifacts(store: TrackingStore, experiment_id: str) -> None:
-    """Raise `TrackingError` where the artifacts of an experiment cannot be written."""
+    """Raise `TrackingError` if the artifacts of an experiment cannot be written."""
     _check_writable(store.get_experiment(experiment_id).artifact_location)
 
 
 def _check_writable(location: str | None) -> None:
-    """Raise `TrackingError` where the artifacts are files of this machine, and cannot be written."""
+    """Raise `TrackingError` if the artifacts are files of this machine, and cannot be written."""
     # A server is asked when it is given the first file; what it does not take stays in the folder of the run.
     if location is None or not location.startswith("file:"):
         return

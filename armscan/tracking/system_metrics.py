@@ -28,7 +28,7 @@ class SystemMetrics:
         self._thread.start()
 
     def finish(self) -> None:
-        """Look once more, and end the thread."""
+        """Measure once more, and end the thread."""
         self._is_over.set()
         self._thread.join()
 

@@ -213,7 +213,7 @@ def is_known(estimate: Estimate) -> bool:
 
 
 def interval_text(estimate: Estimate, form: str) -> str:
-    """Return an interval such as `1.5–2.0`; empty where there is none."""
+    """Return an interval such as `1.5–2.0`; empty if there is none."""
     if math.isnan(estimate.low):
         return ""
     low, high = (form.format(end).removesuffix("%") for end in estimate[1:])

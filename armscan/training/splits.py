@@ -73,7 +73,7 @@ def phantom_data(
     cache_dir: str | None = None,
     version: int = 1,
 ) -> Split:
-    """Phantom wrists; those for validation and test come from seeds that no training phantom has.
+    """Make phantom wrists; validation and test have seeds that no training phantom has.
 
     Args:
         n_training: Number of phantoms to train on, 1 or more. Default: 16.
@@ -148,7 +148,7 @@ def mixed_data(
     folds: int | str | None = None,
     fold: int | None = None,
 ) -> Split:
-    """Volumes of a folder, split by subject, and phantom wrists beside those to train on.
+    """Split the volumes of a folder by subject, and add phantom wrists to the training volumes.
 
     Args:
         path: Folder of the volumes.

@@ -15,7 +15,7 @@ def log(text: str) -> None:
 
 
 def silence_library_warnings() -> None:
-    """Keep warnings of libraries that a user can do nothing about off the screen."""
+    """Hide warnings of libraries that a user cannot act on."""
     for message in (
         "Gym has been unmaintained",
         ".*is an experimental feature.*",

@@ -105,7 +105,7 @@ class RetryPolicy:
 
 @contextmanager
 def no_retry() -> Iterator[None]:
-    """Context in which this thread retries nothing: `RetryPolicy.call` raises `AwayError` at once."""
+    """Return a context in which this thread does not retry: `RetryPolicy.call` raises `AwayError` at once."""
     before = getattr(_this_thread, "no_retry", False)
     _this_thread.no_retry = True
     try:

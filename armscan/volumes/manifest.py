@@ -48,7 +48,7 @@ def volume_files(folder: Path) -> dict[str, Path]:
 
 
 def find_manifest(folder: Path) -> Path | None:
-    """Return the one manifest of a folder, None where there is none."""
+    """Return the one manifest of a folder, None if there is none."""
     found = [folder / name for name in MANIFEST_NAMES if (folder / name).exists()]
     if len(found) > 1:
         raise ManifestError(f"{folder}: holds {' and '.join(path.name for path in found)}, but one manifest is allowed")

@@ -76,7 +76,7 @@ class VolumeEntry(_Settings):
 
     @property
     def plane(self) -> ManipulatorAction | None:
-        """The labelled plane, None where the entry has none."""
+        """The labelled plane, None if the entry has none."""
         if self.rotation is None or self.translation is None:
             return None
         return ManipulatorAction((self.rotation[0], self.rotation[1]), (self.translation[0], self.translation[1]))

@@ -171,7 +171,7 @@ def shift_into(action: ManipulatorAction, bounds_mm: tuple[float, float]) -> Man
     """Slide the plane's origin along the plane until (tx, ty) lies in [0, bounds_mm], by the shortest way.
 
     Returns:
-        The same plane with its picture shifted across, or None where the plane misses the box altogether.
+        The same plane with its picture shifted across, or None if the plane misses the box altogether.
     """
     direction = action.matrix[:2, 0].tolist()
     lowest, highest = -np.inf, np.inf

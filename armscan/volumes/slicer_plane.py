@@ -113,7 +113,7 @@ def _shown(markup: dict[str, Any], path: Path) -> Plane | None:
 
 
 def _stated(markup: dict[str, Any], path: Path) -> Plane | None:
-    """Return the plane by its centre and normal, None where the file has no such keys."""
+    """Return the plane by its centre and normal, None if the file has no such keys."""
     if "center" not in markup or "normal" not in markup:
         return None
     return _numbers(markup, "center", 3, path), _unit(_numbers(markup, "normal", 3, path), "normal", path)

@@ -91,7 +91,7 @@ class LabelVolume:
         return self
 
     def __deepcopy__(self, _: dict[int, object]) -> Self:
-        """Volumes are constant, and large: Gymnasium copies the arguments of every environment it makes, deeply."""
+        """Return this volume: volumes are constant and large, and Gymnasium copies arguments deeply."""
         return self
 
     def __repr__(self) -> str:
@@ -150,7 +150,7 @@ class LabelVolume:
             transform: Motion of the volume, which slices V'(q) = V(T(q)). None: the volume as it is.
 
         Returns:
-            The slice, indexed [across, depth], uint8; 0 where the plane is outside the volume.
+            The slice, indexed [across, depth], uint8; 0 if the plane is outside the volume.
 
         Raises:
             InvalidValueError: If `shape` is not two whole numbers from 1 to 65536, or another argument of another type.

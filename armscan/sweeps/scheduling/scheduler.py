@@ -118,7 +118,7 @@ class TrialScheduler:
         return self.stopped
 
     def go_on(self) -> bool:
-        """Let the study go on because it is started again; returns whether it was stopped."""
+        """Resume a stopped study that is started again; return whether it was stopped."""
         was_stopped = bool(self.look_for_stop())
         if was_stopped:
             self.study.set_user_attr(STOP, "")

@@ -113,7 +113,7 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
 
 @contextmanager
 def _named(chosen: Mapping[str, Value]) -> Iterator[None]:
-    """Say in an error which values are not allowed."""
+    """Name the values in an error that are not allowed."""
     try:
         yield
     except (ArmscanError, HydraException, OmegaConfBaseException, ValueError) as error:

@@ -55,7 +55,7 @@ class Constraint:
         return f"{self.metric} {'<=' if self.is_upper else '>='} {self.bound:g}"
 
     def violation(self, metrics: Mapping[str, float]) -> float:
-        """Return by how much metrics violate it, as a share of the bound: at most 0 where they do not.
+        """Return by how much metrics violate it, as a share of the bound: at most 0 if they do not.
 
         As a share, because Optuna's samplers add up the violations of all constraints. A metric that is no number
         violates it infinitely.

@@ -92,7 +92,7 @@ def _worked(study_input: bytes, directory: str, log_file: BinaryIO, notice: Noti
 
 
 def keep_gpus() -> None:
-    """Keep which GPUs this process may use, for workers whose launcher would hide them."""
+    """Store the GPUs that this process may use, for workers whose launcher would hide them."""
     os.environ[KEPT_GPUS] = os.environ.get(GPUS, ALL_GPUS)
 
 

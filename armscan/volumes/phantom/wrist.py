@@ -53,7 +53,7 @@ def _ovoid(rng: np.random.Generator, centre: tuple[float, float, float], radii: 
 
 
 def _forearm_bones(rng: np.random.Generator) -> Iterator[Tube]:
-    """Radius and ulna, each a shaft that widens towards the wrist, with its styloid process."""
+    """Return radius and ulna, each a shaft that widens towards the wrist, with its styloid process."""
     wide = rng.uniform(0.93, 1.07)
     y_radius = 27.0 + rng.normal(0.0, 0.7)
     yield Tube.cord(
@@ -81,7 +81,7 @@ def _forearm_bones(rng: np.random.Generator) -> Iterator[Tube]:
 
 
 def _proximal_row(rng: np.random.Generator) -> Iterator[Tube]:
-    """Scaphoid, lunate, triquetrum and, before it, the pisiform."""
+    """Return scaphoid, lunate, triquetrum and, before it, the pisiform."""
     yield _ovoid(rng, (-16.0, 18.0, 1.0), (6.6, 6.6, 6.2))
     yield _ovoid(rng, (-2.5, 19.3, -1.0), (5.6, 6.2, 6.6))
     yield _ovoid(rng, (9.3, 18.3, -1.5), (4.9, 5.8, 5.2))
@@ -89,7 +89,7 @@ def _proximal_row(rng: np.random.Generator) -> Iterator[Tube]:
 
 
 def _distal_row(rng: np.random.Generator) -> Iterator[Tube]:
-    """Trapezium, trapezoid, capitate, and the hamate with its hook."""
+    """Return trapezium, trapezoid, capitate, and the hamate with its hook."""
     yield _ovoid(rng, (-24.5, 0.0, 4.5), (7.2, 11.0, 6.6))
     yield _ovoid(rng, (-10.8, 0.0, -1.0), (4.8, 10.8, 6.2))
     yield _ovoid(rng, (0.6, 0.5, -1.0), (5.0, 11.2, 7.6))
@@ -98,7 +98,7 @@ def _distal_row(rng: np.random.Generator) -> Iterator[Tube]:
 
 
 def _finger_bones(rng: np.random.Generator, spread: float) -> Iterator[Tube]:
-    """Five metacarpals and the phalanges beyond them."""
+    """Return five metacarpals and the phalanges beyond them."""
     base_x = (-27.5, -12.5, -0.8, 9.6, 19.2)
     base_z = (6.5, 0.0, -0.5, -0.3, 0.5)
     base_radius = (5.2, 4.7, 4.7, 4.2, 4.2)
@@ -116,7 +116,7 @@ def _finger_bones(rng: np.random.Generator, spread: float) -> Iterator[Tube]:
 
 
 def _accessory_bones(rng: np.random.Generator) -> Iterator[Tube]:
-    """Small bones on both sides of the carpus, before and behind the tunnel: a plane that is tilted meets them."""
+    """Return small bones on both sides of the carpus, before and behind the tunnel, which a tilted plane meets."""
     for x, z in ((-35.5, 10.0), (-36.0, -1.0), (27.0, 8.0), (27.5, -3.0)):
         yield _ovoid(rng, (x, -16.5, z), (2.8, 7.2, 3.4))
     for x, z in ((-32.0, 8.5), (-32.0, -3.0), (27.0, 6.0), (26.0, -5.0)):
@@ -130,7 +130,7 @@ def _beyond(joint: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 def _tendons(rng: np.random.Generator, spread: float) -> Iterator[Tube]:
-    """Five flexor tendons: one to each finger, three groups in the tunnel, bundles in the forearm.
+    """Return five flexor tendons: one to each finger, three groups in the tunnel, bundles in the forearm.
 
     Within the tunnel the thumb's runs with the index finger's and the ring finger's with the little finger's. On the
     way to the forearm all close up into one bundle, which parts again, further up, into a deep and a superficial one.
