@@ -164,6 +164,10 @@ def print_result(opened: OpenedStudy) -> int:
     if wrong:
         print(printable(f"error: {wrong}"), file=sys.stderr)
         return 1
+    if scheduler.termination is not None and (ended := scheduler.termination.reason):
+        print(printable(f"the study has ended by itself: {ended}; study.n_trials or study.terminator change that"))
+    if settings.constraints and state.finished and not best_trials(scheduler.study, 1):
+        print(f"no trial keeps all constraints: {', '.join(map(str, settings.constraints))}")
     table = Table("trial", *settings.objectives, "values", title="best while searching", title_justify="left")
     for trial in best_trials(scheduler.study, max(1, settings.final_eval.top_k)):
         table.add_row(

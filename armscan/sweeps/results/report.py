@@ -30,6 +30,7 @@ from armscan.sweeps.scheduling.state import (
     env_steps_of,
     is_feasible,
 )
+from armscan.sweeps.scheduling.termination import REASON, TERMINATED
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.reports import reports_of
 from armscan.sweeps.study.study import best_trials
@@ -102,11 +103,14 @@ def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Seq
     n_infeasible = sum(not is_feasible(trial) for trial in state.finished)
     taken = f"; {len(state.taken)} were taken from other studies" if state.taken else ""
     violating = f", {n_infeasible} infeasible" if n_infeasible else ""
+    ended = study.user_attrs.get(TERMINATED, {}).get(REASON)
     text = (
         f"{len(state.finished)} trials finished, {n_pruned} of them pruned{violating}; {len(state.running)} running, "
         f"{len(state.failed)} failed, {len(state.retried)} retried after their worker died{taken}. "
         f"{state.env_steps:,} environment steps, {state.busy_hours:.2g} hours."
     )
+    if ended:
+        text += f" The study has ended by itself: {html.escape(ended)}."
     if best:
         values = zip(objectives, best[0].values, strict=True)
         said = "; ".join(f"{title_of(name)} {value_text(name, value)}" for name, value in values)

@@ -31,15 +31,25 @@ from armscan.sweeps.scheduling.state import (
     TrialOutcome,
     env_steps_of,
 )
+from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.storage import Storage
 
 
 class TrialScheduler:
     """Scheduler of the trials of a study; unless it is open, it makes none, and only enqueued ones are run."""
 
-    def __init__(self, study: optuna.Study, storage: Storage, limits: Limits, *, is_open: bool = True) -> None:
+    def __init__(
+        self,
+        study: optuna.Study,
+        storage: Storage,
+        limits: Limits,
+        *,
+        is_open: bool = True,
+        termination: Termination | None = None,
+    ) -> None:
         self.study, self.storage = study, storage
         self.limits, self._is_open = limits, is_open
+        self.termination = termination
         # Who asked the study to stop, as far as this process knows; see `look_for_stop`.
         self.stopped = ""
 
@@ -101,6 +111,8 @@ class TrialScheduler:
             return f"{len(state.finished)} trials have finished"
         if broken := self.broken(state):
             return broken
+        if self.termination is not None and (reason := self.termination.reason):
+            return reason
         if self.stopped:
             return f"the study was stopped {self.stopped}"
         if not self._is_open and not state.waiting:
@@ -111,6 +123,11 @@ class TrialScheduler:
         """See `Limits.broken`; failures before the last restart are ignored."""
         reset = self.study.user_attrs.get(RESET_FAILURES, ()) if state.failed else ()
         return self.limits.broken(state, reset)
+
+    def look_for_end(self, state: StudyState | None = None) -> None:
+        """Look whether the study ends before its last trial; see `Termination.look`."""
+        if self.termination is not None:
+            self.termination.look(state or self.state())
 
     def look_for_stop(self) -> str:
         """Return the user who stopped the study; an empty string if it was not stopped."""

@@ -51,6 +51,7 @@ class StudyAttributes(_Attributes):
     mlflow_run: Text = ""
     stop: Text = ""
     forgiven: list[Number] = Field(default=[], description="a list of numbers of trials")
+    terminated: dict[str, Text] = Field(default={}, description="texts by their names")
     begun_with: list[Text] = Field(default=[], description="a list of texts")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import optuna
 from hydra.errors import HydraException, InstantiationException
@@ -25,8 +25,10 @@ from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.samplers import CmaEsSampler
 from armscan.sweeps.study.settings import StudySettings
+from armscan.sweeps.study.terminators import Terminator
 from armscan.sweeps.tasks.attempt import Task, composed, of_run
 
+TERMINATOR_MEMBERS = ("check", "reason")
 TASK_MEMBERS = ("metrics", "final_metric", "check", "run", "evaluate")
 
 
@@ -57,6 +59,8 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
             "give study/sampler=cmaes"
         )
     make("pruner", settings.pruner, BasePruner)
+    if settings.terminator is not None:
+        make_terminator(settings).check(len(settings.objectives), len(settings.seeds))
     for name, folder in (("folder", settings.folder), ("artifacts", settings.artifacts)):
         path = Path(folder).absolute()
         there = next(each for each in (path, *path.parents) if each.exists())
@@ -88,6 +92,16 @@ def make(name: str, described: Mapping[str, Any], kind: type[Any], **arguments: 
     if not isinstance(made, kind):
         raise InvalidValueError(f"study.{name} is {described['_target_']}, but it must be a {name} of Optuna")
     return made
+
+
+def make_terminator(settings: StudySettings) -> Terminator:
+    """Return the terminator of a study that has one; raise `InvalidValueError` if it describes none."""
+    assert settings.terminator is not None
+    terminator: Any = make("terminator", settings.terminator, object)
+    if missing := [name for name in TERMINATOR_MEMBERS if not hasattr(terminator, name)]:
+        target = settings.terminator["_target_"]
+        raise InvalidValueError(f"study.terminator is {target}, which has no {missing[0]}, as a terminator must")
+    return cast(Terminator, terminator)
 
 
 def check_space(settings: StudySettings, task: Task, words: Sequence[str], config: DictConfig) -> None:

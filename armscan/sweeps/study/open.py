@@ -16,9 +16,11 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from armscan.config.defaults import to_plain
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import FINAL_SEED, Limits
+from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX, check_trials
-from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.storage.storage import Storage, open_storage
+from armscan.sweeps.study.components import make_terminator
 from armscan.sweeps.study.constraints import constrained
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.settings import StudySettings
@@ -159,7 +161,7 @@ def open_for_work(
     objectives = tuple(settings.objectives)
     search = Phase(
         name=settings.name,
-        scheduler=TrialScheduler(study, storage, settings),
+        scheduler=TrialScheduler(study, storage, settings, termination=_termination(settings, study, storage)),
         space=settings.space,
         objectives=objectives,
         reported=objectives,
@@ -175,6 +177,13 @@ def open_for_work(
     )
     final_eval = _final_phase(search, settings, task) if settings.final_eval.top_k else None
     return OpenedStudy(settings=settings, config=config, search=search, final_eval=final_eval)
+
+
+def _termination(settings: StudySettings, study: optuna.Study, storage: Storage) -> Termination | None:
+    if settings.terminator is None:
+        return None
+    terminator, objectives = make_terminator(settings), list(settings.objectives)
+    return Termination(study, storage, lambda state: terminator.reason(study, objectives, state), settings.asked)
 
 
 def _final_phase(search: Phase, settings: StudySettings, task: Task) -> Phase:

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from armscan.errors import printable
 from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.warm_start import Beginning
@@ -54,7 +55,10 @@ def print_plan(settings: StudySettings, study: optuna.Study | None, begins: Sequ
     seconds = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
     files = [file for file in Path(settings.folder).rglob("*") if file.is_file()]
     mean_s, spent_mib = sum(seconds) / len(seconds), sum(file.stat().st_size for file in files) / BYTES_A_MIB
-    left = max(0, settings.n_trials - done)
+    ended = ended_because(study, settings.asked) if study is not None else None
+    left = 0 if ended else max(0, settings.n_trials - done)
+    if ended:
+        console.print(printable(f"ended      {ended}"), markup=False, highlight=False)
     hours = (left + n_final / max(1, len(settings.seeds))) * mean_s / settings.workers / 3600
     console.print(
         f"cost       {sum(seconds) / 3600:.2f} hours of workers, {state.busy_hours:.2f} hours in all, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Mapping
@@ -101,6 +102,7 @@ class StudySettings(Limits):
         constraints: Bounds that metrics of a trial must keep. Default: none.
         sampler: Config of an Optuna sampler, which Hydra instantiates with a seed.
         pruner: Config of an Optuna pruner, which Hydra instantiates.
+        terminator: Config of a `Terminator`, which Hydra instantiates. Default: None, to run every trial.
         prune_after_env_steps: Environment steps of a trial before it may be pruned, 1 or more.
         warm_start: Names of studies of the same storage that provide the first trials. Default: none.
         enqueue: Presets whose settings are tried first; `default` is the study's own configuration. Default: none.
@@ -125,6 +127,7 @@ class StudySettings(Limits):
     )
     sampler: Target
     pruner: Target
+    terminator: Target | None = Field(default=None, description="a section with a _target_, or null")
     prune_after_env_steps: Positive
     warm_start: Annotated[tuple[Other, ...], AfterValidator(_without_repetition)] = Field(
         default=(), strict=False, description="a list of names of studies, none twice"
@@ -152,6 +155,12 @@ class StudySettings(Limits):
                 f"{len(self.objectives)}: give study/pruner=pareto, or study/pruner=none"
             )
         return self
+
+    @property
+    def asked(self) -> str:
+        """What decides whether the study ends before its last trial: where it changes, an ended study goes on."""
+        terminator = dict(self.terminator) if self.terminator is not None else None
+        return json.dumps({"n_trials": self.n_trials, "terminator": terminator}, sort_keys=True)
 
     def check_workers(self, n_cores: int) -> None:
         """Raise `InvalidValueError` if the workers' compute threads are more than the cores of one machine."""

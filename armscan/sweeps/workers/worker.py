@@ -59,6 +59,8 @@ class Worker:
         outcome: TrialOutcome | None = None
         conclude: Callable[[], None] | None = None
         while True:
+            # It may take seconds, in which others claim trials.
+            self._phase.scheduler.look_for_end()
             # One round trip for the trial before and the next: with many workers these add up.
             trial = self._heartbeat.claim(outcome, conclude)
             self._heartbeat.clean_up()
@@ -76,6 +78,7 @@ class Worker:
         while True:
             scheduler.look_for_stop()
             state = scheduler.state()
+            scheduler.look_for_end(state)
             reason = scheduler.end(state)
             # A running trial may yet have to be retried.
             if reason is not None and not state.running:

@@ -12,6 +12,7 @@ from armscan.sweeps.results.report import write_report
 from armscan.sweeps.scheduling import state as names
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, LEASE, METRICS, Limits
+from armscan.sweeps.scheduling.termination import TERMINATED
 from armscan.sweeps.storage.attributes import StudyAttributes, TrialAttributes, check_trials
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, FIXED, SPACE, STUDY_RUN, make_study
@@ -74,7 +75,7 @@ def test_every_attribute_is_checked():
         attempt.CONFIG_SHA256,
     }
     assert set(OF_TRIAL) == ours
-    of_study = {SPACE, FIXED, DASHBOARD_OBJECTIVES, STUDY_RUN, BEGUN_WITH, names.RESET_FAILURES, names.STOP}
+    of_study = {SPACE, FIXED, DASHBOARD_OBJECTIVES, STUDY_RUN, BEGUN_WITH, TERMINATED, names.RESET_FAILURES, names.STOP}
     assert set(StudyAttributes.model_fields) == of_study
 
 
@@ -121,7 +122,7 @@ def test_attribute_of_a_study_of_any_type_is_refused_in_one_line_or_harmless(tmp
         was_refused = is_refused(lambda storage=storage: make_study(storage, settings(), {}))
         assert (
             was_refused
-            or name in (STUDY_RUN, BEGUN_WITH, names.RESET_FAILURES, names.STOP)
+            or name in (STUDY_RUN, BEGUN_WITH, TERMINATED, names.RESET_FAILURES, names.STOP)
             or (name, value) == (FIXED, {})
         )
 

@@ -1,0 +1,63 @@
+"""The end of a study before its last trial: found once, kept in the storage, and the same for every worker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import optuna
+
+from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.storage.storage import Storage
+
+# User attribute of a study: why it has ended, and what was asked of it then.
+TERMINATED = "terminated"
+REASON, ASKED = "reason", "asked"
+
+
+class Termination:
+    """Whether a study has ended before its last trial.
+
+    Args:
+        study: The study in its storage.
+        storage: The storage.
+        find_reason: Returns why a study ends that stands so, None where it goes on. It may take seconds.
+        asked: What is asked of the study, as a text: where it is another than when the study ended, it goes on.
+    """
+
+    def __init__(
+        self, study: optuna.Study, storage: Storage, find_reason: Callable[[StudyState], str | None], asked: str
+    ) -> None:
+        self._study, self._storage = study, storage
+        self._find_reason, self._asked = find_reason, asked
+        # Finished trials at the last look: nothing new can be found without another.
+        self._n_seen = -1
+
+    @property
+    def reason(self) -> str | None:
+        """Why the study has ended; None while it goes on."""
+        return ended_because(self._study, self._asked)
+
+    def look(self, state: StudyState) -> None:
+        """Look whether the study ends, once for each number of finished trials, without holding the lock."""
+        n_seen = len(state.finished)
+        if n_seen == self._n_seen:
+            return
+        self._n_seen = n_seen
+        if self.reason is None and (reason := self._find_reason(state)) is not None:
+            self._storage.exclusive(lambda: self._keep(reason))
+
+    def _keep(self, reason: str) -> None:
+        # Another worker may have found it, too: the first counts.
+        if self.reason is None:
+            self._study.set_user_attr(TERMINATED, {REASON: reason, ASKED: self._asked})
+
+
+def ended_because(study: optuna.Study, asked: str) -> str | None:
+    """Return why a study has ended before its last trial, None where it has not.
+
+    Args:
+        study: The study in its storage.
+        asked: What is asked of it; see `Termination`.
+    """
+    kept = study.user_attrs.get(TERMINATED, {})
+    return kept[REASON] if kept.get(ASKED) == asked and REASON in kept else None

@@ -1,0 +1,140 @@
+"""Terminators: when a study ends before its last trial, because more of them would gain nothing."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from statistics import fmean, variance
+from typing import Protocol
+
+import numpy as np
+import optuna
+from optuna.exceptions import ExperimentalWarning
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, TrialState
+
+from armscan.errors import InvalidValueError
+from armscan.sweeps.scheduling.state import SEEDS, StudyState, is_feasible
+from armscan.sweeps.study.pruners import front_numbers
+
+# Of the trials, the better part that the noise between seeds is measured on: what comes close to the best.
+BETTER_PART = 0.5
+
+
+class Terminator(Protocol):
+    """Says when a study ends."""
+
+    def check(self, n_objectives: int, n_seeds: int) -> None:
+        """Raise `InvalidValueError` where it cannot work for so many objectives and seeds of a trial."""
+
+    def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
+        """Return why the study ends; None while it goes on."""
+
+
+class BelowSeedNoise:
+    """Ends a study when the regret of its best trial is below the noise between seeds.
+
+    The regret is bounded from above with a Gaussian process (Makarova et al. 2022, arXiv:2104.08166), by Optuna's
+    `RegretBoundEvaluator`; the noise is the standard deviation of one training of the better half of the trials.
+
+    Args:
+        min_trials: Trials that run to their end before, at least 2. Default: 20.
+
+    Raises:
+        InvalidValueError: if there are too few.
+    """
+
+    def __init__(self, min_trials: int = 20) -> None:
+        self._min_trials = _at_least(2, "min_trials", min_trials)
+
+    def check(self, n_objectives: int, n_seeds: int) -> None:
+        """See `Terminator.check`."""
+        if n_objectives > 1 or n_seeds < 2:
+            given = f"{n_objectives} objectives" if n_objectives > 1 else "one seed"
+            raise InvalidValueError(
+                f"study.terminator compares one objective with the noise between at least two study.seeds, but the "
+                f"study has {given}: give study/terminator=stagnation"
+            )
+
+    def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
+        """See `Terminator.reason`."""
+        trials = _completed(state)
+        if len(trials) < self._min_trials or (noise := seed_noise(trials, objectives[0], study.direction)) is None:
+            return None
+        # Deferred: it loads torch.
+        from optuna.terminator import RegretBoundEvaluator
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ExperimentalWarning)
+            regret = RegretBoundEvaluator(min_n_trials=self._min_trials, seed=0).evaluate(trials, study.direction)
+        if regret >= noise:
+            return None
+        return (
+            f"after {len(trials)} trials, further ones may gain at most {regret:.3g} in {objectives[0]}, and the noise "
+            f"between seeds is {noise:.3g}"
+        )
+
+
+class Stagnation:
+    """Ends a study when its last trials were no better than those before.
+
+    With several objectives a trial is better if it is on the Pareto front of all, and no trial before is as good.
+
+    Args:
+        n_trials: Trials that ran to their end without being better, at least 1. Default: 30.
+
+    Raises:
+        InvalidValueError: if there are too few.
+    """
+
+    def __init__(self, n_trials: int = 30) -> None:
+        self._n_trials = _at_least(1, "n_trials", n_trials)
+
+    def check(self, n_objectives: int, n_seeds: int) -> None:
+        """See `Terminator.check`."""
+
+    def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
+        """See `Terminator.reason`."""
+        trials = sorted(_completed(state), key=lambda trial: (str(trial.datetime_complete), trial.number))
+        if len(trials) <= self._n_trials:
+            return None
+        signs = [-1.0 if direction == StudyDirection.MAXIMIZE else 1.0 for direction in study.directions]
+        losses, n_before = np.array([trial.values for trial in trials]) * signs, len(trials) - self._n_trials
+        before = np.unique(losses[:n_before], axis=0)
+        # Those that are as good as one before are not better.
+        new = [loss for loss in losses[n_before:] if not (before <= loss).all(axis=1).any()]
+        fronts = front_numbers(np.array([*new, *before]))
+        if (fronts[: len(new)] == 0).any():
+            return None
+        return f"the last {self._n_trials} of {len(trials)} trials were no better than those before"
+
+
+def seed_noise(trials: Sequence[FrozenTrial], objective: str, direction: StudyDirection) -> float | None:
+    """Return the standard deviation of one training between seeds, pooled over the better half of the trials.
+
+    Args:
+        trials: Trials that ran to their end.
+        objective: Name of the metric.
+        direction: Its direction.
+
+    Returns:
+        The standard deviation; None where no trial has two seeds.
+    """
+    ranked = sorted(trials, key=lambda trial: trial.values[0], reverse=direction == StudyDirection.MAXIMIZE)
+    better = ranked[: max(1, round(BETTER_PART * len(ranked)))]
+    of_trials = [[each[objective] for each in trial.user_attrs.get(SEEDS, {}).values()] for trial in better]
+    variances = [variance(values) for values in of_trials if len(values) > 1]
+    return fmean(variances) ** 0.5 if variances else None
+
+
+def _completed(state: StudyState) -> list[FrozenTrial]:
+    trials = (*state.taken, *state.finished)
+    return [trial for trial in trials if trial.state == TrialState.COMPLETE and is_feasible(trial)]
+
+
+def _at_least(least: int, name: str, value: int) -> int:
+    if type(value) is not int or value < least:
+        raise InvalidValueError(
+            f"study.terminator: {name} is {value!r}, but it must be a whole number of at least {least}"
+        )
+    return value
