@@ -1,0 +1,115 @@
+"""Processor time of environment steps beside an earlier checkout, in turn in one run.
+
+    python -m benchmarks.speed.steps --before CHECKOUT [--rounds N] [--threads N]
+
+The default environment, on the four default phantoms, and its vector form, with random actions, resets included; one
+thread. Both checkouts have a process each, which take turns of 2,000 steps of each case; figures are medians over the
+rounds, those of the processor time of the process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parents[2]
+N_STEPS = 2000
+CASES: dict[str, tuple[int, dict[str, Any]]] = {
+    "one environment": (1, {}),
+    "16 side by side": (16, {}),
+    "64 side by side": (64, {}),
+    "16 side by side, full": (16, {"projection": "full"}),
+    "one environment, zy, the last 8 stacked, the best 4 remembered": (1, {"projection": "zy", "stack": 8, "memory": 4}),
+}
+
+
+def main() -> None:
+    """Print the table, or take steps for another process that does."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--before", type=Path, help="another checkout to compare with")
+    parser.add_argument("--rounds", type=int, default=15, help="turns of each (default: 15)")
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.serve:
+        serve()
+        return
+    processes = [_process(each.resolve()) for each in (HERE, given.before) if each]
+    for case in CASES:
+        for process in processes:
+            _ask(process, case)
+    print("| | us a step | before | ratio | least | most |\n| --- | --- | --- | --- | --- | --- |")
+    rounds = [{case: [_ask(each, case) for each in processes] for case in CASES} for _ in range(given.rounds)]
+    for case in CASES:
+        medians = [statistics.median(each[case][which] for each in rounds) for which in range(len(processes))]
+        ratios = sorted(each[case][-1] / each[case][0] for each in rounds)
+        print(
+            f"| {case} | {' | '.join(f'{1e6 * each:.0f}' for each in medians)} | {statistics.median(ratios):.2f} "
+            f"| {ratios[0]:.2f} | {ratios[-1]:.2f} |"
+        )
+    for process in processes:
+        process.stdin.close()
+        process.wait()
+
+
+def _process(checkout: Path) -> Any:
+    return subprocess.Popen(
+        [sys.executable, __file__, "--serve"],
+        env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def _ask(process: Any, case: str) -> float:
+    print(json.dumps(case), file=process.stdin, flush=True)
+    return float(process.stdout.readline())
+
+
+def serve() -> None:
+    """Answer each case that is asked for with the seconds of processor time of a step."""
+    measures: dict[str, Callable[[], None]] = {}
+    for line in sys.stdin:
+        case = json.loads(line)
+        if case not in measures:
+            measures[case] = measured(*CASES[case])
+            measures[case]()
+        start_s = time.process_time()
+        measures[case]()
+        print((time.process_time() - start_s) / N_STEPS, flush=True)
+
+
+def measured(num_envs: int, rules: dict[str, Any]) -> Callable[[], None]:
+    """Return what takes the steps."""
+    # Of the checkout that this process was started for.
+    import gymnasium as gym
+
+    import armscan
+
+    if num_envs > 1:
+        envs: Any = gym.make_vec(armscan.ENV_ID, num_envs=num_envs, **rules)
+    else:
+        envs = gym.make(armscan.ENV_ID, disable_env_checker=True, **rules)
+    envs.action_space.seed(0)
+    actions = [envs.action_space.sample() for _ in range(N_STEPS // num_envs)]
+    envs.reset(seed=0)
+
+    def take_steps() -> None:
+        for action in actions:
+            _, _, terminated, truncated, _ = envs.step(action)
+            if num_envs == 1 and (terminated or truncated):
+                envs.reset()
+
+    return take_steps
+
+
+if __name__ == "__main__":
+    main()
