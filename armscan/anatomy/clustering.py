@@ -144,11 +144,12 @@ def _reached(shape: tuple[int, int], runs: Runs, numbers: RunArray, half_widths:
     reach = half_widths.size - 1
     for row in range(n_rows):
         for run in range(first_run[row], first_run[row + 1]):
+            number, start, stop = numbers[run], starts[run], stops[run] + 1
             for other_row in range(max(0, row - reach), min(n_rows, row + reach + 1)):
                 width = half_widths[abs(other_row - row)]
-                line = reached[other_row, max(0, starts[run] - width) : min(n_cols, stops[run] + width + 1)]
+                line = reached[other_row, max(0, start - width) : min(n_cols, stop + width)]
                 for col in range(line.size):
-                    line[col] = min(line[col], numbers[run])
+                    line[col] = min(line[col], number)
     return reached
 
 
@@ -198,8 +199,9 @@ def _cluster(
     flat = np.zeros((n_rows + 2 * reach) * stride + 2 * margin, dtype=np.uint8)
     mask = flat[reach * stride + margin :][: n_rows * stride].reshape((n_rows, stride))
     for row in range(n_rows):
+        labels, line = slice_xz[row_first + row, col_first : col_first + n_cols], mask[row, :n_cols]
         for col in range(n_cols):
-            mask[row, col] = slice_xz[row_first + row, col_first + col] == label
+            line[col] = labels[col] == label
     if count_disc_pixels(half_widths) < 2**8:
         flat_core = _find_core(flat, stride, margin, half_widths, min_samples, np.uint8(0))
     else:
@@ -212,12 +214,13 @@ def _cluster(
     sums = np.zeros((n_clusters + 1, 3), dtype=np.int64)
     words = mask.view(np.uint64)
     for row in range(n_rows):
-        for word in range(words.shape[1]):
-            if words[row, word] == 0:
+        words_of_row, line, numbers_of_row = words[row], mask[row], clusters[row]
+        for word in range(words_of_row.size):
+            if words_of_row[word] == 0:
                 continue
             for col in range(WORD * word, WORD * word + WORD):
-                if mask[row, col]:
-                    of_cluster = sums[clusters[row, col]]
+                if line[col]:
+                    of_cluster = sums[numbers_of_row[col]]
                     of_cluster[0] += 1
                     of_cluster[1] += row_first + row
                     of_cluster[2] += col_first + col

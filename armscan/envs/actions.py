@@ -50,7 +50,7 @@ class ActionBounds:
         """Return the plane of a normalised vector (rz, rx, tx, ty)."""
         rz, rx, tx, ty = normalised
         (bound_rz, bound_rx), (bound_tx, bound_ty) = self.rotation_deg, self.translation_mm
-        return ManipulatorAction(
+        return ManipulatorAction.of_finite(
             (rz * bound_rz, rx * bound_rx), ((tx + 1.0) / 2.0 * bound_tx, (ty + 1.0) / 2.0 * bound_ty)
         )
 

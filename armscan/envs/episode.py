@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armscan.envs.observations import View
 from armscan.envs.rules import ON_REWARD, ON_STOP, Rules
@@ -20,13 +21,20 @@ class Episode:
 
     Each plane comes in two steps, so that many environments can be looked at together between them: `aim` at it, then
     `see` what is there. The first plane is the start, every further one a step.
+
+    Args:
+        rules: Rules of the environment.
+        scene: Scene of the episode.
+        optimal_xz: Slice of the scene's optimal plane, indexed [across, depth].
+        start: Free components of the first plane, normalised, and `stop` if there is one.
     """
 
     view: View
 
-    def __init__(self, rules: Rules, scene: Scene, start: FloatArray) -> None:
+    def __init__(self, rules: Rules, scene: Scene, optimal_xz: NDArray[np.uint8], start: FloatArray) -> None:
         self.rules = rules
         self.scene = scene
+        self.optimal_xz = optimal_xz
         self.n_steps = -1
         self.is_solved = self.starts_solved = self.is_terminated = self.is_truncated = False
         self.rewards: list[float] = []
@@ -106,7 +114,7 @@ def begin(rules: Rules, rngs: Sequence[np.random.Generator], volume_names: Seque
         name or rules.names[int(rng.integers(len(rules.names)))] for name, rng in zip(volume_names, rngs, strict=True)
     ]
     scenes = rules.draw_scenes(drawn, rngs)
-    return [Episode(rules, scene, _start(rules, rng)) for scene, rng in zip(scenes, rngs, strict=True)]
+    return [Episode(rules, *scene, _start(rules, rng)) for scene, rng in zip(scenes, rngs, strict=True)]
 
 
 def _start(rules: Rules, rng: np.random.Generator) -> FloatArray:

@@ -121,13 +121,18 @@ class Rules:
         """Bounds of the actions on each volume, by its name."""
         return {name: self._sampler.bounds(volume) for name, volume in self.volumes.items()}
 
-    def draw_scenes(self, names: Sequence[str], rngs: Sequence[np.random.Generator]) -> list[Scene]:
+    def draw_scenes(
+        self, names: Sequence[str], rngs: Sequence[np.random.Generator]
+    ) -> list[tuple[Scene, NDArray[np.uint8]]]:
         """Draw a scene of each named volume with the generator beside it, its optimal plane above -success_threshold.
+
+        Returns:
+            Each scene, and the slice of its optimal plane.
 
         Raises:
             OptimalPlaneError: If no motion in a thousand leaves the optimal plane within the bounds and rewarded.
         """
-        drawn: dict[int, Scene] = {}
+        drawn: dict[int, tuple[Scene, NDArray[np.uint8]]] = {}
         for _ in range(MAX_DRAWS):
             proposed = {
                 i: scene
@@ -136,7 +141,8 @@ class Rules:
             }
             if proposed:
                 views = self.look(list(proposed.values()), [scene.optimum for scene in proposed.values()])
-                drawn |= {i: proposed[i] for i, view in zip(proposed, views, strict=True) if self.is_solved(view)}
+                seen = zip(proposed.items(), views, strict=True)
+                drawn |= {i: (scene, view.slice_xz) for (i, scene), view in seen if self.is_solved(view)}
             if len(drawn) == len(names):
                 return [drawn[i] for i in range(len(names))]
         name = next(name for i, name in enumerate(names) if i not in drawn)

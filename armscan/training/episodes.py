@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import VectorEnv
-from numpy.typing import NDArray
 
 from armscan.agents.batch_agent import BatchAgent, batch_agent
 from armscan.agents.protocols import Agent
@@ -73,15 +72,9 @@ def _play_all(
         seconds[running] += (time.perf_counter() - start_s) / running.size
         goes_on = ~(terminated | truncated)
         observations, rewards, running = rows_of(observations, goes_on), rewards[goes_on], running[goes_on]
-    optima = bare.rules.look([episode.scene for episode in episodes], [episode.scene.optimum for episode in episodes])
     # Of agents that say how far off they expect to be.
     expected = getattr(agent, "expected_errors", np.full((len(planned), 2), None)).tolist()
-    return [
-        _result(episode, seed, its_seconds, optimal.slice_xz, its_expected)
-        for episode, seed, its_seconds, optimal, its_expected in zip(
-            episodes, seeds, seconds.tolist(), optima, expected, strict=True
-        )
-    ]
+    return [_result(*each) for each in zip(episodes, seeds, seconds.tolist(), expected, strict=True)]
 
 
 def play(
@@ -107,32 +100,25 @@ def play(
         reward, ended = float(received), terminated or truncated
         look()
     seconds = time.perf_counter() - start_s
-    (optimal,) = env.get_wrapper_attr("rules").look([episode.scene], [episode.scene.optimum])
     expected = getattr(agent, "expected_error", None) or (None, None)
-    return _result(episode, seed, seconds, optimal.slice_xz, expected)
+    return _result(episode, seed, seconds, expected)
 
 
-def _result(
-    episode: Episode,
-    seed: int,
-    seconds: float,
-    optimal_xz: NDArray[np.uint8],
-    expected: Sequence[float | None],
-) -> EpisodeResult:
+def _result(episode: Episode, seed: int, seconds: float, expected: Sequence[float | None]) -> EpisodeResult:
     """Return how an episode went that has ended.
 
     Args:
         episode: Finished episode.
         seed: Seed of its reset.
         seconds: Wall time of all its steps, in seconds.
-        optimal_xz: Slice of its optimal plane, indexed [across, depth].
         expected: Errors that the agent expects of its last plane, in mm and degrees, or None and None.
     """
     # The first is the start's.
     _, *rewards = episode.rewards
     distance_mm, distance_deg = episode.distance
-    dice = tissue_dice(episode.view.slice_xz, optimal_xz)
-    nerve_mm2, nerve_percent = nerve_area_error(episode.view.slice_xz, optimal_xz, episode.scene.volume.pixel_mm)
+    shown = episode.view.slice_xz, episode.optimal_xz
+    dice = tissue_dice(*shown)
+    nerve_mm2, nerve_percent = nerve_area_error(*shown, episode.scene.volume.pixel_mm)
     return EpisodeResult(
         volume=episode.scene.volume.name,
         seed=seed,

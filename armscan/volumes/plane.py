@@ -45,6 +45,16 @@ def composed(
     return matrix, offset_mm
 
 
+@numba.njit(cache=True)
+def moved_plane(
+    motion: FloatArray, motion_mm: FloatArray, rotation: tuple[float, float], translation: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Return (M, b) of a plane p -> Rz(rz) Rx(rx) p + (tx, ty, 0), moved by q -> motion q + motion_mm."""
+    origin_mm = np.zeros(3)
+    origin_mm[0], origin_mm[1] = translation
+    return composed(motion, motion_mm, rotation_matrix(rotation[0], rotation[1]), origin_mm)
+
+
 @dataclass(frozen=True)
 class ManipulatorAction:
     """One slicing plane, absolute in the volume's frame.
@@ -67,6 +77,13 @@ class ManipulatorAction:
         tx, ty = check_numbers("translation", self.translation, 2, "(tx, ty) in mm")
         object.__setattr__(self, "rotation", (rz, rx))
         object.__setattr__(self, "translation", (tx, ty))
+
+    @classmethod
+    def of_finite(cls, rotation: tuple[float, float], translation: tuple[float, float]) -> Self:
+        """Build the action from plain floats that are known to be finite; for each step that is taken."""
+        action = object.__new__(cls)
+        action.__dict__.update(rotation=rotation, translation=translation)
+        return action
 
     @classmethod
     def from_array(cls, components: FloatArray) -> Self:
@@ -136,7 +153,7 @@ class RigidTransform:
 
     def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
         """Return (M, b) with T(plane(p)) = M p + b: from the plane's frame into the unmoved volume."""
-        return composed(self.matrix, self.offset_mm, action.matrix, action.offset_mm)
+        return moved_plane(self.matrix, self.offset_mm, action.rotation, action.translation)
 
     def inverse_plane(self, action: ManipulatorAction) -> ManipulatorAction:
         """Return the plane of the moved volume that shows the same slice as `action` in the unmoved one.
@@ -159,7 +176,7 @@ class RigidTransform:
             if abs(in_depth_z) < 1e-9:
                 raise InvalidValueError(f"{action}, moved by {self}, lies parallel to the volume's floor and above it")
             x_mm, y_mm = x_mm - z_mm / in_depth_z * in_depth_x, y_mm - z_mm / in_depth_z * in_depth_y
-        return ManipulatorAction(rotation, (x_mm, y_mm))
+        return ManipulatorAction.of_finite(rotation, (x_mm, y_mm))
 
 
 def wrap_deg(angle_deg: float) -> float:
@@ -189,7 +206,7 @@ def shift_into(action: ManipulatorAction, bounds_mm: tuple[float, float]) -> Man
         min(max(position + shift_mm * step, 0.0), bound)
         for position, step, bound in zip(action.translation, direction, bounds_mm, strict=True)
     )
-    return ManipulatorAction(action.rotation, (tx, ty))
+    return ManipulatorAction.of_finite(action.rotation, (tx, ty))
 
 
 def plane_distance(

@@ -27,7 +27,10 @@ CASES: dict[str, tuple[int, dict[str, Any]]] = {
     "16 side by side": (16, {}),
     "64 side by side": (64, {}),
     "16 side by side, full": (16, {"projection": "full"}),
-    "one environment, zy, the last 8 stacked, the best 4 remembered": (1, {"projection": "zy", "stack": 8, "memory": 4}),
+    "one environment, zy, the last 8 stacked, the best 4 remembered": (
+        1,
+        {"projection": "zy", "stack": 8, "memory": 4},
+    ),
 }
 
 

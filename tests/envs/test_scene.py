@@ -18,7 +18,7 @@ def make_rules(volume, **changes):
 def draw(volume, rng, n_scenes=1, **changes):
     """Draws scenes of a volume, one after another."""
     made = make_rules(volume, **changes)
-    return [made.draw_scenes([volume.name], [rng])[0] for _ in range(n_scenes)]
+    return [made.draw_scenes([volume.name], [rng])[0][0] for _ in range(n_scenes)]
 
 
 def test_scene_optimum_is_rewarded_and_within_the_bounds(dataset, phantom):
@@ -207,5 +207,6 @@ def test_task_gives_up_where_no_transform_keeps_the_plane_in_view(phantom):
 class _OutOfView:
     """A random generator that always moves the hand out of the picture."""
 
-    def uniform(self, _low, high):
-        return high * [0, 0, 40, -40]
+    def random(self, _size):
+        """Draws that are shares of the way from the lowest to the highest."""
+        return np.array([0.5, 0.5, 20.5, -19.5])

@@ -73,6 +73,31 @@ def test_slice_of_moved_volume_equals_resampling_through_both_maps(volume, rotat
     np.testing.assert_array_equal(volume.slice(action, transform=transform)[clear], expected[clear])
 
 
+def plainly_sliced(volume, action, shape):
+    """The slice by its definition, all pixels at once."""
+    across, depth = np.meshgrid(*(np.arange(n, dtype=float) for n in shape), indexing="ij")
+    places, is_inside = [], np.ones(shape, dtype=bool)
+    for axis, (n_voxels, spacing) in enumerate(zip(volume.shape, volume.spacing, strict=True)):
+        first = (action.matrix[axis, 0] * (across * volume.spacing[0]) + action.offset_mm[axis]) / spacing + 0.5
+        place = np.floor(first + action.matrix[axis, 2] * volume.spacing[2] / spacing * depth)
+        is_inside &= (place >= 0) & (place < n_voxels)
+        places.append(place)
+    voxels = tuple(np.where(is_inside, place, 0).astype(int) for place in places)
+    return np.where(is_inside, volume.labels[voxels], 0)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    volume=volumes(),
+    rotation=st.tuples(angles_deg, angles_deg | st.sampled_from([0.0, 90.0, 180.0, 1e-9])),
+    translation=st.tuples(shifts_mm | st.just(1e12), shifts_mm),
+    shape=st.tuples(st.integers(1, 20), st.integers(1, 20)),
+)
+def test_slice_is_what_its_definition_says_at_every_pixel(volume, rotation, translation, shape):
+    action = ManipulatorAction(rotation, translation)
+    np.testing.assert_array_equal(volume.slice(action, shape), plainly_sliced(volume, action, shape))
+
+
 def test_slice_takes_the_upper_voxel_at_a_tie(tiny_volume):
     between = 6.5 * tiny_volume.spacing[1]
     np.testing.assert_array_equal(

@@ -1,0 +1,35 @@
+"""The processor's instruction that asks for memory ahead of its use, for compiled code."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+# Of LLVM's prefetch: for reading, kept in all caches, data.
+READ, KEEP, DATA = 0, 3, 1
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def prefetch(context: Any, array: Any, index: Any) -> Any:
+    """Ask for the element of a flat array that is needed soon; unlike a read, nothing waits for it.
+
+    Args:
+        context: Typing context, passed by Numba.
+        array: Flat array.
+        index: Index into it, an unsigned integer.
+    """
+
+    def generate(target: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = target.make_array(signature.args[0])(target, builder, arguments[0]).data
+        place = builder.bitcast(builder.gep(data, [arguments[1]]), ir.IntType(8).as_pointer())
+        word = ir.IntType(32)
+        function = ir.FunctionType(ir.VoidType(), [place.type, word, word, word])
+        called = cgutils.get_or_insert_function(builder.module, function, "llvm.prefetch.p0")
+        builder.call(called, [place, word(READ), word(KEEP), word(DATA)])
+        return target.get_dummy_value()
+
+    return types.void(array, index), generate
