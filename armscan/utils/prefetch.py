@@ -6,15 +6,14 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 # Of LLVM's prefetch: for reading, kept in all caches, data.
 READ, KEEP, DATA = 0, 3, 1
+LLVM_NAME = "llvm.prefetch.p0"
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def prefetch(context: Any, array: Any, index: Any) -> Any:
+def _prefetch(context: Any, array: Any, index: Any) -> Any:
     """Ask for the element of a flat array that is needed soon; unlike a read, nothing waits for it.
 
     Args:
@@ -28,8 +27,12 @@ def prefetch(context: Any, array: Any, index: Any) -> Any:
         place = builder.bitcast(builder.gep(data, [arguments[1]]), ir.IntType(8).as_pointer())
         word = ir.IntType(32)
         function = ir.FunctionType(ir.VoidType(), [place.type, word, word, word])
-        called = cgutils.get_or_insert_function(builder.module, function, "llvm.prefetch.p0")
+        called = builder.module.globals.get(LLVM_NAME) or ir.Function(builder.module, function, LLVM_NAME)
         builder.call(called, [place, word(READ), word(KEEP), word(DATA)])
         return target.get_dummy_value()
 
     return types.void(array, index), generate
+
+
+# For compiled code: prefetch(array, index).
+prefetch: Any = intrinsic(_prefetch)
