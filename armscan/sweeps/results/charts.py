@@ -16,6 +16,7 @@ from plotly.graph_objects import Figure, Scatter
 
 from armscan.reports.chart_style import BLUE, GREY, ORANGE, RED, mode
 from armscan.reports.html import chart
+from armscan.sweeps.scheduling.state import is_feasible
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.reports import reports_of
 from armscan.training.titles import is_rate, title_of
@@ -81,16 +82,26 @@ def _said(trial: FrozenTrial) -> str:
 
 
 def _history(trials: Sequence[FrozenTrial], number: int, objective: str, direction: StudyDirection) -> Figure:
-    """Return the values of the trials in their order, and the best so far."""
-    values, numbers = [_value(number)(trial) for trial in trials], [trial.number for trial in trials]
+    """Return the values of the trials in their order, and the best so far of those that keep all constraints."""
+    figure = Figure()
+    for name, color, is_drawn in (("trial", BLUE, is_feasible), ("infeasible trial", GREY, _is_infeasible)):
+        drawn = list(filter(is_drawn, trials))
+        hover = {"text": list(map(_said, drawn)), "hovertemplate": "%{y:.4g}<br>%{text}<extra></extra>"}
+        points: dict[str, Any] = {"mode": "markers", "marker": {"color": color, "size": 7, "opacity": 0.7}}
+        numbers, values = [trial.number for trial in drawn], list(map(_value(number), drawn))
+        if drawn:
+            figure.add_scatter(x=numbers, y=values, name=name, **points, **hover)
+    feasible = list(filter(is_feasible, trials))
+    numbers, values = [trial.number for trial in feasible], list(map(_value(number), feasible))
     best = list(accumulate(values, max if direction == StudyDirection.MAXIMIZE else min))
-    points: dict[str, Any] = {"mode": "markers", "marker": {"color": BLUE, "size": 7, "opacity": 0.7}}
-    hover = {"text": list(map(_said, trials)), "hovertemplate": "%{y:.4g}<br>%{text}<extra></extra>"}
-    figure = Figure(Scatter(x=numbers, y=values, name="trial", **points, **hover))
     line = {"color": ORANGE, "width": 2, "shape": "hv"}
     figure.add_scatter(x=numbers, y=best, mode=mode(len(best)), line=line, marker={"size": 4}, name="best so far")
     legend = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0}
     return figure.update_layout(height=HEIGHT_PX, xaxis_title="trial", yaxis=_axis(objective), legend=legend)
+
+
+def _is_infeasible(trial: FrozenTrial) -> bool:
+    return not is_feasible(trial)
 
 
 def _importance(rows: Sequence[Mapping[str, Any]]) -> Figure:

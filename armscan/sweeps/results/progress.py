@@ -19,7 +19,17 @@ from armscan.errors import ArmscanError, printable
 from armscan.experiment.console import print_table, print_where_to_look
 from armscan.experiment.results import volume_notes
 from armscan.sweeps.results.summary import final_results, final_table, values_of
-from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, STOP, StudyState
+from armscan.sweeps.scheduling.state import (
+    ENV_STEPS,
+    FAILURE,
+    FINAL_SEED,
+    FINALIST,
+    LEASE,
+    RETRIED,
+    STOP,
+    StudyState,
+    is_feasible,
+)
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attributes import check_trials
 from armscan.sweeps.study.open import OpenedStudy, Phase
@@ -144,7 +154,8 @@ def _describe(trial: FrozenTrial, objectives: Iterable[str]) -> str:
     if trial.state == TrialState.PRUNED:
         how = "stopped" if STOP in attributes else "pruned"
         return f"{name} {how} after {attributes.get(ENV_STEPS)} environment steps [{tried}]"
-    return f"{name} done: {values_of(trial, objectives)} [{tried}]"
+    infeasible = "" if is_feasible(trial) else ", infeasible"
+    return f"{name} done{infeasible}: {values_of(trial, objectives)} [{tried}]"
 
 
 def print_result(opened: OpenedStudy) -> int:
