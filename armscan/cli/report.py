@@ -83,8 +83,9 @@ def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int |
     import optuna
 
     from armscan.sweeps.results.report import write_report
-    from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX, check_trials
+    from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, check_trials
     from armscan.sweeps.storage.storage import existing_storage
+    from armscan.sweeps.study.final_eval import FinalEvaluation
     from armscan.sweeps.study.settings import check_study_name
     from armscan.sweeps.study.study import is_ours
 
@@ -94,7 +95,7 @@ def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int |
         raise StudyError(f"--storage is {uri!r}, but nothing is there: give the one that it is in")
     names = optuna.get_all_study_names(storage.optuna)
     if name not in names:
-        others = [each for each in names if not each.endswith(FINAL_EVAL_SUFFIX)]
+        others = [each for each in names if not each.endswith(FINAL_SUFFIXES)]
         there = f"there is only {listed(others)}" if others else "there is no study"
         raise StudyError(f"--study is {name!r}, but {there} in {storage.uri!r}")
     study = optuna.load_study(study_name=name, storage=storage.optuna)
@@ -104,10 +105,11 @@ def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int |
     def write(refresh_s: int | None) -> Path:
         check_trials(study)
         evaluated = []
-        if name + FINAL_EVAL_SUFFIX in optuna.get_all_study_names(storage.optuna):
-            final = optuna.load_study(study_name=name + FINAL_EVAL_SUFFIX, storage=storage.optuna)
+        if name + JUDGEMENT_SUFFIX in optuna.get_all_study_names(storage.optuna):
+            final = optuna.load_study(study_name=name + JUDGEMENT_SUFFIX, storage=storage.optuna)
             check_trials(final, n_searched=len(study.get_trials(deepcopy=False)))
             evaluated = final.get_trials(deepcopy=False)
-        return write_report(study, evaluated, out or Path("reports", name), refresh_s=refresh_s)
+        stored = FinalEvaluation.stored(storage, study)
+        return write_report(study, evaluated, out or Path("reports", name), final=stored, refresh_s=refresh_s)
 
     return write

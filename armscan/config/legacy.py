@@ -27,6 +27,8 @@ RENAMED_KEYS = {
     "env.delta": "env.success_threshold",
     "training.epoch_env_steps": "training.eval_every_env_steps",
 }
+# Of a study, whose section no run keeps.
+RENAMED_KEYS_OF_STUDIES = {"study.final_eval.n_seeds": "study.final_eval.judge_seeds"}
 INVERTED = ("agent.judged_by_sampling",)
 # Truth values of a configuration, and of MLflow's parameters.
 OPPOSITES = {True: False, False: True, "True": "False", "False": "True"}
@@ -52,7 +54,7 @@ def migrate(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def rename_hint(key: str) -> str | None:
     """Return the current name of a key of an earlier version; None if the key has not been renamed."""
-    if (now := RENAMED_KEYS.get(key)) is None:
+    if (now := (RENAMED_KEYS | RENAMED_KEYS_OF_STUDIES).get(key)) is None:
         return None
     return f"{key} has been renamed: give {now}" + (", which means the opposite" if key in INVERTED else "")
 

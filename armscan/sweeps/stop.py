@@ -11,7 +11,7 @@ from optuna.trial import TrialState
 
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.state import LEASE, STOP
-from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX
+from armscan.sweeps.storage.attributes import FINAL_SUFFIXES
 from armscan.sweeps.storage.storage import Storage, existing_storage, open_storage
 from armscan.sweeps.study.study import is_ours
 
@@ -34,7 +34,7 @@ def stop_study(uri: str, name: str) -> str:
     """Stop a study: its trials are requeued, and its command resumes it; return the consequence in one line."""
     storage = _storage_with(uri, name)
     names, n_running = optuna.get_all_study_names(storage.optuna), 0
-    for each in (name, name + FINAL_EVAL_SUFFIX):
+    for each in (name, *(name + suffix for suffix in FINAL_SUFFIXES)):
         if each in names:
             study = optuna.load_study(study_name=each, storage=storage.optuna)
             study.set_user_attr(STOP, reason())

@@ -24,7 +24,7 @@ HIDDEN = {"lease", "figures", "seeds", "config_sha256", "attempt", "retried", "m
 NAMES = {
     "env_steps": "environment steps",
     "retry_of": "retry of trial",
-    "judged": "final training of trial",
+    "judged": "final training of trial (-1: the control)",
     "judged_seed": "seed",
     "stop": "stopped",
 }

@@ -40,6 +40,10 @@ class Sleeping:
         waited = wait(attempt.trial.number, self._shortest_s, self._longest_s, report)
         return {"mean_steps": value, **waited._asdict()}
 
+    def validate(self, attempt: Attempt) -> dict[str, float]:
+        """See `Task.validate`."""
+        return self.run(attempt)
+
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
         """See `Task.evaluate`."""
         return {"test/mean_steps": self.run(attempt)["mean_steps"]}

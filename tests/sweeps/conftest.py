@@ -27,8 +27,8 @@ def make_scheduler(storage_uri):
     def make(**limits):
         storage = open_storage(storage_uri)
         study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
-        is_open = limits.pop("is_open", True)
-        return TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits), is_open=is_open)
+        plan = limits.pop("plan", None)
+        return TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits), plan)
 
     return make
 

@@ -31,7 +31,12 @@ TINY = [
         "env.max_steps=8",
     ),
     *("agent.learning_starts=100", "agent.batch_size=32", "network.vector.hidden_sizes=[16]", "study/pruner=none"),
-    *("study.final_eval.top_k=1", "study.final_eval.n_seeds=1"),
+    *(
+        "study.final_eval.top_k=1",
+        "study.final_eval.min_seeds=1",
+        "study.final_eval.max_seeds=1",
+        "study.final_eval.judge_seeds=1",
+    ),
 ]
 COMMAND = [sys.executable, "-m", "armscan.run"]
 
@@ -71,15 +76,18 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
     assert ended.stdout.count(" done: mean_steps ") == 2
-    assert " with seed 1000 done: test/mean_steps" in ended.stdout
+    for line in ("selection of control with seed 1000 done: mean_steps", "result: ", "control and"):
+        assert line in ended.stdout
+    assert "judgement of control with seed 2000 done: test/mean_steps" in ended.stdout
     client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
     runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
     by_id = {each.info.run_id: each for each in runs}
     assert {each.info.status for each in runs} == {"FINISHED"}
     # Of all that was trained, only what judges keeps its policy.
     kept = [each.data.tags["folder"] for each in runs if each.data.tags.get("policy") == "kept"]
-    assert kept == [str(model.parent.parent) for model in tmp_path.glob("studies/**/MLmodel")]
-    assert "/judged/" in kept[0]
+    assert sorted(kept) == sorted(str(model.parent.parent) for model in tmp_path.glob("studies/**/MLmodel"))
+    assert all("/judged/" in folder for folder in kept)
+    assert len(kept) == len(trials_of(tmp_path, "sac_y-judged"))
     storage = open_storage(str(tmp_path / "optuna.journal")).optuna
     (study_run,) = [each for each in runs if each.info.run_name == "study sac_y"]
     for trial in trials_of(tmp_path):
@@ -224,7 +232,19 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
         (["-m", "sweep=sac_y", f"study.name={'a' * 101}"], "have at most 100 characters"),
         (
             ["-m", "sweep=sac_y", "study.name=a-judged"],
-            "and not end in -judged, as final",
+            "and not end in -selection or -judged, as final",
+        ),
+        (
+            ["-m", "sweep=sac_y", "study.final_eval.max_seeds=1"],
+            "study.final_eval.min_seeds is 2, but it must be at most study.final_eval.max_seeds, which is 1",
+        ),
+        (
+            ["-m", "sweep=sac_y", "study.final_eval.judge_seeds=0"],
+            "study.final_eval.judge_seeds is 0, but it must be a whole number from 1 to 1000",
+        ),
+        (
+            ["-m", "sweep=sac_y", "study.final_eval.n_seeds=2"],
+            "study.final_eval.n_seeds has been renamed: give study.final_eval.judge_seeds",
         ),
         (["-m", "sweep=sac_y", "study.workers=999", "--plan"], "study.workers is 999, but this machine has "),
         (["-m", "sweep=sac_y", "study.workers=999"], "study.workers is 999, but this machine has "),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
@@ -18,7 +18,9 @@ from armscan.config.command_hints import armscan_command
 from armscan.errors import ArmscanError, printable
 from armscan.experiment.console import print_table, print_where_to_look
 from armscan.experiment.results import volume_notes
-from armscan.sweeps.results.summary import final_results, final_table, values_of
+from armscan.sweeps.results.judgement import HOW, judge
+from armscan.sweeps.results.selection import candidates_of, objective_of
+from armscan.sweeps.results.summary import final_table, values_of
 from armscan.sweeps.scheduling.state import (
     ENV_STEPS,
     FAILURE,
@@ -31,9 +33,11 @@ from armscan.sweeps.scheduling.state import (
     is_feasible,
 )
 from armscan.sweeps.space.parameter import overrides_of
-from armscan.sweeps.storage.attributes import check_trials
+from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX, check_trials
+from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, n_trainings, name_of, settings_of
 from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.study import best_trials
+from armscan.training.titles import title_of
 from armscan.utils.console import WHOLE_CHARS, wide_console
 from armscan.utils.retry import no_retry
 
@@ -54,7 +58,7 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
         for key, trial, phase in _ended(opened):
             if key not in shown:
                 shown.add(key)
-                print(printable(_describe(trial, phase.objectives)), flush=True)
+                print(printable(_describe(trial, phase)), flush=True)
 
     def show() -> None:
         # Nothing that is shown is worth waiting for: who leaves would wait for it, too.
@@ -107,23 +111,32 @@ def _ended(opened: OpenedStudy) -> list[tuple[tuple[str, int], FrozenTrial, Phas
 
 def _table(opened: OpenedStudy) -> Table:
     """Return the running trials, below how the study stands."""
-    final = opened.final_eval
     state = opened.search.scheduler.state()
-    final_state = final.scheduler.state() if final is not None else StudyState.of(())
+    finals = [(phase, phase.scheduler.state()) for phase in opened.finals]
     # As wide as the terminal.
     table = Table("worker", title=Text(_summary(opened, state)), title_justify="left", expand=True)
     for heading in ("trial", "seed", "environment steps", "return"):
         table.add_column(heading, justify="right")
-    if final_state.all:
-        table.caption = f"final evaluation: {len(final_state.finished)} of {len(final_state.all)} done"
-    for trial in (*state.running, *final_state.running):
+    if opened.final_eval is not None and any(of_final.all for _, of_final in finals):
+        table.caption = _final_summary(opened.final_eval, [len(of_final.finished) for _, of_final in finals])
+    for trial in (*state.running, *(trial for _, of_final in finals for trial in of_final.running)):
         lease, finalist = trial.user_attrs.get(LEASE, {}), trial.user_attrs.get(FINALIST)
-        name = str(trial.number) if finalist is None else f"final evaluation of {finalist}: {trial.number}"
+        name = str(trial.number) if finalist is None else f"{name_of(finalist)}, final"
         mean_return = f"{lease['return']:.2f}" if "return" in lease else "-"
         shown = (lease.get("seed", "-"), lease.get(ENV_STEPS, "-"), mean_return)
         worker = printable(lease.get("worker", "?").rpartition("/")[2])
         table.add_row(Text(worker), name, *map(str, shown))
     return table
+
+
+def _final_summary(final: FinalEvaluation, n_done: Sequence[int]) -> str:
+    """Return how the final evaluation stands, in one line."""
+    _, most = n_trainings(final.settings)
+    chosen = final.race().chosen
+    n_left = sum(standing.is_in for standing in final.race().standings.values())
+    now = f"{n_left} candidates left" if chosen is None else f"{name_of(chosen)} chosen"
+    selected, judged = n_done
+    return f"final evaluation: {selected} trainings to select, {judged} to judge, at most {most} in all; {now}"
 
 
 def _summary(opened: OpenedStudy, state: StudyState) -> str:
@@ -143,19 +156,20 @@ def _summary(opened: OpenedStudy, state: StudyState) -> str:
     return "; ".join(parts)
 
 
-def _describe(trial: FrozenTrial, objectives: Iterable[str]) -> str:
+def _describe(trial: FrozenTrial, phase: Phase) -> str:
     """Return the outcome of a trial in one line."""
     attributes, tried = trial.user_attrs, " ".join(overrides_of(trial.params))
     name = f"trial {trial.number}"
+    what = "judgement" if phase.name.endswith(JUDGEMENT_SUFFIX) else "selection"
     if FINALIST in attributes:
-        name = f"final evaluation of trial {attributes[FINALIST]} with seed {attributes[FINAL_SEED]}"
+        name = f"{what} of {name_of(attributes[FINALIST])} with seed {attributes[FINAL_SEED]}"
     if trial.state == TrialState.FAIL:
         return f"{name} failed{', retried' if RETRIED in attributes else ''}: {attributes.get(FAILURE)} [{tried}]"
     if trial.state == TrialState.PRUNED:
         how = "stopped" if STOP in attributes else "pruned"
         return f"{name} {how} after {attributes.get(ENV_STEPS)} environment steps [{tried}]"
     infeasible = "" if is_feasible(trial) else ", infeasible"
-    return f"{name} done{infeasible}: {values_of(trial, objectives)} [{tried}]"
+    return f"{name} done{infeasible}: {values_of(trial, phase.objectives)}{f' [{tried}]' if tried else ''}"
 
 
 def print_result(opened: OpenedStudy) -> int:
@@ -185,29 +199,48 @@ def print_result(opened: OpenedStudy) -> int:
             str(trial.number), *(f"{value:.4g}" for value in trial.values), " ".join(overrides_of(trial.params))
         )
     wide_console(WHOLE_CHARS).print(table)
-    is_evaluated = _print_final_results(opened)
+    is_judged = opened.final_eval is None or _print_final_results(opened, opened.final_eval)
     print_where_to_look(opened.folder, opened.config.tracking.uri, storage=settings.storage)
     print(f"report    {armscan_command('report', '--study', settings.name, storage=settings.storage)}")
-    return 0 if is_evaluated else 1
+    return 0 if is_judged else 1
 
 
-def _print_final_results(opened: OpenedStudy) -> bool:
-    """Print the final evaluation; returns whether there is one, if it is asked for."""
-    if opened.final_eval is None:
-        return True
+def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
+    """Print how a configuration was chosen, and what the test volumes say of it; returns whether they say anything."""
     trials = opened.search.scheduler.study.get_trials(deepcopy=False)
-    check_trials(opened.final_eval.scheduler.study, n_searched=len(trials))
-    state = opened.final_eval.scheduler.state()
-    if state.failed:
-        reason = state.failed[0].user_attrs.get(FAILURE)
-        print(printable(f"error: {len(state.failed)} of the final trainings have failed: {reason}"), file=sys.stderr)
-    results = final_results(state.finished)
-    if not results:
-        print("error: no final evaluation, because no trial or no final training has finished", file=sys.stderr)
+    for phase in opened.finals:
+        check_trials(phase.scheduler.study, n_searched=len(trials))
+        failed = phase.scheduler.state().failed
+        if failed:
+            reason = failed[0].user_attrs.get(FAILURE)
+            print(printable(f"error: {len(failed)} trainings of {phase.name} have failed: {reason}"), file=sys.stderr)
+    candidates = candidates_of(final)
+    if candidates:
+        objective = objective_of(final)
+        title = f"selection, on the validation volumes by {title_of(objective)}"
+        _print_rows(title, [each.row(objective) for each in candidates])
+    judgement = judge(final)
+    if judgement is None or not judgement.results:
+        reason = "no trial or no final training has finished"
+        if not final.race().is_over or final.missing_of_judgement():
+            reason = "trainings are missing; the same command resumes the study"
+        print(f"error: no final evaluation, because {reason}", file=sys.stderr)
         return False
-    n_seeds = ", ".join(sorted({str(result.n_seeds) for result in results}))
-    title = f"result on the test volumes, with {n_seeds} other seed(s) each"
-    print_table(title, final_table(results), volume_notes(results[0].figures))
-    for result in results:
-        print(f"trial {result.number}: {' '.join(overrides_of(trials[result.number].params))}")
+    print(f"result: {judgement.statement}")
+    if judgement.differences:
+        title = f"{name_of(judgement.chosen)} and the control, {judgement.n_seeds} other seeds each"
+        _print_rows(title, [each.row() for each in judgement.differences])
+        print(HOW)
+    notes = [*volume_notes(judgement.results[0].figures), *judgement.notes]
+    print_table("the test volumes", final_table(judgement.results), notes)
+    for result in judgement.results:
+        settings = " ".join(overrides_of(settings_of(trials, result.number)))
+        print(f"{name_of(result.number)}: {settings or NOTHING_SEARCHED}")
     return True
+
+
+def _print_rows(title: str, rows: Sequence[Mapping[str, str]]) -> None:
+    table = Table(*rows[0], title=Text(title), title_justify="left")
+    for row in rows:
+        table.add_row(*map(Text, row.values()))
+    wide_console(WHOLE_CHARS).print(table)

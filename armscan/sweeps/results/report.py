@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 from armscan.reports.html import folded, table, video_address, write_page
 from armscan.sweeps.results.charts import charts_of
+from armscan.sweeps.results.judgement import HOW, Judgement, judge
+from armscan.sweeps.results.selection import candidates_of, decided, score_rows
 from armscan.sweeps.results.summary import ConfigResult, final_results, final_table
 from armscan.sweeps.scheduling.state import (
     ENV_STEPS,
@@ -33,6 +35,7 @@ from armscan.sweeps.scheduling.state import (
 from armscan.sweeps.scheduling.termination import REASON, TERMINATED
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.reports import reports_of
+from armscan.sweeps.study.final_eval import FinalEvaluation, key_of, name_of, settings_of
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import FOLDER, RUN
 from armscan.training.titles import title_of, value_text
@@ -47,21 +50,31 @@ GIF = b"GIF8"
 
 
 def write_report(
-    study: optuna.Study, final_trials: Sequence[FrozenTrial], folder: Path, *, refresh_s: int | None = None
+    study: optuna.Study,
+    final_trials: Sequence[FrozenTrial],
+    folder: Path,
+    *,
+    final: FinalEvaluation | None = None,
+    refresh_s: int | None = None,
 ) -> Path:
     """Write the report of a study.
 
     Args:
         study: Study in its storage.
-        final_trials: Trials of the final evaluation; empty without one.
+        final_trials: Trials on the test volumes; empty without one.
         folder: Folder that takes `report.html` and the CSV files.
+        final: Final evaluation of the study. Default: None, there is none, or an earlier version made it.
         refresh_s: Seconds after which a browser reads the page again. Default: None, never.
 
     Returns:
         The HTML file.
     """
     objectives = list(study.user_attrs["objectives"])
-    trials, found = study.get_trials(deepcopy=False), final_results(final_trials)
+    trials = study.get_trials(deepcopy=False)
+    judgement = judge(final) if final is not None else None
+    candidates = candidates_of(final) if final is not None else []
+    # Of an earlier version: its best configurations, without a control.
+    found = final_results(final_trials) if final is None else judgement.results if judgement is not None else ()
     shares = _importances(study, objectives)
     tables = {
         "trials": [_trial_row(trial, objectives) for trial in trials],
@@ -79,11 +92,15 @@ def write_report(
         ],
         "result": list(_result_rows(found)),
         "importances": shares,
+        "selection": [*score_rows(candidates)],
+        "differences": [*_difference_rows(judgement)] if judgement is not None else [],
     }
     parts = [
         _summary(study, trials, objectives),
-        "<h2>Result</h2><p>The best settings, trained with new seeds, on the test volumes, beside the baselines.</p>",
+        "<h2>Result</h2>",
+        _judgement(judgement) if judgement is not None else "",
         _result(found, trials) if found else "<p>No final evaluation yet.</p>",
+        decided(final, judgement, candidates, StudyState.of(trials)) if final is not None else "",
         _running(trials),
         *charts_of(study, trials, objectives, shares),
         _videos(final_trials),
@@ -136,7 +153,11 @@ def _running(trials: Sequence[FrozenTrial]) -> str:
 
 def _settings(trial: FrozenTrial) -> Row:
     """Return the values of a trial by their keys, rounded by the table."""
-    return {name: value if isinstance(value, int | float) else str(value) for name, value in trial.params.items()}
+    return _plain(trial.params)
+
+
+def _plain(settings: Mapping[str, Any]) -> Row:
+    return {name: value if isinstance(value, int | float) else str(value) for name, value in settings.items()}
 
 
 def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
@@ -186,7 +207,7 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
         number = trial.user_attrs[FINALIST]
         if files and number not in videos:
             address = video_address(files[0].read_bytes())
-            caption = f"<figcaption>trial {number}</figcaption>"
+            caption = f"<figcaption>{name_of(number)}</figcaption>"
             videos[number] = f'<figure><img alt="an episode" src="{address}">{caption}</figure>'
     if not videos:
         return ""
@@ -234,13 +255,36 @@ def _cause(trial: FrozenTrial) -> str:
     return str(trial.user_attrs.get(FAILURE, "not known"))
 
 
+def _judgement(judgement: Judgement) -> str:
+    """Return the result in a sentence, and the differences to the control."""
+    notes = "".join(f"<p>Note: {html.escape(note)}.</p>" for note in judgement.notes)
+    said = f"<p><strong>{html.escape(judgement.statement)}</strong></p>{notes}"
+    if not judgement.differences:
+        return said
+    seeds = f"Both were trained with the same {judgement.n_seeds} seeds, which nothing before has used."
+    return f"{said}{table([each.row() for each in judgement.differences])}<p>{HOW} {seeds}</p>"
+
+
+def _difference_rows(judgement: Judgement) -> Iterator[Row]:
+    for each in judgement.differences:
+        yield {
+            "chosen": key_of(judgement.chosen),
+            "figure": f"test/{each.metric}",
+            "seeds": judgement.n_seeds,
+            **dict(zip(("difference", "low", "high"), each.paired, strict=True)),
+            **dict(zip(("probability", "probability_low", "probability_high"), each.probability, strict=True)),
+        }
+
+
 def _result(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> str:
     """Return the table of the result, and the settings of each trial in it."""
-    rows = [{"trial": result.number, **_settings(trials[result.number])} for result in found]
-    words = {result.number: html.escape(" ".join(overrides_of(trials[result.number].params))) for result in found}
-    items = "".join(f"<li>trial {number}: <code>{text}</code></li>" for number, text in words.items())
-    typed = folded("As words of the command line, with all digits", f"<ul>{items}</ul>")
-    return f"{final_table(found).html()}<h3>Their settings</h3>{table(rows)}{typed}"
+    of_each = {result.number: settings_of(trials, result.number) for result in found}
+    rows = [{"configuration": name_of(number), **_plain(settings)} for number, settings in of_each.items()]
+    words = {number: html.escape(" ".join(overrides_of(settings))) for number, settings in of_each.items() if settings}
+    items = "".join(f"<li>{name_of(number)}: <code>{text}</code></li>" for number, text in words.items())
+    typed = folded("As words of the command line, with all digits", f"<ul>{items}</ul>") if items else ""
+    shown = f"<h3>Their settings</h3>{table(rows)}{typed}" if items else ""
+    return f"{final_table(found).html()}{shown}"
 
 
 def _result_rows(found: Sequence[ConfigResult]) -> Iterator[dict[str, Any]]:
@@ -248,7 +292,7 @@ def _result_rows(found: Sequence[ConfigResult]) -> Iterator[dict[str, Any]]:
     for result in found:
         for of, figures in {"agent": result.figures, **result.baselines}.items():
             for name, (value, low, high) in figures.estimates.items():
-                row = {"trial": result.number, "of": of, "seeds": figures.n_seeds, "figure": f"test/{name}"}
+                row = {"trial": key_of(result.number), "of": of, "seeds": figures.n_seeds, "figure": f"test/{name}"}
                 yield row | {"value": value, "low": low, "high": high}
 
 

@@ -1,4 +1,4 @@
-"""The result of a study: its best configurations on the test volumes, over seeds that did not choose them."""
+"""What the final trainings of a study have measured on the test volumes, over seeds that did not choose them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import optuna
 from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
 
@@ -15,11 +14,10 @@ from armscan.errors import StudyError
 from armscan.stats.aggregation import over_seeds
 from armscan.stats.on_plane import limits_among
 from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
-from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.study.final_eval import name_of
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.metrics import COUNTS
 from armscan.training.result_table import with_baselines
-from armscan.training.titles import leading_among
 
 OF_VOLUME = re.compile(r"test/volume/(.+)/(\w+)")
 OF_TEST = "test/"
@@ -52,8 +50,8 @@ def values_of(trial: FrozenTrial, objectives: Iterable[str]) -> str:
 
 def final_table(results: Sequence[ConfigResult]) -> ResultTable:
     """Return the table of a study's result, a line for each configuration and for each baseline."""
-    figures = {f"trial {result.number}": result.figures for result in results}
-    return ResultTable(with_baselines(figures, {f"trial {each.number}": each.baselines for each in results}))
+    figures = {name_of(result.number): result.figures for result in results}
+    return ResultTable(with_baselines(figures, {name_of(each.number): each.baselines for each in results}))
 
 
 def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
@@ -70,24 +68,6 @@ def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
         if trial.state == TrialState.COMPLETE:
             of_number.setdefault(int(trial.user_attrs[FINALIST]), []).append(trial)
     return [_config_result(number, of_seeds) for number, of_seeds in of_number.items()]
-
-
-def best_metrics(search: optuna.Study, final: Sequence[FrozenTrial]) -> dict[str, float]:
-    """Return the leading metrics of a study's best trial and of its best final evaluation, by the names that runs use.
-
-    Args:
-        search: Study of the search.
-        final: Trials of the final evaluation; empty without one.
-    """
-    found: dict[str, float] = {}
-    if best := best_trials(search, 1):
-        metrics = best[0].user_attrs.get(METRICS, {})
-        found |= {f"validation/{name}": metrics[name] for name in leading_among(metrics)}
-    if results := [result.figures.metrics() for result in final_results(final)]:
-        leading = leading_among(results[0])
-        highest = max(results, key=lambda metrics: metrics[leading[0]] if leading else 0.0)
-        found |= {f"test_volumes/{name}": highest[name] for name in leading_among(highest)}
-    return found
 
 
 def _config_result(number: int, of_seeds: Sequence[FrozenTrial]) -> ConfigResult:
@@ -117,13 +97,13 @@ def _of_means(of_seeds: Sequence[Mapping[str, float]]) -> MetricEstimates:
     common = set.intersection(*map(set, of_seeds))
     of_seeds = [{name: value for name, value in metrics.items() if name in common} for metrics in of_seeds]
     names = [name for name in of_seeds[0] if name.startswith(OF_TEST) and not OF_VOLUME.fullmatch(name)]
-    means = {name.removeprefix(OF_TEST): over_seeds(_scores(name, of_seeds), np.mean) for name in names}
+    means = {name.removeprefix(OF_TEST): over_seeds(scores_of(name, of_seeds), np.mean) for name in names}
     volumes = {match[1] for name in common if (match := OF_VOLUME.fullmatch(name))}
     episodes, solved = (sum(int(each.get(OF_TEST + name, 0)) for each in of_seeds) for name in COUNTS[1:])
     return MetricEstimates(len(of_seeds), len(volumes), episodes, solved, means, limits_among(means))
 
 
-def _scores(name: str, of_seeds: Sequence[Mapping[str, float]]) -> NDArray[np.float64]:
+def scores_of(name: str, of_seeds: Sequence[Mapping[str, float]]) -> NDArray[np.float64]:
     """Return a metric of shape (seeds, test volumes), or (seeds, 1) if it is not known for each volume."""
     metric = name.removeprefix(OF_TEST)
     volumes = [key for key in of_seeds[0] if (found := OF_VOLUME.fullmatch(key)) and found[2] == metric]

@@ -6,7 +6,7 @@ It decides from what is in the storage, one process at a time, and keeps nothing
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import optuna
@@ -27,6 +27,7 @@ from armscan.sweeps.scheduling.state import (
     STOP,
     Limits,
     PendingWrites,
+    PlannedTrial,
     StudyState,
     TrialOutcome,
     env_steps_of,
@@ -34,21 +35,34 @@ from armscan.sweeps.scheduling.state import (
 from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.storage import Storage
 
+# Optuna's system attribute of an enqueued trial: its values.
+FIXED_PARAMS = "fixed_params"
+Plan = Callable[[], Sequence[PlannedTrial]]
+
 
 class TrialScheduler:
-    """Scheduler of the trials of a study; unless it is open, it makes none, and only enqueued ones are run."""
+    """Scheduler of the trials of a study.
+
+    Args:
+        study: The study in its storage.
+        storage: The storage.
+        limits: When the study ends.
+        plan: Returns the trials to enqueue next, from what is in the storage, of a study that makes none by itself.
+            Default: None, its sampler makes them.
+        termination: Ends the study by itself. Default: None, nothing does.
+    """
 
     def __init__(
         self,
         study: optuna.Study,
         storage: Storage,
         limits: Limits,
+        plan: Plan | None = None,
         *,
-        is_open: bool = True,
         termination: Termination | None = None,
     ) -> None:
         self.study, self.storage = study, storage
-        self.limits, self._is_open = limits, is_open
+        self.limits, self._plan = limits, plan
         self.termination = termination
         # Who asked the study to stop, as far as this process knows; see `look_for_stop`.
         self.stopped = ""
@@ -81,6 +95,9 @@ class TrialScheduler:
                 return Trial(self.study, own[0]._trial_id)
             if not self.has_more(state):
                 return None
+            if self._plan is not None and not state.waiting:
+                for planned in self._plan():
+                    self.study.enqueue_trial(dict(planned.params), user_attrs=dict(planned.attributes))
             trial = self.study.ask()
             trial.set_user_attr(LEASE, dict(lease))
             return trial
@@ -103,7 +120,7 @@ class TrialScheduler:
     def has_more(self, state: StudyState) -> bool:
         """Return whether a trial can be claimed now."""
         enough = len(state.finished) + len(state.running) >= self.limits.n_trials
-        return not enough and self.end(state) is None and (self._is_open or bool(state.waiting))
+        return not enough and self.end(state) is None
 
     def end(self, state: StudyState) -> str | None:
         """Return why no further trial is claimed; None while trials are missing."""
@@ -115,7 +132,7 @@ class TrialScheduler:
             return reason
         if self.stopped:
             return f"the study was stopped {self.stopped}"
-        if not self._is_open and not state.waiting:
+        if self._plan is not None and not state.waiting and not self._plan():
             return f"{len(state.finished)} trials have finished, {len(state.failed)} failed"
         return self.limits.spent(state)
 
@@ -231,7 +248,9 @@ class TrialScheduler:
             if not any(other.user_attrs.get(RETRY_OF) == trial.number for other in state.all):
                 kept = {name: value for name, value in trial.user_attrs.items() if name in KEPT_BY_RETRY}
                 of_retry = kept | {RETRY_OF: trial.number, ATTEMPT: attempt + 1}
-                self.study.enqueue_trial(renamed(trial.params), user_attrs=of_retry)
+                # What it was enqueued with, too: its worker may have died before it asked for its values.
+                params = {**trial.system_attrs.get(FIXED_PARAMS, {}), **trial.params}
+                self.study.enqueue_trial(renamed(params), user_attrs=of_retry)
         for name, value in attributes.items():
             self.study._storage.set_trial_user_attr(trial._trial_id, name, value)
         self.study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)

@@ -19,8 +19,10 @@ LEASE, ENV_STEPS, METRICS, FAILURE = "lease", "env_steps", "figures", "failure"
 RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
 # Of a trial that a study has begun with: where it was run, or what its settings are of.
 TAKEN_FROM, ENQUEUED_FROM = "taken_from", "enqueued_from"
-# In the study of final trainings: the trial whose configuration is trained, and the seed.
+# Of a final training: the trial whose configuration is trained, and the seed.
 FINALIST, FINAL_SEED = "judged", "judged_seed"
+# In place of a trial's number: the configuration of the study without what it searches.
+CONTROL = -1
 # A system attribute: the episodes of the final evaluation.
 EPISODES = "episodes"
 # Of a trial, or of a study: who asked it to stop, and when; an empty text where a study goes on again.
@@ -174,6 +176,19 @@ class PendingWrites(list[Callable[[], object]]):
         n_written, done = transaction(lambda: (self.write(), operate()))
         del self[:n_written]
         return done
+
+
+@dataclass(frozen=True)
+class PlannedTrial:
+    """A trial that is to be enqueued.
+
+    Args:
+        params: Its values by the names of the parameters.
+        attributes: Its user attributes.
+    """
+
+    params: Mapping[str, Any]
+    attributes: Mapping[str, Any]
 
 
 @dataclass

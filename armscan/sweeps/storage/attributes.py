@@ -18,8 +18,9 @@ from armscan.sweeps.storage.reports import REPORT
 from armscan.utils.section import Section
 from armscan.utils.validation import LARGEST_SEED
 
-# The study of the final trainings is called like the study, with this suffix.
-FINAL_EVAL_SUFFIX = "-judged"
+# The studies of the final trainings are called like the study, with these suffixes: those that choose a configuration,
+# and those that judge it.
+SELECTION_SUFFIX, JUDGEMENT_SUFFIX = FINAL_SUFFIXES = ("-selection", "-judged")
 # What each of its trials has, and what those have that are complete.
 OF_FINAL, OF_FINISHED = ("judged", "judged_seed"), "figures"
 # What each study of armscan has.
@@ -85,7 +86,7 @@ class TrialAttributes(_Attributes):
     seeds: dict[Annotated[str, Field(pattern=r"^[0-9]{1,10}$")], dict[str, float]] = Field(
         default={}, description="the metrics of each seed"
     )
-    judged: Number = 0
+    judged: int = Field(default=0, ge=-1, le=LARGEST, description="a whole number of at least 0, or -1 for the control")
     judged_seed: int = Field(default=0, ge=0, le=LARGEST_SEED, description=f"a whole number from 0 to {LARGEST_SEED}")
     mlflow_run: Text = ""
     folder: Text = ""
@@ -128,7 +129,7 @@ def check_trial(trial: FrozenTrial, study_name: str, n_objectives: int) -> None:
     TrialAttributes.read(f"{where}.user_attrs", trial.user_attrs)
     if wrong := _wrong_numbers(trial, n_objectives):
         raise StudyError(f"{where} {wrong}")
-    if study_name.endswith(FINAL_EVAL_SUFFIX):
+    if study_name.endswith(FINAL_SUFFIXES):
         _check_final(trial, where)
 
 

@@ -29,7 +29,7 @@ from armscan.sweeps.study.terminators import Terminator
 from armscan.sweeps.tasks.attempt import Task, composed, of_run
 
 TERMINATOR_MEMBERS = ("check", "reason")
-TASK_MEMBERS = ("metrics", "final_metric", "check", "run", "evaluate")
+TASK_MEMBERS = ("metrics", "final_metric", "check", "run", "validate", "evaluate")
 
 
 def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig]:

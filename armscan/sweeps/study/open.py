@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,15 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.config.defaults import to_plain
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import FINAL_SEED, Limits
+from armscan.sweeps.scheduling.state import CONTROL, FINALIST, Limits
 from armscan.sweeps.scheduling.termination import Termination
+from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.space.space import Space
-from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import Storage, open_storage
 from armscan.sweeps.study.components import make_terminator
 from armscan.sweeps.study.constraints import constrained
 from armscan.sweeps.study.dashboard import note_run
+from armscan.sweeps.study.final_eval import FinalEvaluation, training_of
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import STUDY_RUN, make_study, name_objectives
 from armscan.sweeps.tasks.attempt import RUN, STORAGE_TAG, STUDY_TAG, TRIAL_TAG, Attempt, Task, trial_folder
@@ -74,6 +76,10 @@ class Phase:
         """Return the tags by which tracked runs of a trial are known."""
         return {STUDY_TAG: self.name, STORAGE_TAG: self.scheduler.storage.uri, TRIAL_TAG: str(trial.number)}
 
+    def suggest(self, trial: Trial) -> dict[str, Value]:
+        """Return the values of a trial by their keys; the control has none."""
+        return {} if trial.user_attrs.get(FINALIST) == CONTROL else self.space.suggest(trial)
+
     def close_runs_of(self, trial: FrozenTrial) -> None:
         """Close the tracked runs that a dead worker has left open, except those that a retry has resumed."""
         abandon(trial_folder(self.folder, trial.number), self.client, WORKER_DIED)
@@ -104,13 +110,15 @@ class OpenedStudy:
         settings: Settings of the study.
         config: Configuration of its trials, without the searched values.
         search: Phase that searches configurations.
-        final_eval: Phase that trains the best again with other seeds; None without one.
+        final_eval: Final evaluation; None without one.
+        finals: Phases of the final evaluation, which select a configuration and judge it; none without one.
     """
 
     settings: StudySettings
     config: DictConfig
     search: Phase
-    final_eval: Phase | None
+    final_eval: FinalEvaluation | None
+    finals: tuple[Phase, ...]
 
     @property
     def folder(self) -> Path:
@@ -119,8 +127,8 @@ class OpenedStudy:
 
     @property
     def phases(self) -> tuple[Phase, ...]:
-        """The search, and the final evaluation if there is one."""
-        return (self.search,) if self.final_eval is None else (self.search, self.final_eval)
+        """The search, and those of the final evaluation if there is one."""
+        return (self.search, *self.finals)
 
 
 def open_for_work(
@@ -175,8 +183,9 @@ def open_for_work(
         experiment_id=experiment_id,
         run_id=storage.exclusive(tracked_run),
     )
-    final_eval = _final_phase(search, settings, task) if settings.final_eval.top_k else None
-    return OpenedStudy(settings=settings, config=config, search=search, final_eval=final_eval)
+    final_eval = FinalEvaluation.opened(storage, settings, study) if settings.final_eval.top_k else None
+    finals = _final_phases(search, settings, task, final_eval) if final_eval is not None else ()
+    return OpenedStudy(settings=settings, config=config, search=search, final_eval=final_eval, finals=finals)
 
 
 def _termination(settings: StudySettings, study: optuna.Study, storage: Storage) -> Termination | None:
@@ -186,19 +195,24 @@ def _termination(settings: StudySettings, study: optuna.Study, storage: Storage)
     return Termination(study, storage, lambda state: terminator.reason(study, objectives, state), settings.asked)
 
 
-def _final_phase(search: Phase, settings: StudySettings, task: Task) -> Phase:
-    storage, name = search.scheduler.storage, settings.name + FINAL_EVAL_SUFFIX
-    study = storage.exclusive(lambda: optuna.create_study(study_name=name, storage=storage.optuna, load_if_exists=True))
-    check_trials(study, n_searched=len(search.scheduler.study.get_trials(deepcopy=False)))
-    name_objectives(study, [task.final_metric])
+def _final_phases(search: Phase, settings: StudySettings, task: Task, final: FinalEvaluation) -> tuple[Phase, Phase]:
     limits = Limits(n_trials=NO_END, max_failures=settings.max_failures, max_retries=settings.max_retries)
-    return dataclasses.replace(
-        search,
-        name=name,
-        scheduler=TrialScheduler(study, storage, limits, is_open=False),
-        objectives=(task.final_metric,),
-        reported=(),
-        run=task.evaluate,
-        seeds_of=lambda trial: (int(trial.user_attrs[FINAL_SEED]),),
-        folder=search.folder / "judged",
+    shared = partial(dataclasses.replace, search, reported=(), seeds_of=lambda trial: (training_of(trial)[1],))
+    storage = search.scheduler.storage
+    name_objectives(final.selection, search.objectives)
+    name_objectives(final.judgement, [task.final_metric])
+    return (
+        shared(
+            name=final.selection.study_name,
+            scheduler=TrialScheduler(final.selection, storage, limits, final.missing_of_selection),
+            run=task.validate,
+            folder=search.folder / "selection",
+        ),
+        shared(
+            name=final.judgement.study_name,
+            scheduler=TrialScheduler(final.judgement, storage, limits, final.missing_of_judgement),
+            objectives=(task.final_metric,),
+            run=task.evaluate,
+            folder=search.folder / "judged",
+        ),
     )

@@ -15,7 +15,8 @@ from armscan.errors import printable
 from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
-from armscan.sweeps.study.settings import StudySettings
+from armscan.sweeps.study.final_eval import n_trainings
+from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.warm_start import Beginning
 from armscan.utils.console import WHOLE_CHARS, wide_console
 
@@ -41,9 +42,10 @@ def print_plan(settings: StudySettings, study: optuna.Study | None, begins: Sequ
     limits = [f"{settings.n_trials} trials"]
     limits += [f"{settings.timeout_hours:g} hours"] if settings.timeout_hours is not None else []
     limits += [f"{settings.max_env_steps:,} environment steps"] if settings.max_env_steps is not None else []
-    n_final = settings.final_eval.top_k * settings.final_eval.n_seeds
+    fewest, most = n_trainings(settings.final_eval)
     console.print(f"objective  {objectives}, over the seeds {', '.join(map(str, settings.seeds))}")
-    console.print(f"limits     {', '.join(limits)}; {settings.workers} workers; then {n_final} final trainings")
+    console.print(f"limits     {', '.join(limits)}; {settings.workers} workers")
+    console.print(f"then       {_final(settings.final_eval)}")
     for each in begins:
         console.print(printable(f"begins     {each.told}"), markup=False, highlight=False)
     others = (("failed", state.failed), ("waiting", state.waiting))
@@ -59,14 +61,26 @@ def print_plan(settings: StudySettings, study: optuna.Study | None, begins: Sequ
     left = 0 if ended else max(0, settings.n_trials - done)
     if ended:
         console.print(printable(f"ended      {ended}"), markup=False, highlight=False)
-    hours = (left + n_final / max(1, len(settings.seeds))) * mean_s / settings.workers / 3600
+    hours = [(left + n / len(settings.seeds)) * mean_s / settings.workers / 3600 for n in (fewest, most)]
     console.print(
         f"cost       {sum(seconds) / 3600:.2f} hours of workers, {state.busy_hours:.2f} hours in all, "
         f"{state.env_steps:,} environment steps, {spent_mib:.0f} MiB"
     )
     console.print(
-        f"the rest   {left} trials and the final evaluation, about {hours:.2f} hours and "
+        f"the rest   {left} trials and the final evaluation, about {hours[0]:.2f} to {hours[1]:.2f} hours and "
         f"{spent_mib / done * left:.0f} MiB ({mean_s:.0f} s a trial so far)"
+    )
+
+
+def _final(settings: FinalEvalSettings) -> str:
+    """Return how many trainings the final evaluation takes."""
+    fewest, most = n_trainings(settings)
+    if not most:
+        return "no final evaluation"
+    return (
+        f"at least {fewest} and at most {most} final trainings: {settings.top_k} candidates and the control with "
+        f"{settings.min_seeds} to {settings.max_seeds} seeds each to select one, then it and the control with "
+        f"{settings.judge_seeds} others on the test volumes"
     )
 
 

@@ -10,18 +10,18 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
-from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX
+from armscan.sweeps.storage.attributes import FINAL_SUFFIXES
 from armscan.sweeps.study.constraints import Constraint
 from armscan.utils.section import Section
 from armscan.utils.validation import LARGEST_SEED
 
-NAME = re.compile(rf"(?!.*{FINAL_EVAL_SUFFIX}$)\w[\w\-.]{{0,99}}")
-# The first final seed is this much above the largest seed of the search.
-FIRST_SEED_ABOVE, MAX_FINAL_SEEDS = 1000, 1000
-LARGEST_SEARCH_SEED = LARGEST_SEED - FIRST_SEED_ABOVE - MAX_FINAL_SEEDS
+NAME = re.compile(rf"(?!.*(?:{'|'.join(FINAL_SUFFIXES)})$)\w[\w\-.]{{0,99}}")
+# So much above the largest seed of the search are the first seed of the selection, and that of the judgement.
+SELECTION_SEEDS_ABOVE, JUDGEMENT_SEEDS_ABOVE, MAX_FINAL_SEEDS = 1000, 2000, 1000
+LARGEST_SEARCH_SEED = LARGEST_SEED - JUDGEMENT_SEEDS_ABOVE - MAX_FINAL_SEEDS
 T = TypeVar("T")
 OPTUNA_PRUNERS = "optuna.pruners."
 NO_PRUNER = f"{OPTUNA_PRUNERS}NopPruner"
@@ -32,7 +32,7 @@ def check_study_name(where: str, name: Any) -> str:
     if not isinstance(name, str) or not NAME.fullmatch(name):
         raise InvalidValueError(
             f"{where} is {name!r}, but it must begin with a letter, a digit or _, go on with these, - and ., have at "
-            f"most 100 characters and not end in {FINAL_EVAL_SUFFIX}, as final evaluations do"
+            f"most 100 characters and not end in {listed(FINAL_SUFFIXES)}, as final evaluations do"
         )
     return name
 
@@ -76,16 +76,44 @@ Positive = Annotated[int, Field(ge=1, description="a whole number of at least 1"
 Seed = Annotated[int, Field(strict=True, ge=0, le=LARGEST_SEARCH_SEED)]
 
 
+SeedCount = Annotated[int, Field(ge=1, le=MAX_FINAL_SEEDS, description=f"a whole number from 1 to {MAX_FINAL_SEEDS}")]
+
+
 class FinalEvalSettings(Section):
-    """The final evaluation of the best configurations.
+    """The final evaluation: one of the best configurations is selected, and judged beside the control.
+
+    The control is the configuration of the study without what it searches. No search trial was run with any of the
+    seeds, and the judgement has seeds of its own.
 
     Args:
-        top_k: Number of configurations to train again, 0 or more; 0 for no final evaluation.
-        n_seeds: Number of trainings of each, with seeds that no search trial has used.
+        top_k: Number of candidates, the best different configurations of the search; 0 for no final evaluation.
+        min_seeds: Seeds of each candidate, and of the control, in the first round of the selection.
+        max_seeds: Most seeds of each in the selection.
+        judge_seeds: Seeds of the chosen configuration, and of the control, on the test volumes.
     """
 
     top_k: int = Field(ge=0, description="a whole number of at least 0")
-    n_seeds: int = Field(ge=1, le=MAX_FINAL_SEEDS, description=f"a whole number from 1 to {MAX_FINAL_SEEDS}")
+    min_seeds: SeedCount
+    max_seeds: SeedCount
+    judge_seeds: SeedCount
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_earlier_versions(cls, values: Any) -> Any:
+        """Take `n_seeds` of a sweep that was written for an earlier version as `judge_seeds`."""
+        if not isinstance(values, Mapping) or "n_seeds" not in values:
+            return values
+        kept = {key: value for key, value in values.items() if key != "n_seeds"}
+        return kept | {"judge_seeds": values["n_seeds"]}
+
+    @model_validator(mode="after")
+    def _fewest_first(self) -> Self:
+        if self.min_seeds > self.max_seeds:
+            raise InvalidValueError(
+                f"study.final_eval.min_seeds is {self.min_seeds}, but it must be at most study.final_eval.max_seeds, "
+                f"which is {self.max_seeds}"
+            )
+        return self
 
 
 class StudySettings(Limits):
@@ -142,7 +170,7 @@ class StudySettings(Limits):
         min_length=1,
         description=f"a list of at least one seed, such as [0, 1], none twice and none above {LARGEST_SEARCH_SEED}",
     )
-    final_eval: FinalEvalSettings = Field(description="a section with top_k and n_seeds")
+    final_eval: FinalEvalSettings = Field(description="a section with top_k, min_seeds, max_seeds and judge_seeds")
     allow_config_changes: bool = Field(description="true or false")
 
     @model_validator(mode="after")

@@ -1,11 +1,10 @@
-"""A study in its storage, created or compared with the requested settings, and its final trainings."""
+"""A study in its storage, created or compared with the requested settings."""
 
 from __future__ import annotations
 
 import json
 import warnings
 from collections.abc import Mapping, Sequence
-from itertools import product
 from typing import Any
 
 import optuna
@@ -16,11 +15,11 @@ from optuna.trial import FrozenTrial, TrialState
 from armscan.config.defaults import ADDED, NOT_COMPARED
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError
-from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, is_feasible
+from armscan.sweeps.scheduling.state import is_feasible
 from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.components import make
-from armscan.sweeps.study.settings import FIRST_SEED_ABOVE, StudySettings
+from armscan.sweeps.study.settings import StudySettings
 from armscan.tracking import flattened
 
 # User attributes of a study.
@@ -146,25 +145,3 @@ def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:
     for trial in ranked:
         different.setdefault(json.dumps(trial.params, sort_keys=True), trial)
     return list(different.values())[:n_best]
-
-
-def enqueue_final_trials(storage: Storage, settings: StudySettings, search: optuna.Study, final: optuna.Study) -> None:
-    """Enqueue the final trainings that are missing, one for each of the best configurations and seeds."""
-
-    def enqueue() -> None:
-        for trial, seed in missing_final_trials(settings, search, final):
-            final.enqueue_trial(renamed(trial.params), user_attrs={FINALIST: trial.number, FINAL_SEED: seed})
-
-    storage.exclusive(enqueue)
-
-
-def missing_final_trials(
-    settings: StudySettings, search: optuna.Study, final: optuna.Study
-) -> list[tuple[FrozenTrial, int]]:
-    """Return the best trials with each seed for which there is no final training yet."""
-    trials = final.get_trials(deepcopy=False)
-    there = {(trial.user_attrs[FINALIST], trial.user_attrs[FINAL_SEED]) for trial in trials}
-    # None of these seeds was a search trial run with.
-    first = max(settings.seeds) + FIRST_SEED_ABOVE
-    wanted = product(best_trials(search, settings.final_eval.top_k), range(first, first + settings.final_eval.n_seeds))
-    return [(trial, seed) for trial, seed in wanted if (trial.number, seed) not in there]

@@ -18,7 +18,7 @@ from armscan.errors import StudyError, listed
 from armscan.sweeps.scheduling.state import ENQUEUED_FROM, ENV_STEPS, FINISHED, METRICS, SEEDS, TAKEN_FROM
 from armscan.sweeps.space.parameter import Value, as_kept, overrides_of, written
 from armscan.sweeps.space.space import Space
-from armscan.sweeps.storage.attributes import FINAL_EVAL_SUFFIX, check_trials
+from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.settings import StudySettings
@@ -142,7 +142,7 @@ def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], stor
 
 def _source(settings: StudySettings, name: str, storage: Storage | None) -> optuna.Study:
     names = [] if storage is None else optuna.get_all_study_names(storage.optuna)
-    others = sorted(each for each in names if each != settings.name and not each.endswith(FINAL_EVAL_SUFFIX))
+    others = sorted(each for each in names if each != settings.name and not each.endswith(FINAL_SUFFIXES))
     if storage is None or name not in others:
         there = listed(others) if others else "none is there"
         raise StudyError(f"study.warm_start names {name!r}, but it must be another study of the storage: {there}")

@@ -181,8 +181,14 @@ class Task(Protocol):
             optuna.TrialPruned: If the trial is not worth going on with.
         """
 
+    def validate(self, attempt: Attempt) -> dict[str, float]:
+        """Run a candidate with one seed, and return the metrics that `run` returns, of the validation volumes.
+
+        Candidates are compared by them, so they must not be those of the best of several looks.
+        """
+
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
-        """Run one of the best configurations with a seed that did not choose it, and returns the metrics of the test.
+        """Run the chosen configuration, or the control, with one other seed, and return the metrics of the test.
 
         Their names begin with `test/`.
         """

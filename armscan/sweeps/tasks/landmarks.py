@@ -52,6 +52,11 @@ class LandmarksTask:
         config, _ = attempt.config(attempt.seeds[0])
         return self._run_task(config, volumes_of(config).training)
 
+    def validate(self, attempt: Attempt) -> dict[str, float]:
+        """Look at the validation volumes. See `Task.validate`."""
+        config, _ = attempt.config(attempt.seeds[0])
+        return self._run_task(config, volumes_of(config).validation)
+
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
         """Look at the test volumes. See `Task.evaluate`."""
         config, _ = attempt.config(attempt.seeds[0])

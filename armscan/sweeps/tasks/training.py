@@ -27,10 +27,12 @@ from armscan.tracking import TrackedRun, draw_learning_curve, open_store, run_of
 from armscan.tracking.run import PARENT_TAG
 from armscan.training import (
     TEST,
+    VALIDATION,
     Budget,
     EpochReport,
     Evaluation,
     TrainingResult,
+    evaluate,
     record_episode,
     resume_from_checkpoint,
 )
@@ -38,6 +40,8 @@ from armscan.utils.files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, RUN_FILE, 
 from armscan.utils.log import log
 from armscan.utils.retry import RETRY_S
 
+# First seed of the episodes that candidates are compared by, which are played for nothing else.
+SELECTION_SEED = 7 * 10**6
 # Of each training, beside the metrics of its best validation.
 TRAINING_METRICS = (ENV_STEPS, "training_s", "solved")
 Conclude = Callable[[Experiment, TrainingResult, TrackedRun, Path], dict[str, float]]
@@ -110,10 +114,29 @@ class TrainingTask:
         of_seeds = [attempt.seeds_done[seed] for seed in attempt.seeds]
         return {name: float(interquartile_mean([metrics[name] for metrics in of_seeds])) for name in of_seeds[0]}
 
+    def validate(self, attempt: Attempt) -> dict[str, float]:
+        """Train, and play episodes on the validation volumes that chose no weights; returns their metrics."""
+        (seed,) = attempt.seeds
+        return _trained(attempt, seed, partial(_validated, attempt))
+
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
         """Train, evaluate, record a video and keep the policy; returns the metrics of the test."""
         (seed,) = attempt.seeds
         return _trained(attempt, seed, partial(_concluded, attempt))
+
+
+def _validated(
+    attempt: Attempt, setup: Experiment, result: TrainingResult, tracked: TrackedRun, folder: Path
+) -> dict[str, float]:
+    """Evaluate a trained agent on the validation volumes; returns its metrics there."""
+    seed, n_episodes = SELECTION_SEED + setup.seed, setup.n_episodes
+    played = evaluate(setup.agent, setup.validation_env, n_episodes=n_episodes, seed=seed, on_plane=setup.on_plane)
+    attempt.keep_episodes({VALIDATION: played})
+    metrics = played.metrics()
+    tracked.log_metrics(
+        {f"selection/{name}": value for name, value in metrics.items()}, n_env_steps=result.best.n_env_steps
+    )
+    return metrics
 
 
 def _concluded(

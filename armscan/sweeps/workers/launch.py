@@ -19,8 +19,8 @@ from armscan.config.error_messages import one_line_message
 from armscan.config.sources import working_folder
 from armscan.errors import ArmscanError, StudyError
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, silence_launcher
+from armscan.sweeps.results.judgement import best_metrics
 from armscan.sweeps.results.progress import progress_display
-from armscan.sweeps.results.summary import best_metrics
 from armscan.sweeps.space.parameter import written
 from armscan.sweeps.study.arguments import STORAGE, USUAL_LAUNCHER, WORKER_KEY, StudyCommand, fixed_by
 from armscan.sweeps.study.open import OpenedStudy
@@ -143,8 +143,7 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
             for phase in opened.phases:
                 for trial in phase.scheduler.reclaim(LivenessCheck().is_dead):
                     phase.close_runs_of(trial)
-            evaluated = opened.final_eval.scheduler.study.get_trials(deepcopy=False) if opened.final_eval else []
-            tracked.log_metrics(best_metrics(opened.search.scheduler.study, evaluated), n_env_steps=0)
+            tracked.log_metrics(best_metrics(opened.search.scheduler.study, opened.final_eval), n_env_steps=0)
         _deliver(opened, tracked, "KILLED" if is_asked.is_set() else status)
         for each, handler in before.items():
             signal.signal(each, handler)

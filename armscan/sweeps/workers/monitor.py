@@ -11,7 +11,6 @@ from collections.abc import Iterator
 
 from armscan.errors import ArmscanError, StorageAwayError
 from armscan.sweeps.study.open import OpenedStudy
-from armscan.sweeps.study.study import missing_final_trials
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.utils.retry import no_retry
 
@@ -33,14 +32,13 @@ class StudyMonitor:
     def is_over(self) -> bool:
         """Return whether no trial is running, and none is missing."""
         for phase in self._opened.phases:
-            phase.scheduler.look_for_stop()
+            stopped = phase.scheduler.look_for_stop()
             state = phase.scheduler.state()
             if state.running or phase.scheduler.end(state) is None:
                 return False
-        search, final = self._opened.search.scheduler, self._opened.final_eval
-        if final is None or search.stopped or search.broken(search.state()):
-            return True
-        return not missing_final_trials(self._opened.settings, search.study, final.scheduler.study)
+            if stopped or phase.scheduler.broken(state):
+                return True
+        return True
 
     def is_alive(self) -> bool:
         """Return whether the worker of any trial is."""

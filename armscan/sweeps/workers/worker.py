@@ -24,7 +24,6 @@ from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.components import make, read_settings
 from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_picture, shown_metrics
 from armscan.sweeps.study.open import Phase, open_for_work
-from armscan.sweeps.study.study import enqueue_final_trials
 from armscan.sweeps.tasks.attempt import (
     CONFIG_SHA256,
     FOLDER,
@@ -127,7 +126,7 @@ class Worker:
         seed = np.random.SeedSequence((phase.seed, trial.number)).generate_state(1)[0]
         trial.study.sampler = make("sampler", phase.sampler, BaseSampler, seed=int(seed))
         # Of a new object each time: what the trial believes written may have been lost with the connection.
-        chosen = phase.scheduler.storage.transaction(lambda: phase.space.suggest(Trial(trial.study, trial._trial_id)))
+        chosen = phase.scheduler.storage.transaction(lambda: phase.suggest(Trial(trial.study, trial._trial_id)))
         config, choices = composed([*self._words, *overrides_of(chosen)])
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)
@@ -247,10 +246,7 @@ def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None
             reason = Worker(phase, words, heartbeat).work()
         log(f"{phase.name}: {reason}")
 
-    search, final = opened.search, opened.final_eval
-    run_phase(search)
-    state = search.scheduler.state()
-    is_over = search.scheduler.look_for_stop() or search.scheduler.broken(state)
-    if final is not None and state.finished and not is_over:
-        enqueue_final_trials(search.scheduler.storage, opened.settings, search.scheduler.study, final.scheduler.study)
-        run_phase(final)
+    for phase in opened.phases:
+        run_phase(phase)
+        if phase.scheduler.look_for_stop() or phase.scheduler.broken(phase.scheduler.state()):
+            return

@@ -14,6 +14,8 @@ from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.storage.storage import open_storage
 from tests.sweeps.conftest import fail
+from tests.sweeps.study.test_final_eval import QUIET
+from tests.sweeps.study.test_final_eval import run as run_final
 
 
 @pytest.fixture
@@ -141,6 +143,27 @@ def test_videos_are_after_the_charts_and_pruned_trials_look_so(answer, tmp_path)
     assert page.index("<h2>Parallel") < page.index("<h2>Episodes on a test volume") < page.index("<h2>Trials")
     lines = {each["name"]: each["marker"]["symbol"][-1] for each in chart_below(page, "While training")}
     assert lines == {"finished": "circle", "pruned": "x", "failed": "circle"}
+
+
+def test_report_shows_how_a_study_decided(answer, tmp_path, browser):
+    run_final(str(tmp_path / "optuna.journal"), chance=QUIET)
+    assert answer("--study=a") == (0, "look at   reports/a/report.html\n", "")
+    folder = tmp_path / "reports" / "a"
+    page = (folder / "report.html").read_text()
+    assert "Trial 1 is better than the default configuration: steps, mean." in page
+    of_candidates = chart_below(page, "How this study decides")
+    # Dots of the seeds and a diamond with the interval, of each candidate.
+    assert [len(each["x"]) > 1 for each in of_candidates] == [True, False] * 3
+    assert of_candidates[0]["y"][0] == "trial 1, chosen"
+    scores = rows(folder / "selection.csv")
+    assert {row["candidate"]: row["outcome"] for row in scores} == {"1": "chosen", "control": "dropped", "0": "dropped"}
+    steps, success = rows(folder / "differences.csv")
+    assert (steps["chosen"], steps["figure"], success["difference"]) == ("1", "test/mean_steps", "0.0")
+    assert float(steps["low"]) < float(steps["difference"]) < float(steps["high"]) < 0
+    browser.open((folder / "report.html").as_uri())
+    browser.count(".js-plotly-plot .main-svg", at_least=3)
+    for width in (1600, 390):
+        assert browser.wider_than_page(width) == []
 
 
 def test_running_trials_are_listed_with_how_far_they_are(answer, tmp_path):

@@ -11,7 +11,17 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.scheduling.state import ATTEMPT, FAILURE, LEASE, RETRIED, RETRY_OF, StudyState
+from armscan.sweeps.scheduling.state import (
+    ATTEMPT,
+    FAILURE,
+    FINAL_SEED,
+    FINALIST,
+    LEASE,
+    RETRIED,
+    RETRY_OF,
+    PlannedTrial,
+    StudyState,
+)
 from armscan.sweeps.workers import heartbeat as lease_module
 from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
 from armscan.utils.processes import ProcessInfo, process_start
@@ -193,15 +203,39 @@ def test_workers_killed_at_any_moment_lose_no_trial_and_make_none_too_many(make_
     assert len({trial.params["x"] for trial in state.finished}) == n_trials
 
 
-def test_closed_ledger_runs_only_what_waits(make_scheduler):
-    scheduler = make_scheduler(n_trials=9, is_open=False)
+def test_study_with_a_plan_runs_what_is_planned_each_once_and_what_is_planned_after_it(make_scheduler):
+    def plan():
+        """Two trials, and a third once both have ended."""
+        trials = scheduler.study.get_trials(deepcopy=False)
+        ended = sum(trial.state.is_finished() for trial in trials)
+        planned = [PlannedTrial({"x": float(n)}, {FINALIST: n, FINAL_SEED: 7}) for n in range(2 if ended < 2 else 3)]
+        return planned[len(trials) :]
+
+    scheduler = make_scheduler(n_trials=9, plan=plan)
+    other = make_scheduler(n_trials=9, plan=plan)
+    trials = [scheduler.claim({}), other.claim({})]
+    assert [trial.user_attrs[FINALIST] for trial in trials] == [0, 1]
     assert scheduler.claim({}) is None
-    scheduler.study.enqueue_trial({"x": 1.0})
-    trial = scheduler.claim({})
-    assert trial.suggest_float("x", 0, 2) == 1.0
-    assert scheduler.claim({}) is None
-    finish(scheduler, trial)
-    assert scheduler.end(scheduler.state()) == "1 trials have finished, 0 failed"
+    assert not scheduler.has_more(scheduler.state())
+    for number, trial in enumerate(trials):
+        assert trial.suggest_float("x", 0, 5) == number
+        finish(scheduler, trial)
+    assert scheduler.end(scheduler.state()) is None
+    last = other.claim({})
+    assert last.suggest_float("x", 0, 5) == 2.0
+    finish(other, last)
+    assert scheduler.end(scheduler.state()) == "3 trials have finished, 0 failed"
+
+
+def test_retry_of_a_planned_trial_whose_worker_died_before_it_asked_for_its_values_has_them(make_scheduler):
+    scheduler = make_scheduler()
+    scheduler.study.enqueue_trial({"x": 0.125}, user_attrs={FINALIST: 3, FINAL_SEED: 7})
+    scheduler.claim({"worker": "a", "host": "there"})
+    scheduler.reclaim(lambda _: True)
+    again = scheduler.claim({})
+    assert again.user_attrs[RETRY_OF] == 0
+    assert again.user_attrs[FINALIST] == 3
+    assert again.suggest_float("x", 0, 1) == 0.125
 
 
 def test_tally_counts_the_time_in_which_anything_ran_once(make_scheduler):

@@ -133,6 +133,10 @@ def test_attribute_of_a_study_of_any_type_is_refused_in_one_line_or_harmless(tmp
         ({FINAL_SEED: 3}, r"a.trials\[0\].user_attrs has no judged, as each final training has"),
         ({FINALIST: 0}, "has no judged_seed"),
         ({FINALIST: 0, FINAL_SEED: 3}, "has no figures"),
+        (
+            {FINALIST: -2, FINAL_SEED: 3, METRICS: {}},
+            "judged is -2, but it must be a whole number of at least 0, or -1",
+        ),
         ({FINALIST: 7, FINAL_SEED: 3, METRICS: {}}, "judged is 7, but it must be the number of one of 4 trials"),
     ],
 )

@@ -15,7 +15,7 @@ from armscan.sweeps.study.study import STUDY_RUN
 from armscan.tracking import open_store
 from tests.sweeps.study.test_study import settings
 
-TASK = SimpleNamespace(run=None, evaluate=None, final_metric="test/mean_steps")
+TASK = SimpleNamespace(run=None, validate=None, evaluate=None, final_metric="test/mean_steps")
 
 
 @pytest.fixture

@@ -8,8 +8,9 @@ from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
 from armscan.sweeps.study.components import read_settings
+from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
-from armscan.sweeps.study.study import enqueue_final_trials, make_study
+from armscan.sweeps.study.study import make_study
 
 FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
 
@@ -34,7 +35,7 @@ def settings(**changes):
         "workers": 1,
         "seed": 0,
         "seeds": (0,),
-        "final_eval": FinalEvalSettings(top_k=0, n_seeds=1),
+        "final_eval": FinalEvalSettings(top_k=0, min_seeds=1, max_seeds=1, judge_seeds=1),
         "allow_config_changes": False,
     }
     return StudySettings(**values | changes)
@@ -97,12 +98,11 @@ def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_
     ratio = trial.suggest_float("agent.updates_per_env_step", **lr)
     study.tell(trial, 1.0)
     fixed = {"env": {"_target_": "armscan.envs.EnvFactory"}, "agent": {"learning_starts": 2000}}
-    final_eval = FinalEvalSettings(top_k=1, n_seeds=1)
+    final_eval = FinalEvalSettings(top_k=1, min_seeds=1, max_seeds=1, judge_seeds=1)
     now = settings(space=Space.read({"agent.utd_ratio": lr}), final_eval=final_eval)
     search = make_study(storage, now, fixed)
-    final = optuna.create_study(study_name="a-judged", storage=storage.optuna)
-    enqueue_final_trials(storage, now, search, final)
-    assert final.ask().suggest_float("agent.utd_ratio", **lr) == ratio
+    control, best = FinalEvaluation.opened(storage, now, search).missing_of_selection()
+    assert (control.params, best.params) == ({}, {"agent.utd_ratio": ratio})
 
 
 def test_space_is_changed_key_by_key_on_the_command_line():

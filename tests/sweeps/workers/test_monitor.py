@@ -9,9 +9,8 @@ import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, METRICS, Limits
+from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, METRICS, STOP, Limits, PlannedTrial
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.study import missing_final_trials
 from armscan.sweeps.workers import monitor as module
 from armscan.sweeps.workers.monitor import StudyMonitor
 from tests.support.waiting import HANG_S
@@ -31,20 +30,22 @@ def watch(make_scheduler, storage_uri, monkeypatch):
     for name, value in (("LOOK_S", 0.05), ("OVER_S", 0.2), ("LIFELESS_S", 60.0)):
         monkeypatch.setattr(module, name, value)
 
-    def watch(top_k=0):
+    def watch(n_final=0):
         scheduler = make_scheduler(n_trials=2)
         phases = [SimpleNamespace(name="a", scheduler=scheduler)]
-        if top_k:
+        if n_final:
             storage = open_storage(storage_uri)
             final = optuna.create_study(study_name="a-judged", storage=storage.optuna)
-            scheduler_of_final = TrialScheduler(final, storage, Limits(n_trials=9), is_open=False)
+
+            def plan():
+                n_begun = len(final.get_trials(deepcopy=False))
+                return [PlannedTrial({}, {FINALIST: 0, FINAL_SEED: seed}) for seed in range(n_begun, n_final)]
+
+            scheduler_of_final = TrialScheduler(final, storage, Limits(n_trials=9), plan)
             phases.append(SimpleNamespace(name="a-judged", scheduler=scheduler_of_final))
-        settings = SimpleNamespace(final_eval=SimpleNamespace(top_k=top_k, n_seeds=1), seeds=(0,))
         first, second = scheduler.claim(ELSEWHERE), scheduler.claim(ELSEWHERE)
         scheduler.study.tell(first, 1.0)
-        opened = SimpleNamespace(phases=phases, search=phases[0], final_eval=phases[1] if top_k else None)
-        opened.settings = watch.settings = settings
-        return StudyMonitor(opened), *(phase.scheduler for phase in phases), second
+        return StudyMonitor(SimpleNamespace(phases=phases)), *(phase.scheduler for phase in phases), second
 
     return watch
 
@@ -57,15 +58,20 @@ def test_study_is_over_when_enough_trials_have_finished_and_none_is_running(watc
 
 
 def test_study_is_over_when_its_final_evaluation_is(watch):
-    monitor, scheduler, final, running = watch(top_k=1)
+    monitor, scheduler, final, running = watch(n_final=1)
     scheduler.study.tell(running, 1.0)
     assert not monitor.is_over()
-    ((best, seed),) = missing_final_trials(watch.settings, scheduler.study, final.study)
-    final.study.enqueue_trial({}, user_attrs={FINALIST: best.number, FINAL_SEED: seed})
+    trial = final.claim(ELSEWHERE)
     assert not monitor.is_over()
-    trial = final.study.ask()
     trial.set_user_attr(METRICS, {})
     final.study.tell(trial, 1.0)
+    assert monitor.is_over()
+
+
+def test_study_that_was_stopped_is_over_without_its_final_evaluation(watch):
+    monitor, scheduler, _, running = watch(n_final=1)
+    scheduler.study.tell(running, 1.0)
+    scheduler.study.set_user_attr(STOP, "by me")
     assert monitor.is_over()
 
 

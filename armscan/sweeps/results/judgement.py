@@ -1,0 +1,182 @@
+"""The result of a study: the chosen configuration beside the control, on the test volumes, seed by seed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import optuna
+from optuna.trial import FrozenTrial, TrialState
+
+from armscan.stats.aggregation import probability_of_improvement
+from armscan.stats.bootstrap import Estimate
+from armscan.stats.paired import paired_difference
+from armscan.sweeps.results.summary import OF_TEST, ConfigResult, final_results, scores_of
+from armscan.sweeps.scheduling.state import CONTROL, METRICS
+from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, training_of
+from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, best_trials
+from armscan.training.metrics import ENDS
+from armscan.training.titles import is_rate, leading_among, title_of
+
+MAXIMIZE = "maximize"
+HOW = (
+    "A difference is the mean over all seeds and test volumes, each beside itself; its interval is for other seeds and "
+    "other volumes. The probability of improvement: a training of the chosen configuration is better on a volume than "
+    "one of the control. Rates differ by percentage points."
+)
+
+
+class Difference(NamedTuple):
+    """Difference of a metric between the chosen configuration and the control.
+
+    Args:
+        metric: Name of the metric.
+        is_higher_better: Whether higher values are better.
+        paired: Mean over the seeds and volumes of the chosen one's value less the control's, with its 95 % interval.
+        probability: Probability that a training of the chosen one is better on a volume than one of the control.
+    """
+
+    metric: str
+    is_higher_better: bool
+    paired: Estimate
+    probability: Estimate
+
+    @property
+    def verdict(self) -> str:
+        """Whether the interval says `better` or `worse`; empty where it holds no difference, or there is none."""
+        above, below = ("better", "worse") if self.is_higher_better else ("worse", "better")
+        return above if self.paired.low > 0 else below if self.paired.high < 0 else ""
+
+    def row(self) -> dict[str, str]:
+        """Return what a table shows of it, by column."""
+        unit, factor = (" points", 100.0) if is_rate(self.metric) else ("", 1.0)
+        value, low, high = (f"{factor * each:+.3g}" for each in self.paired)
+        interval = f"{low} to {high}" if math.isfinite(self.paired.low) else ""
+        if self.paired.low == self.paired.high:
+            interval = "none: all differences are alike"
+        better = "higher" if self.is_higher_better else "lower"
+        return {
+            "on the test volumes": f"{title_of(self.metric)} ({better} is better)",
+            "chosen less control": f"{value}{unit}",
+            "95 % interval": interval,
+            "probability of improvement": f"{self.probability.value:.0%}",
+            "its 95 % interval": (
+                f"{self.probability.low:.0%} to {self.probability.high:.0%}"
+                if math.isfinite(self.probability.low)
+                else ""
+            ),
+        }
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the test volumes say of the chosen configuration.
+
+    Args:
+        chosen: The configuration: the number of a trial, or that of the control.
+        results: Results of the chosen one and the control, as far as their trainings have finished.
+        differences: Differences of the objectives and of the leading metrics; none where the control was chosen.
+        n_seeds: Number of seeds that both have been trained with.
+        n_planned: Number of seeds that they are to be trained with.
+        others: Other trials that the test volumes have been opened for, because the study went on after its end.
+    """
+
+    chosen: int
+    results: tuple[ConfigResult, ...]
+    differences: tuple[Difference, ...]
+    n_seeds: int
+    n_planned: int
+    others: tuple[int, ...]
+
+    @property
+    def notes(self) -> list[str]:
+        """What has to be said of the judgement."""
+        notes = []
+        if self.n_seeds < self.n_planned:
+            notes.append(f"only {self.n_seeds} of {self.n_planned} seeds have been trained to their end")
+        if names := ", ".join(map(name_of, self.others)):
+            notes.append(f"the test volumes were opened before for {names}: the study went on after its end")
+        return notes
+
+    @property
+    def statement(self) -> str:
+        """The result in a sentence."""
+        if self.chosen == CONTROL:
+            return (
+                "No setting beat the default configuration: of all candidates, the control was the best on the "
+                "validation volumes."
+            )
+        name = name_of(self.chosen).capitalize()
+        if not self.differences:
+            return f"{name} was chosen; it has not been judged beside the control yet."
+        first = self.differences[0]
+        if first.verdict:
+            return f"{name} is {first.verdict} than the default configuration: {title_of(first.metric)}."
+        return (
+            f"{name} was chosen, but the test volumes do not show that it is better than the default configuration: "
+            f"the interval of the difference holds 0 ({title_of(first.metric)})."
+        )
+
+
+def judge(final: FinalEvaluation) -> Judgement | None:
+    """Return what the test volumes say; None before a configuration was chosen."""
+    chosen = final.race().chosen
+    if chosen is None:
+        return None
+    complete = final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    judged = {training_of(trial): trial for trial in complete}
+    both = final.judged()
+    now = [judged[number, seed] for number in both for seed in final.judge_seeds if (number, seed) in judged]
+    seeds = [seed for seed in final.judge_seeds if all((number, seed) in judged for number in both)]
+    pairs = [[judged[number, seed] for seed in seeds] for number in both]
+    differences = _differences(final.search, *pairs) if seeds and chosen != CONTROL else ()
+    others = sorted({number for number, _ in judged} - set(both))
+    return Judgement(
+        chosen, tuple(final_results(now)), tuple(differences), len(seeds), len(final.judge_seeds), tuple(others)
+    )
+
+
+def best_metrics(search: optuna.Study, final: FinalEvaluation | None) -> dict[str, float]:
+    """Return the leading metrics of a study's best trial and of its result, by the names that runs use.
+
+    Args:
+        search: Study of the search.
+        final: Its final evaluation; None without one.
+    """
+    found: dict[str, float] = {}
+    if best := best_trials(search, 1):
+        metrics = best[0].user_attrs.get(METRICS, {})
+        found |= {f"validation/{name}": metrics[name] for name in leading_among(metrics)}
+    judgement = judge(final) if final is not None else None
+    if judgement is None or not judgement.results:
+        return found
+    of_chosen = judgement.results[0].figures.metrics()
+    found |= {f"test_volumes/{name}": of_chosen[name] for name in leading_among(of_chosen)}
+    for each in judgement.differences:
+        for key, estimate in (("difference", each.paired), ("probability_of_improvement", each.probability)):
+            names = (f"{key}/{each.metric}{end}" for end in ("", *ENDS))
+            found |= dict(zip(names, estimate, strict=True))
+    return found
+
+
+def _differences(
+    search: optuna.Study, chosen: Sequence[FrozenTrial], control: Sequence[FrozenTrial]
+) -> Iterator[Difference]:
+    """Yield the differences of the metrics that all trainings have; both have the same seeds, in order."""
+    metrics = [trial.user_attrs[METRICS] for trial in (*chosen, *control)]
+    common = set.intersection(*map(set, metrics))
+    tested = [name.removeprefix(OF_TEST) for name in metrics[0] if name in common and name.startswith(OF_TEST)]
+    objectives = search.user_attrs[DASHBOARD_OBJECTIVES]
+    # First what the configuration was selected by.
+    for name in dict.fromkeys((*(name for name in objectives if name in tested), *leading_among(tested))):
+        scores = scores_of(OF_TEST + name, metrics)
+        if not np.isfinite(scores).all():
+            continue
+        ours, theirs = scores[: len(chosen)], scores[len(chosen) :]
+        is_higher_better = objectives[name] == MAXIMIZE if name in objectives else is_rate(name)
+        sign = 1.0 if is_higher_better else -1.0
+        probability = probability_of_improvement(sign * ours, sign * theirs)
+        yield Difference(name, is_higher_better, paired_difference(ours, theirs), probability)

@@ -1,0 +1,167 @@
+"""How a study has chosen its configuration: the candidates on the validation volumes, as rows and as a chart."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from optuna.trial import TrialState
+from plotly.graph_objects import Figure
+
+from armscan.reports.chart_style import BLUE, GREY, ORANGE
+from armscan.reports.html import chart, table
+from armscan.stats.bootstrap import Estimate
+from armscan.sweeps.results.charts import PERCENT
+from armscan.sweeps.results.judgement import Judgement
+from armscan.sweeps.scheduling.racing import DROP_LEVEL, Race
+from armscan.sweeps.scheduling.state import CONTROL, StudyState
+from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of
+from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES
+from armscan.training.titles import is_rate, title_of, value_text
+
+ROW_PX, AROUND_PX = 44, 110
+
+
+class Candidate(NamedTuple):
+    """A candidate of the selection.
+
+    Args:
+        number: Number of its trial, or that of the control.
+        scores: The objective on the validation volumes by seed, NaN for a training that failed.
+        estimate: Its mean with the 95 % interval by which candidates are compared.
+        n_seeds: Number of seeds that the estimate is over.
+        outcome: What became of it: `chosen`, `dropped`, `failed`, `not chosen`, or `in the race`.
+        settings: Its values as overrides.
+    """
+
+    number: int
+    scores: dict[int, float]
+    estimate: Estimate
+    n_seeds: int
+    outcome: str
+    settings: str
+
+    @property
+    def name(self) -> str:
+        """How people call it."""
+        return name_of(self.number)
+
+    def row(self, objective: str) -> dict[str, str]:
+        """Return what a table shows of it, by column."""
+        value, low, high = (value_text(objective, each) for each in self.estimate)
+        is_known = math.isfinite(self.estimate.value)
+        return {
+            "candidate": self.name,
+            "seeds": str(len(self.scores)),
+            title_of(objective): value if is_known else "",
+            "95 % interval": f"{low} to {high}" if math.isfinite(self.estimate.low) else "",
+            "outcome": self.outcome,
+        }
+
+
+def objective_of(final: FinalEvaluation) -> str:
+    """Return the metric that candidates are compared by."""
+    return str(next(iter(final.search.user_attrs[DASHBOARD_OBJECTIVES])))
+
+
+def candidates_of(final: FinalEvaluation) -> list[Candidate]:
+    """Return the candidates, the chosen one first, then those that were in the race for longest."""
+    race, sign = final.race(), final.sign
+    searched = final.search.get_trials(deepcopy=False)
+    found = []
+    for number, scores in final.scores().items():
+        standing = race.standings[number]
+        value, *ends = (sign * each for each in standing.estimate)
+        low, high = sorted(ends)
+        found.append(
+            Candidate(
+                number,
+                {seed: sign * score for seed, score in sorted(scores.items())},
+                Estimate(value, low, high),
+                standing.n_seeds,
+                _outcome(race, number, scores),
+                "" if number == CONTROL else " ".join(overrides_of(searched[number].params)),
+            )
+        )
+    return sorted(found, key=lambda each: (each.number != race.chosen, -each.n_seeds, -sign * each.estimate.value))
+
+
+def _outcome(race: Race, number: int, scores: Mapping[int, float]) -> str:
+    if number == race.chosen:
+        return "chosen"
+    if not race.standings[number].is_in:
+        return "failed" if any(map(math.isnan, scores.values())) else "dropped"
+    return "not chosen" if race.is_over else "in the race"
+
+
+def selection_chart(candidates: Sequence[Candidate], objective: str) -> Figure:
+    """Return the candidates with their intervals, and a dot for each seed."""
+    figure = Figure()
+    labels = [f"{each.name}, {each.outcome}" for each in candidates]
+    for each, label in zip(candidates, labels, strict=True):
+        colour = ORANGE if each.outcome == "chosen" else BLUE if each.number == CONTROL else GREY
+        value, low, high = each.estimate
+        said = html.escape(each.settings or NOTHING_SEARCHED)
+        figure.add_scatter(
+            x=list(each.scores.values()),
+            y=[label] * len(each.scores),
+            text=[f"seed {seed}" for seed in each.scores],
+            hovertemplate=f"%{{text}}: %{{x}}<extra>{each.name}</extra>",
+            mode="markers",
+            marker={"color": colour, "opacity": 0.45, "size": 9},
+            showlegend=False,
+        )
+        figure.add_scatter(
+            x=[value],
+            y=[label],
+            error_x={"type": "data", "symmetric": False, "array": [high - value], "arrayminus": [value - low]},
+            hovertemplate=f"%{{x:.4g}} ({low:.4g} to {high:.4g})<br>{said}<extra>{each.name}</extra>",
+            mode="markers",
+            marker={"color": colour, "symbol": "diamond", "size": 12},
+            showlegend=False,
+        )
+    axis: dict[str, Any] = {"title": f"{title_of(objective)}, validation volumes"}
+    figure.update_xaxes(**axis, **(PERCENT if is_rate(objective) else {}))
+    figure.update_yaxes(autorange="reversed", automargin=True, categoryorder="array", categoryarray=labels)
+    return figure.update_layout(height=AROUND_PX + ROW_PX * len(candidates))
+
+
+def score_rows(candidates: Sequence[Candidate]) -> Iterator[dict[str, Any]]:
+    """Yield the score of each training of the selection."""
+    for each in candidates:
+        for seed, score in each.scores.items():
+            yield {"candidate": key_of(each.number), "seed": seed, "score": score, "outcome": each.outcome}
+
+
+def decided(
+    final: FinalEvaluation, judgement: Judgement | None, candidates: Sequence[Candidate], searched: StudyState
+) -> str:
+    """Return how a study has decided, step by step, as HTML."""
+    n_pruned = sum(trial.state == TrialState.PRUNED for trial in searched.finished)
+    objective, settings = objective_of(final), final.settings
+    better = "higher" if final.sign > 0 else "lower"
+    n_selected = sum(len(each.scores) for each in candidates)
+    n_candidates = max(0, len(candidates) - 1)
+    steps = [
+        f"<b>Search</b>: {len(searched.finished)} trials, {n_pruned} of them pruned. Its {n_candidates} best different "
+        f"configurations are candidates, beside the control: {NOTHING_SEARCHED}.",
+        f"<b>Selection</b>, on the validation volumes: {n_selected} trainings with seeds that the search has not used "
+        f"({settings.min_seeds} to {settings.max_seeds} of each candidate), compared by "
+        f"{html.escape(title_of(objective))} ({better} is better). Those that were behind the "
+        f"leader with {DROP_LEVEL:.0%} confidence got no further seed. Of the others, the one with the best "
+        "unfavourable end of its interval is chosen.",
+    ]
+    if judgement is not None:
+        judged = "the control alone" if judgement.chosen == CONTROL else f"{name_of(judgement.chosen)} and the control"
+        steps.append(
+            f"<b>Judgement</b>, on the test volumes: {judged}, with {settings.judge_seeds} seeds of their own."
+        )
+    listed = "".join(f"<li>{step}</li>" for step in steps)
+    if not candidates:
+        return f"<h2>How this study decides</h2><ol>{listed}</ol>"
+    drawn = chart(selection_chart(candidates, objective))
+    rows = table([each.row(objective) for each in candidates])
+    return f"<h2>How this study decides</h2><ol>{listed}</ol>{drawn}{rows}"

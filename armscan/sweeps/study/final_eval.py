@@ -1,0 +1,202 @@
+"""The final evaluation of a study: which trainings are missing, which configuration is selected, which seeds judge it.
+
+All of it is read from the storage. The candidates race on the validation volumes; the test volumes are opened for the
+chosen one and the control alone, with other seeds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import optuna
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, Trial, TrialState
+from pydantic import Field
+
+from armscan.config.legacy import renamed
+from armscan.errors import StudyError
+from armscan.sweeps.scheduling.racing import Race, budget, race
+from armscan.sweeps.scheduling.state import CONTROL, FINAL_SEED, FINALIST, RETRIED, PlannedTrial
+from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
+from armscan.sweeps.storage.storage import Storage
+from armscan.sweeps.study.settings import (
+    JUDGEMENT_SEEDS_ABOVE,
+    LARGEST_SEARCH_SEED,
+    SELECTION_SEEDS_ABOVE,
+    FinalEvalSettings,
+    StudySettings,
+)
+from armscan.sweeps.study.study import best_trials
+from armscan.utils.section import Section
+
+# User attribute of the study of the selection: its settings, for reports.
+FINAL_EVAL = "final_eval"
+# What the control is.
+NOTHING_SEARCHED = "the configuration of the study without what it searches"
+ENDED_WITHOUT_SCORE = (TrialState.FAIL, TrialState.PRUNED)
+
+
+class _Stored(Section):
+    """What the study of the selection has kept: its settings, and the largest seed of the search."""
+
+    settings: FinalEvalSettings = Field(description="a section with top_k, min_seeds, max_seeds and judge_seeds")
+    search_seed: int = Field(ge=0, le=LARGEST_SEARCH_SEED, description="the largest seed of the search")
+
+
+@dataclass(frozen=True)
+class FinalEvaluation:
+    """The final evaluation of a study, in its storage.
+
+    Args:
+        settings: Its settings.
+        search_seed: The largest seed of the search.
+        search: The study of the search.
+        selection: The study of the trainings that choose a configuration.
+        judgement: The study of the trainings that judge it.
+    """
+
+    settings: FinalEvalSettings
+    search_seed: int
+    search: optuna.Study
+    selection: optuna.Study
+    judgement: optuna.Study
+
+    @classmethod
+    def opened(cls, storage: Storage, settings: StudySettings, search: optuna.Study) -> Self:
+        """Make the two studies, or find them."""
+
+        def make(suffix: str, directions: Sequence[StudyDirection]) -> optuna.Study:
+            study = storage.exclusive(
+                lambda: optuna.create_study(
+                    study_name=settings.name + suffix,
+                    storage=storage.optuna,
+                    directions=directions,
+                    load_if_exists=True,
+                )
+            )
+            check_trials(study, n_searched=len(search.get_trials(deepcopy=False)))
+            return study
+
+        selection = make(SELECTION_SUFFIX, search.directions)
+        stored = _Stored(settings=settings.final_eval, search_seed=max(settings.seeds)).model_dump()
+        if selection.user_attrs.get(FINAL_EVAL) != stored:
+            selection.set_user_attr(FINAL_EVAL, stored)
+        judgement = make(JUDGEMENT_SUFFIX, [StudyDirection.MINIMIZE])
+        return cls(settings.final_eval, max(settings.seeds), search, selection, judgement)
+
+    @classmethod
+    def stored(cls, storage: Storage, search: optuna.Study) -> Self | None:
+        """Return that of a study in its storage; None where none was begun, or an earlier version made it."""
+        names = [search.study_name + suffix for suffix in (SELECTION_SUFFIX, JUDGEMENT_SUFFIX)]
+        if not set(names) <= set(optuna.get_all_study_names(storage.optuna)):
+            return None
+        selection, judgement = (optuna.load_study(study_name=name, storage=storage.optuna) for name in names)
+        for study in (selection, judgement):
+            check_trials(study, n_searched=len(search.get_trials(deepcopy=False)))
+        where, found = f"{selection.study_name}.user_attrs.{FINAL_EVAL}", selection.user_attrs.get(FINAL_EVAL)
+        if not isinstance(found, Mapping):
+            raise StudyError(f"{where} is {found!r}, but it must be the settings of the final evaluation")
+        kept = _Stored.read(where, found)
+        return cls(kept.settings, kept.search_seed, search, selection, judgement)
+
+    @property
+    def selection_seeds(self) -> range:
+        """The seeds of the selection; no search trial was run with one."""
+        first = self.search_seed + SELECTION_SEEDS_ABOVE
+        return range(first, first + self.settings.max_seeds)
+
+    @property
+    def judge_seeds(self) -> range:
+        """The seeds of the judgement; neither the search nor the selection has used one."""
+        first = self.search_seed + JUDGEMENT_SEEDS_ABOVE
+        return range(first, first + self.settings.judge_seeds)
+
+    @property
+    def sign(self) -> float:
+        """Factor that makes higher values of the first objective better."""
+        return -1.0 if self.search.directions[0] == StudyDirection.MINIMIZE else 1.0
+
+    def candidates(self) -> list[int]:
+        """Return the control and the numbers of the best trials; nothing where no trial has finished."""
+        best = [trial.number for trial in best_trials(self.search, self.settings.top_k)]
+        # First, so that it wins where it is as good.
+        return [CONTROL, *best] if best else []
+
+    def scores(self) -> dict[int, dict[int, float]]:
+        """Return the score of each training of the selection that has ended, by candidate and seed; NaN: it failed."""
+        scores: dict[int, dict[int, float]] = {number: {} for number in self.candidates()}
+        for trial in self.selection.get_trials(deepcopy=False):
+            number, seed = training_of(trial)
+            if number not in scores:
+                continue
+            if trial.state == TrialState.COMPLETE:
+                scores[number][seed] = self.sign * trial.values[0]
+            elif trial.state in ENDED_WITHOUT_SCORE and RETRIED not in trial.user_attrs:
+                scores[number].setdefault(seed, math.nan)
+        return scores
+
+    def race(self) -> Race:
+        """Return how the selection stands."""
+        return race(self.scores(), self.selection_seeds, min_seeds=self.settings.min_seeds)
+
+    def missing_of_selection(self) -> list[PlannedTrial]:
+        """Return the trainings that the selection needs next, and that nobody has begun."""
+        return self._planned(self.race().missing, self.selection)
+
+    def judged(self) -> list[int]:
+        """Return the configurations that the test volumes are opened for: the chosen one and the control."""
+        chosen = self.race().chosen
+        return [] if chosen is None else list(dict.fromkeys((chosen, CONTROL)))
+
+    def missing_of_judgement(self) -> list[PlannedTrial]:
+        """Return the trainings of the judgement that nobody has begun; nothing before a configuration is chosen."""
+        judged = self.judged()
+        return self._planned([(number, seed) for seed in self.judge_seeds for number in judged], self.judgement)
+
+    def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
+        begun = set(map(training_of, study.get_trials(deepcopy=False)))
+        searched = self.search.get_trials(deepcopy=False)
+        return [
+            PlannedTrial(settings_of(searched, number), {FINALIST: number, FINAL_SEED: seed})
+            for number, seed in trainings
+            if (number, seed) not in begun
+        ]
+
+
+def training_of(trial: FrozenTrial | Trial) -> tuple[int, int]:
+    """Return the configuration and the seed of a final training."""
+    return int(trial.user_attrs[FINALIST]), int(trial.user_attrs[FINAL_SEED])
+
+
+def name_of(number: int) -> str:
+    """Return how people call a configuration: `control`, or `trial 7`."""
+    return "control" if number == CONTROL else f"trial {number}"
+
+
+def key_of(number: int) -> int | str:
+    """Return what a configuration is called in files: the number of its trial, or `control`."""
+    return "control" if number == CONTROL else number
+
+
+def settings_of(searched: Sequence[FrozenTrial], number: int) -> dict[str, Any]:
+    """Return the values of a configuration by their keys; the control has none.
+
+    Args:
+        searched: Trials of the search.
+        number: Number of one of them, or that of the control.
+    """
+    return {} if number == CONTROL else renamed(searched[number].params)
+
+
+def n_trainings(settings: FinalEvalSettings) -> tuple[int, int]:
+    """Return the fewest and the most trainings of a final evaluation in which none fails.
+
+    The fewest: all but one are dropped after the first round, and the control is the one that is left.
+    """
+    if not settings.top_k:
+        return 0, 0
+    fewest, most = budget(settings.top_k + 1, min_seeds=settings.min_seeds, max_seeds=settings.max_seeds)
+    return fewest + settings.judge_seeds, most + 2 * settings.judge_seeds

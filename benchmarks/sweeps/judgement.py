@@ -1,0 +1,116 @@
+"""How often the interval of a study's result holds the truth, simulated; and what other ways of judging would do.
+
+    python -m benchmarks.sweeps.judgement [--studies 2000]
+
+A simulated study has four candidates and the control. The score of a training on a volume is the sum of its
+configuration's true value, an effect of the training, one of the configuration on the volume, and a rest, all normal.
+The configuration is selected by `armscan.sweeps.scheduling.racing`. Of the studies that do not choose the control, the
+table has the share of those whose 95 % interval of chosen less control holds the true difference:
+
+- `paired`: as armscan judges, with seeds of its own, and `armscan.stats.paired`;
+- `same seeds`: the same interval, of the trainings that have chosen the configuration;
+- `bootstrap`: seeds of its own, and a percentile bootstrap of the seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from armscan.stats.aggregation import band_over_seeds
+from armscan.stats.paired import crossed_mean
+from armscan.sweeps.scheduling.racing import race
+
+N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MAX_SEEDS = 4, 8, 2, 6
+# Standard deviations of the effects of trainings, of volumes for each configuration, and of the rest.
+OF_SEEDS, OF_VOLUMES, REST = 1.0, 0.4, 0.5
+N_SEEDS, N_VOLUMES, EFFECTS = (3, 5, 10), (4, 8, 12), (0.0, 1.0)
+
+
+class Coverage(NamedTuple):
+    """Shares of the studies whose interval holds the truth, by the way of judging; see above."""
+
+    paired: float
+    same_seeds: float
+    bootstrap: float
+    n_studies: int
+    n_trainings: float
+
+
+def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float, *, seed: int = 0) -> Coverage:
+    """Simulate studies.
+
+    Args:
+        n_studies: Number of studies.
+        n_seeds: Seeds of the judgement.
+        n_volumes: Test volumes.
+        effect: Standard deviation of the true values of the candidates, around that of the control.
+        seed: Seed of the simulation. Default: 0.
+    """
+    rng = np.random.default_rng(seed)
+    n_configurations = N_CANDIDATES + 1
+    true = np.c_[np.zeros(n_studies), effect * rng.standard_normal((n_studies, N_CANDIDATES))]
+
+    def trained(n: int) -> np.ndarray:
+        return OF_SEEDS * rng.standard_normal((n_studies, n_configurations, n))
+
+    def played(trainings: np.ndarray, n: int) -> np.ndarray:
+        """Scores of trainings on other volumes, shape (studies, configurations, seeds, volumes)."""
+        of_volumes = OF_VOLUMES * rng.standard_normal((n_studies, n_configurations, 1, n))
+        rest = REST * rng.standard_normal((*trainings.shape, n))
+        return true[..., None, None] + trainings[..., None] + of_volumes + rest
+
+    selecting, judging = trained(MAX_SEEDS), trained(n_seeds)
+    scores, own, same = (
+        played(selecting, N_VALIDATION).mean(axis=-1),
+        played(judging, n_volumes),
+        played(selecting, n_volumes),
+    )
+    held, n_trainings = [], 0
+    for study, table in enumerate(scores):
+        by_seed = {number: dict(enumerate(row)) for number, row in enumerate(table)}
+        raced = race(by_seed, range(MAX_SEEDS), min_seeds=MIN_SEEDS)
+        chosen = raced.chosen
+        n_trainings += sum(standing.n_seeds for standing in raced.standings.values())
+        if not chosen:
+            continue
+        truth = true[study, chosen] - true[study, 0]
+        common = min(raced.standings[number].n_seeds for number in (0, chosen))
+        differences = own[study, chosen] - own[study, 0]
+        of_seeds = differences.mean(axis=-1, keepdims=True)
+        band = band_over_seeds(of_seeds, np.mean)
+        held.append(
+            (
+                holds(differences, truth),
+                holds((same[study, chosen] - same[study, 0])[:common], truth),
+                bool(band.lows[0] <= truth <= band.highs[0]),
+            )
+        )
+    return Coverage(*np.mean(held, axis=0), len(held), n_trainings / n_studies)
+
+
+def holds(differences: np.ndarray, truth: float) -> bool:
+    """Return whether the interval of a paired difference holds the truth."""
+    mean, half = crossed_mean(differences)
+    return bool(abs(mean - truth) <= half)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--studies", type=int, default=2000)
+    n_studies = parser.parse_args().studies
+    print("| seeds | test volumes | effect | paired | same seeds | bootstrap | studies | trainings to select |")
+    print("| --- " * 8 + "|")
+    for n_seeds, n_volumes, effect in product(N_SEEDS, N_VOLUMES, EFFECTS):
+        found = simulate(n_studies, n_seeds, n_volumes, effect)
+        shares = " | ".join(f"{share:.1%}" for share in found[:3])
+        line = f"| {n_seeds} | {n_volumes} | {effect} | {shares} | {found.n_studies} | {found.n_trainings:.1f} |"
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""The interval of a paired difference holds a known truth as often as it says, for few seeds and volumes."""
+
+import numpy as np
+import pytest
+
+from armscan.errors import InvalidValueError
+from armscan.stats.paired import crossed_mean, paired_difference
+
+N_STUDIES = 4000
+
+
+def drawn(rng, n_seeds, n_volumes, of_seeds, of_volumes, of_cells):
+    """Differences of many studies around 0, shape (studies, seeds, volumes)."""
+    effects = (
+        of_seeds * rng.standard_normal((N_STUDIES, n_seeds, 1)),
+        of_volumes * rng.standard_normal((N_STUDIES, 1, n_volumes)),
+        of_cells * rng.standard_normal((N_STUDIES, n_seeds, n_volumes)),
+    )
+    return sum(effects)
+
+
+@pytest.mark.parametrize("spread", [(1.0, 0.3, 1.0), (0.3, 1.0, 1.0), (0.7, 0.7, 0.5), (1.0, 0.0, 0.5)])
+@pytest.mark.parametrize(("n_seeds", "n_volumes"), [(3, 4), (3, 12), (5, 8), (10, 4), (10, 12)])
+def test_interval_holds_the_truth_in_92_to_98_percent_of_studies(n_seeds, n_volumes, spread):
+    means, halves = crossed_mean(drawn(np.random.default_rng(0), n_seeds, n_volumes, *spread))
+    assert 0.92 <= (np.abs(means) <= halves).mean() <= 0.98
+
+
+def test_interval_of_one_seed_is_for_other_volumes_and_that_of_one_volume_for_other_seeds():
+    values = np.random.default_rng(0).standard_normal((N_STUDIES, 1, 6))
+    of_volumes, of_seeds = crossed_mean(values), crossed_mean(values.swapaxes(1, 2))
+    assert np.allclose(of_volumes, of_seeds)
+    # Of one kind it is Student's.
+    mean, half = values[0].mean(), 2.5706 * values[0].std(ddof=1) / np.sqrt(6)
+    assert (of_volumes[0][0], of_volumes[1][0]) == pytest.approx((mean, half), rel=1e-4)
+
+
+def test_difference_of_equal_trainings_has_no_width_and_one_of_one_cell_no_interval():
+    assert paired_difference(np.full((3, 4), 2.0), np.full((3, 4), 1.5)) == (0.5, 0.5, 0.5)
+    value, low, high = paired_difference(np.array([[2.0]]), np.array([[1.5]]))
+    assert value == 0.5
+    assert np.isnan([low, high]).all()
+
+
+def test_trainings_of_other_seeds_or_volumes_are_refused():
+    with pytest.raises(InvalidValueError, match=r"the shapes \(2, 3\) and \(3, 3\)"):
+        paired_difference(np.zeros((2, 3)), np.zeros((3, 3)))

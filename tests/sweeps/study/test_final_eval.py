@@ -1,0 +1,193 @@
+"""The final evaluation of a study: decided from the storage alone, whoever dies, and exactly as many trainings."""
+
+import math
+import random
+from types import SimpleNamespace
+
+import numpy as np
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from armscan.sweeps.results.judgement import best_metrics, judge
+from armscan.sweeps.results.selection import candidates_of
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.state import CONTROL, FINALIST, METRICS, RETRIED, Limits
+from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, training_of
+from armscan.sweeps.study.settings import FinalEvalSettings
+from armscan.sweeps.study.study import make_study
+from tests.sweeps.study.test_study import settings
+
+FINAL_EVAL = {"top_k": 2, "min_seeds": 2, "max_seeds": 5, "judge_seeds": 3}
+# Mean steps of each configuration on all volumes: the luckiest trial of the search is not the best.
+TRUE = {CONTROL: 6.0, 0: 5.0, 1: 3.0, 2: 9.0}
+LUCK = {0: 1.0, 1: 2.0, 2: 9.0}
+# Nothing happens by chance.
+QUIET = SimpleNamespace(random=lambda: 1.0, randrange=lambda n: 0)
+
+
+@pytest.fixture
+def storage_uri(tmp_path):
+    return str(tmp_path / "a.journal")
+
+
+def searched(uri, objectives=("mean_steps",), **changes):
+    """Makes a study whose search has ended; returns its storage, settings and study."""
+    asked = settings(
+        storage=uri,
+        objectives=dict.fromkeys(objectives, "minimize"),
+        final_eval=FinalEvalSettings(**FINAL_EVAL | changes),
+    )
+    storage = open_storage(uri)
+    search = make_study(storage, asked, {})
+    for number, luck in LUCK.items() if not search.trials else ():
+        trial = search.ask()
+        trial.suggest_float("agent.lr", 1e-4, 1e-2)
+        trial.set_user_attr(METRICS, {"mean_steps": luck, "success_rate": 0.5})
+        search.tell(trial, [luck] * len(objectives))
+        assert trial.number == number
+    return storage, asked, search
+
+
+def opened(uri, **changes):
+    storage, asked, search = searched(uri, **changes)
+    final = FinalEvaluation.opened(storage, asked, search)
+    limits = Limits(n_trials=10**9)
+    plans = {final.selection: final.missing_of_selection, final.judgement: final.missing_of_judgement}
+    return final, [TrialScheduler(study, storage, limits, plan) for study, plan in plans.items()]
+
+
+def steps_of(number, seed, true, rng_of=0):
+    """Steps of a training on each of three volumes; the same for the same training."""
+    rng = np.random.default_rng((number + 1, seed, rng_of))
+    return true[number] + 0.3 * rng.standard_normal() + 0.2 * rng.standard_normal(3)
+
+
+def end(scheduler, trial, true):
+    """Ends a final training as its worker does."""
+    number, seed = training_of(trial)
+    steps = steps_of(number, seed, true)
+    metrics = {"mean_steps": steps.mean(), "test/mean_steps": steps.mean(), "test/success_rate": 1.0}
+    metrics |= {f"test/volume/v{volume}/mean_steps": value for volume, value in enumerate(steps)}
+    metrics |= {f"test/volume/v{volume}/success_rate": 1.0 for volume in range(3)}
+    trial.set_user_attr(METRICS, {name: float(value) for name, value in metrics.items()})
+    trial.study.tell(trial, float(steps.mean()))
+
+
+def run(uri, true=TRUE, chance=None, **changes):
+    """Runs a final evaluation with workers that come and go; returns it."""
+    chance = chance or random.Random(0)
+    final, schedulers = opened(uri, **changes)
+    for scheduler in schedulers:
+        running = []
+        while True:
+            while len(running) < 2 and (trial := scheduler.claim({"worker": str(len(running))})):
+                running.append(trial)
+            if not running:
+                break
+            trial = running.pop(chance.randrange(len(running)))
+            if chance.random() < 0.2:
+                # Its worker is killed.
+                number = trial.number
+                scheduler.reclaim(lambda each, number=number: each.number == number)
+            elif chance.random() < 0.1:
+                scheduler.requeue(trial, {"worker": trial.user_attrs["lease"]["worker"]})
+            else:
+                end(scheduler, trial, true)
+    return final
+
+
+def trained(study):
+    """The trainings that have finished."""
+    return [training_of(trial) for trial in study.trials if trial.state == TrialState.COMPLETE]
+
+
+def test_test_volumes_are_opened_for_the_chosen_configuration_and_the_control_alone(
+    storage_uri,
+):
+    final = run(storage_uri)
+    assert final.candidates() == [CONTROL, 0, 1]
+    assert final.race().chosen == 1
+    assert {number for number, _ in trained(final.judgement)} == {CONTROL, 1}
+    # No seed of the search, nor of the selection, judges.
+    assert {seed for _, seed in trained(final.selection)} <= set(range(1000, 1005))
+    assert {seed for _, seed in trained(final.judgement)} == {2000, 2001, 2002}
+    judgement = judge(final)
+    assert (judgement.chosen, judgement.n_seeds, judgement.others) == (1, 3, ())
+    difference = {each.metric: each for each in judgement.differences}["mean_steps"]
+    assert difference.paired.low <= -3.0 <= difference.paired.high < 0
+    assert difference.verdict == "better"
+    assert difference.probability.value == 1.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_workers_that_die_change_nothing_and_no_training_is_run_twice(tmp_path, seed):
+    quiet, killed = run(str(tmp_path / "a"), chance=QUIET), run(str(tmp_path / "b"), chance=random.Random(seed))
+    for name in ("selection", "judgement"):
+        ours, theirs = (trained(getattr(final, name)) for final in (quiet, killed))
+        lost = {training_of(trial) for trial in getattr(killed, name).trials if is_lost(trial)}
+        assert len(theirs) == len(set(theirs))
+        if not lost:
+            assert sorted(ours) == sorted(theirs)
+    fewest, most = n_trainings(killed.settings)
+    assert len(trained(quiet.selection)) + len(trained(quiet.judgement)) in range(fewest, most + 1)
+
+
+def is_lost(trial):
+    return trial.state == TrialState.FAIL and RETRIED not in trial.user_attrs
+
+
+def test_control_that_is_the_best_is_the_result(storage_uri):
+    final = run(storage_uri, true=TRUE | {CONTROL: 1.0})
+    judgement = judge(final)
+    assert judgement.chosen == CONTROL
+    assert "No setting beat the default configuration" in judgement.statement
+    assert {number for number, _ in trained(final.judgement)} == {CONTROL}
+    assert judgement.differences == ()
+
+
+def test_training_that_failed_leaves_its_candidate_out_and_the_study_has_a_result(storage_uri):
+    final, (selection, _) = opened(storage_uri)
+    while trial := selection.claim({}):
+        if trial.user_attrs[FINALIST] == 1:
+            selection.study.tell(trial, state=TrialState.FAIL)
+        else:
+            end(selection, trial, TRUE)
+    assert final.race().chosen == 0
+    (failed,) = [each for each in candidates_of(final) if each.number == 1]
+    assert failed.outcome == "failed"
+    assert all(map(math.isnan, failed.scores.values()))
+
+
+def test_study_that_goes_on_says_for_whom_else_the_test_volumes_were_opened(storage_uri):
+    run(storage_uri)
+    _, _, search = searched(storage_uri)
+    trial = search.ask()
+    trial.suggest_float("agent.lr", 1e-4, 1e-2)
+    search.tell(trial, 0.5)
+    final = run(storage_uri, true=TRUE | {3: 0.5})
+    assert (judge(final).chosen, judge(final).others) == (3, (1,))
+    assert "opened before for trial 1" in judge(final).notes[0]
+
+
+def test_run_of_the_study_has_the_result(storage_uri):
+    final = run(storage_uri)
+    metrics = best_metrics(final.search, final)
+    assert metrics["validation/mean_steps"] == 1.0
+    assert metrics["difference/mean_steps_low"] < metrics["difference/mean_steps"] < 0
+    assert metrics["probability_of_improvement/mean_steps"] == 1.0
+    assert metrics["test_volumes/mean_steps"] < 4.0
+
+
+def test_final_evaluation_is_read_from_the_storage_and_that_of_an_earlier_version_is_none(storage_uri):
+    storage, asked, search = searched(storage_uri)
+    assert FinalEvaluation.stored(storage, search) is None
+    optuna.create_study(study_name="a-judged", storage=storage.optuna)
+    assert FinalEvaluation.stored(storage, search) is None
+    final = FinalEvaluation.opened(storage, asked, search)
+    assert FinalEvaluation.stored(open_storage(storage_uri), search).settings == final.settings
+
+
+def test_settings_of_an_earlier_version_are_read():
+    assert FinalEvalSettings.read("a", FINAL_EVAL | {"n_seeds": 7}).judge_seeds == 7
