@@ -62,14 +62,12 @@ class Beginning:
             if self.origin in begun_with:
                 return False
             # Those that a process has added that ended in between.
-            there = [trial.user_attrs for trial in study.get_trials(deepcopy=False)]
-            places = {attributes.get(TAKEN_FROM) for attributes in there}
-            n_enqueued = sum(attributes.get(ENQUEUED_FROM) == self.origin for attributes in there)
+            places = {trial.user_attrs.get(TAKEN_FROM) for trial in study.get_trials(deepcopy=False)}
             for trial in self.taken:
                 if trial.user_attrs[TAKEN_FROM] not in places:
                     study.add_trial(trial)
-            for chosen in self.enqueued[n_enqueued:]:
-                study.enqueue_trial(chosen, user_attrs={ENQUEUED_FROM: self.origin})
+            for chosen in self.enqueued:
+                study.enqueue_trial(chosen, user_attrs={ENQUEUED_FROM: self.origin}, skip_if_exists=True)
             study.set_user_attr(BEGUN_WITH, [*begun_with, self.origin])
             return True
 
@@ -96,10 +94,12 @@ def beginnings(
     presets = [name for name in settings.enqueue if PRESET.format(name) not in begun_with]
     sources = [name for name in settings.warm_start if SOURCE.format(name) not in begun_with]
     storage = existing_storage(settings.storage) if sources else None
-    return [
+    begins = [
         *(_of_preset(settings.space, name, words) for name in presets),
         *(_of_study(settings, name, fixed, storage) for name in sources),
     ]
+    # First what is taken: the settings of a trial with a value need not be tried again.
+    return sorted(begins, key=lambda each: not each.taken)
 
 
 def _of_preset(space: Space, name: str, words: Sequence[str]) -> Beginning:

@@ -14,7 +14,7 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.study import best_trials, make_study
-from armscan.sweeps.study.warm_start import N_ENQUEUED, beginnings
+from armscan.sweeps.study.warm_start import N_ENQUEUED, Beginning, beginnings
 from tests.sweeps.study.test_study import settings
 
 LR = {"low": 1e-4, "high": 1e-2, "log": True}
@@ -143,6 +143,16 @@ def test_preset_whose_values_lie_in_the_space_is_tried_first():
     other = {"agent.lr_end_factor": 0.1, "stack": 4, "memory": 2, "agent.target_entropy_per_dim": -3.0}
     assert best.enqueued == (own.enqueued[0] | other,)
     assert best.told.startswith("preset best_zy is tried first: agent.lr=0.001 agent.lr_end_factor=0.1 ")
+
+
+def test_settings_of_a_taken_trial_are_not_tried_again(study_in):
+    study_in("before", {"agent.lr": LR}, rows=[({"agent.lr": 1e-3}, 3.0)])
+    asked, storage, study = study_in("now", {"agent.lr": LR}, warm_start=["before"])
+    (taken,) = beginnings(asked, [], FIXED, study)
+    preset = Beginning("preset a", "", (), ({"agent.lr": 1e-3}, {"agent.lr": 2e-3}))
+    for each in (taken, preset):
+        each.add(storage, study)
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE", "WAITING"]
 
 
 def test_preset_whose_values_do_not_lie_in_the_space_is_not_tried():
