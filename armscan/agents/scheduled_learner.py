@@ -53,7 +53,7 @@ class ScheduledLearner:
 
     @property
     def validation_note(self) -> str | None:
-        """How the actions of evaluations are chosen, where the learner says so."""
+        """Return how the actions of evaluations are chosen, if the learner has such a note."""
         return getattr(self._learner, "validation_note", None)
 
     def warm_up(self) -> None:

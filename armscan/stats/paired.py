@@ -28,7 +28,7 @@ def paired_difference(ours: FloatArray, theirs: FloatArray) -> Estimate:
         The estimate; without an interval where there are one seed and one volume.
 
     Raises:
-        InvalidValueError: if the shapes differ.
+        InvalidValueError: If the shapes differ.
     """
     if ours.shape != theirs.shape:
         raise InvalidValueError(f"scores have the shapes {ours.shape} and {theirs.shape}, but both must have the same")
@@ -62,6 +62,6 @@ def crossed_mean(values: FloatArray) -> tuple[Any, Any]:
     differ = volumes > rest if n_seeds > 1 else np.full(means.shape, True)
     variances = np.maximum(seeds + np.where(differ, volumes - rest, 0.0), volumes)
     terms = seeds**2 / max(1, n_seeds - 1) + np.where(differ, volumes**2 / max(1, n_volumes - 1), 0.0)
-    # Without any spread there is no width, whatever the degrees of freedom.
+    # Without any spread there is no width, with any degrees of freedom.
     df = np.where(terms > 0.0, variances**2 / np.where(terms > 0.0, terms, 1.0), 1.0)
     return means, stdtrit(df, (1 + LEVEL) / 2) * np.sqrt(variances / (n_seeds * n_volumes))

@@ -46,7 +46,7 @@ class Difference(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Whether the interval says `better` or `worse`; empty where it holds no difference, or there is none."""
+        """Return `better` or `worse`, as the interval says; empty if it includes 0, or there is none."""
         above, below = ("better", "worse") if self.is_higher_better else ("worse", "better")
         return above if self.paired.low > 0 else below if self.paired.high < 0 else ""
 
@@ -73,7 +73,7 @@ class Difference(NamedTuple):
 
 @dataclass(frozen=True)
 class Judgement:
-    """What the test volumes say of the chosen configuration.
+    """Judgement of the chosen configuration on the test volumes.
 
     Args:
         chosen: The configuration: the number of a trial, or that of the control.
@@ -93,7 +93,7 @@ class Judgement:
 
     @property
     def notes(self) -> list[str]:
-        """What has to be said of the judgement."""
+        """Notes on the judgement."""
         notes = []
         if self.n_seeds < self.n_planned:
             notes.append(f"only {self.n_seeds} of {self.n_planned} seeds have been trained to their end")

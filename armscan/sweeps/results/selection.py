@@ -1,4 +1,4 @@
-"""How a study has chosen its configuration: the candidates on the validation volumes, as rows and as a chart."""
+"""Selection of a study's configuration: the candidates on the validation volumes, as rows and as a chart."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Candidate(NamedTuple):
 
     @property
     def name(self) -> str:
-        """How people call it."""
+        """Name for users."""
         return name_of(self.number)
 
     def row(self, objective: str) -> dict[str, str]:

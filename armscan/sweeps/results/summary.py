@@ -1,4 +1,4 @@
-"""What the final trainings of a study have measured on the test volumes, over seeds that did not choose them."""
+"""Results of a study's final trainings on the test volumes, over seeds that did not choose them."""
 
 from __future__ import annotations
 

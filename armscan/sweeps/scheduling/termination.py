@@ -15,7 +15,7 @@ REASON, ASKED = "reason", "asked"
 
 
 class Termination:
-    """Whether a study has ended before its last trial.
+    """Decision to end a study before its last trial.
 
     Args:
         study: The study in its storage.
@@ -34,7 +34,7 @@ class Termination:
 
     @property
     def reason(self) -> str | None:
-        """Why the study has ended; None while it goes on."""
+        """Reason why the study has ended; None while it goes on."""
         return ended_because(self._study, self._asked)
 
     def look(self, state: StudyState) -> None:

@@ -41,7 +41,7 @@ class BelowSeedNoise:
         min_trials: Trials that run to their end before, at least 2. Default: 20.
 
     Raises:
-        InvalidValueError: if there are too few.
+        InvalidValueError: If there are too few.
     """
 
     def __init__(self, min_trials: int = 20) -> None:
@@ -84,7 +84,7 @@ class Stagnation:
         n_trials: Trials that ran to their end without being better, at least 1. Default: 30.
 
     Raises:
-        InvalidValueError: if there are too few.
+        InvalidValueError: If there are too few.
     """
 
     def __init__(self, n_trials: int = 30) -> None:
