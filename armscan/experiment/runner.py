@@ -132,6 +132,7 @@ def train_agent(
     run_id: str,
     tell: Callable[[str], None],
     earlier: Sequence[EpochReport] = (),
+    until_env_steps: int | None = None,
 ) -> TrainingResult:
     """Train the agent of a setup, which must be a `Learner`, and tell how its updates are computed; see `train`."""
     agent, budget = setup.agent, setup.budget
@@ -147,7 +148,16 @@ def train_agent(
         seed=seed,
         on_plane=setup.on_plane,
     )
-    return train(agent, budget, validate, folder, callbacks, provenance=setup.provenance(run_id), earlier=earlier)
+    return train(
+        agent,
+        budget,
+        validate,
+        folder,
+        callbacks,
+        provenance=setup.provenance(run_id),
+        earlier=earlier,
+        until_env_steps=until_env_steps,
+    )
 
 
 def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: RunResult, folder: Path) -> None:

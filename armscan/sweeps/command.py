@@ -15,6 +15,7 @@ from armscan.sweeps.study.arguments import STORAGE, StudyCommand, words_of_trial
 from armscan.sweeps.study.components import check_space, read_settings
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.plan import print_plan
+from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.study import existing_study
 from armscan.sweeps.study.warm_start import beginnings
 from armscan.sweeps.tasks.attempt import composed
@@ -37,6 +38,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     launcher = composed(given.launching)[1][LAUNCHER]
     if launcher in ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))
+    population_of(settings, config)
     # Before the space is checked, which takes seconds, and anything is made.
     existing = existing_study(settings, to_plain(config))
     if not given.is_plan:

@@ -4,7 +4,7 @@ from armscan.stats.on_plane import ON_PLANE, OnPlane, check_on_plane
 from armscan.training.baselines import evaluate_baselines
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
-from armscan.training.checkpointing import CheckpointProvenance, resume_from_checkpoint
+from armscan.training.checkpointing import CheckpointProvenance, resume_from_checkpoint, take_over_checkpoints
 from armscan.training.domain import TrainingDomain
 from armscan.training.episode_results import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation
 from armscan.training.episodes import evaluate
@@ -54,5 +54,6 @@ __all__ = [
     "record_episode",
     "resume_from_checkpoint",
     "save_checkpoint",
+    "take_over_checkpoints",
     "train",
 ]

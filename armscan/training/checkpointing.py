@@ -77,16 +77,7 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
     last, best = folder / LAST_CHECKPOINT, folder / BEST_CHECKPOINT
     if not last.exists():
         return []
-    state, facts = load_checkpoint(last)
-    provenance.check(last, facts)
-    reports = _read(facts.get("reports"), last)
-    try:
-        learner.load_state(state)
-    # The checksum is right, so somebody has written another state.
-    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        if isinstance(error, CheckpointError):
-            raise
-        raise CheckpointError(f"{last}: does not hold the state of this agent: {error!r}") from error
+    reports = _restore(learner, last, provenance)
     best_report = [report for report in reports if report.is_best][-1]
     if best_report is reports[-1]:
         # A kill may have come before this was written.
@@ -99,6 +90,52 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
         raise CheckpointError(
             f"{best}: is of epoch {best_facts.get('epoch')}, but the best epoch of {last} is {best_report.epoch}"
         )
+    return reports
+
+
+def take_over_checkpoints(
+    learner: Learner, source: Path, folder: Path, *, theirs: CheckpointProvenance, own: CheckpointProvenance
+) -> list[EpochReport]:
+    """Restore a learner to the state of another training's last checkpoint, and keep its checkpoints as its own.
+
+    Args:
+        learner: Learner that has learned nothing yet.
+        source: Folder of the other training, which stays as it is.
+        folder: Folder of this training.
+        theirs: Provenance of the other training.
+        own: Provenance of this training.
+
+    Returns:
+        The reports of the other training's epochs, for `train`.
+
+    Raises:
+        CheckpointError: If a checkpoint is missing, damaged or another run's.
+        ChangedVolumesError: If a checkpoint is of other volumes.
+    """
+    weights, best_facts = load_checkpoint(source / BEST_CHECKPOINT)
+    theirs.check(source / BEST_CHECKPOINT, best_facts)
+    reports = _restore(learner, source / LAST_CHECKPOINT, theirs)
+    best_report = [report for report in reports if report.is_best][-1]
+    save_checkpoint(folder / BEST_CHECKPOINT, weights, _facts(best_report, own))
+    # Last: from then on this training can be resumed.
+    save_checkpoint(
+        folder / LAST_CHECKPOINT, learner.state(), _facts(reports[-1], own) | {"reports": _written(reports)}
+    )
+    return reports
+
+
+def _restore(learner: Learner, last: Path, provenance: CheckpointProvenance) -> list[EpochReport]:
+    """Restore a learner to the state of a checkpoint; returns the reports of the epochs before it."""
+    state, facts = load_checkpoint(last)
+    provenance.check(last, facts)
+    reports = _read(facts.get("reports"), last)
+    try:
+        learner.load_state(state)
+    # The checksum is right, so somebody has written another state.
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(f"{last}: does not hold the state of this agent: {error!r}") from error
     return reports
 
 

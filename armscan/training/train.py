@@ -113,6 +113,7 @@ def train(
     *,
     provenance: CheckpointProvenance | None = None,
     earlier: Sequence[EpochReport] = (),
+    until_env_steps: int | None = None,
 ) -> TrainingResult:
     """Train a learner; it ends with the weights of its best epoch.
 
@@ -124,6 +125,8 @@ def train(
         callbacks: Callbacks at the start, after each epoch and at the end.
         provenance: Origin of the checkpoints, kept in them.
         earlier: Reports that `resume_from_checkpoint` returned, for a resumed training.
+        until_env_steps: Environment steps after which this part of the training ends, at the end of an epoch. Default:
+            None, at the end of the budget.
 
     Returns:
         The reports of all epochs.
@@ -136,7 +139,8 @@ def train(
     try:
         if not reports:
             learner.warm_up()
-        while learner.n_env_steps < budget.env_steps and not is_solved:
+        end = min(budget.env_steps, until_env_steps or budget.env_steps)
+        while learner.n_env_steps < end and not is_solved:
             metrics = learner.learn(min(budget.eval_every_env_steps, budget.env_steps - learner.n_env_steps))
             evaluation = validate()
             by = budget.best_by

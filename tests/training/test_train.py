@@ -17,6 +17,7 @@ from armscan.training import (
     checkpointing,
     load_checkpoint,
     resume_from_checkpoint,
+    take_over_checkpoints,
     train,
 )
 
@@ -295,3 +296,27 @@ def test_budget_refuses_impossible_figures(changes, message):
 def test_solved_criterion_refuses_impossible_figures(changes):
     with pytest.raises(InvalidValueError, match=next(iter(changes))):
         SolvedCriterion(**changes)
+
+
+def test_training_that_ends_early_goes_on_in_another_folder_as_its_own(tmp_path):
+    first, second, script = tmp_path / "first", tmp_path / "second", [evaluation_of(each) for each in (9, 3, 5, 4)]
+    for folder in (first, second):
+        folder.mkdir()
+    budget = Budget(env_steps=150, eval_every_env_steps=40, validation_episodes=1)
+    theirs, own = (CheckpointProvenance(run_id=each) for each in ("a", "b"))
+    of_first = iter(script)
+    train(ScriptedLearner(), budget, lambda: next(of_first), first, provenance=theirs, until_env_steps=80)
+    kept = {file.name: file.read_bytes() for file in first.iterdir()}
+    learner = ScriptedLearner()
+    reports = take_over_checkpoints(learner, first, second, theirs=theirs, own=own)
+    # Killed here, it is resumed from its own.
+    learner = ScriptedLearner()
+    assert resume_from_checkpoint(learner, second, own) == reports
+    assert (learner.n_env_steps, [report.n_env_steps for report in reports]) == (90, [50, 90])
+    result = train(learner, budget, lambda: next(of_first), second, provenance=own, earlier=reports)
+    assert [report.n_env_steps for report in result.reports] == [50, 90, 130, 150]
+    assert result.best.epoch == 2
+    assert load_checkpoint(second / BEST_CHECKPOINT)[1]["run_id"] == "b"
+    assert {file.name: file.read_bytes() for file in first.iterdir()} == kept
+    with pytest.raises(CheckpointError, match="is a checkpoint of run 'a', but this is 'b'"):
+        take_over_checkpoints(ScriptedLearner(), first, second, theirs=own, own=own)

@@ -16,6 +16,7 @@ from plotly.graph_objects import Figure, Scatter
 
 from armscan.reports.chart_style import BLUE, GREY, ORANGE, RED, mode
 from armscan.reports.html import chart
+from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.reports import reports_of
@@ -78,7 +79,7 @@ def _axis(metric: str) -> dict[str, Any]:
 
 def _said(trial: FrozenTrial) -> str:
     """Return the hover text of a trial."""
-    return "<br>".join(map(html.escape, (f"trial {trial.number}", *overrides_of(trial.params))))
+    return "<br>".join(map(html.escape, (f"trial {trial.number}", *overrides_of(searched_values(trial)))))
 
 
 def _history(trials: Sequence[FrozenTrial], number: int, objective: str, direction: StudyDirection) -> Figure:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +22,7 @@ from armscan.experiment.results import volume_notes
 from armscan.sweeps.results.judgement import HOW, judge
 from armscan.sweeps.results.selection import candidates_of, objective_of
 from armscan.sweeps.results.summary import final_table, values_of
+from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import (
     ENV_STEPS,
     FAILURE,
@@ -37,8 +39,10 @@ from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX, check_trials
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, n_trainings, name_of, settings_of
 from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.training.titles import title_of
 from armscan.utils.console import WHOLE_CHARS, wide_console
+from armscan.utils.files import RUN_FILE
 from armscan.utils.retry import no_retry
 
 REFRESH_S = 2.0
@@ -158,7 +162,7 @@ def _summary(opened: OpenedStudy, state: StudyState) -> str:
 
 def _describe(trial: FrozenTrial, phase: Phase) -> str:
     """Return the outcome of a trial in one line."""
-    attributes, tried = trial.user_attrs, " ".join(overrides_of(trial.params))
+    attributes, tried = trial.user_attrs, " ".join(overrides_of(searched_values(trial)))
     name = f"trial {trial.number}"
     what = "judgement" if phase.name.endswith(JUDGEMENT_SUFFIX) else "selection"
     if FINALIST in attributes:
@@ -196,13 +200,26 @@ def print_result(opened: OpenedStudy) -> int:
     table = Table("trial", *settings.objectives, "values", title="best while searching", title_justify="left")
     for trial in best_trials(scheduler.study, max(1, settings.final_eval.top_k)):
         table.add_row(
-            str(trial.number), *(f"{value:.4g}" for value in trial.values), " ".join(overrides_of(trial.params))
+            str(trial.number),
+            *(f"{value:.4g}" for value in trial.values),
+            " ".join(overrides_of(searched_values(trial))),
         )
     wide_console(WHOLE_CHARS).print(table)
     is_judged = opened.final_eval is None or _print_final_results(opened, opened.final_eval)
     print_where_to_look(opened.folder, opened.config.tracking.uri, storage=settings.storage)
+    _print_replay(opened)
     print(f"report    {armscan_command('report', '--study', settings.name, storage=settings.storage)}")
     return 0 if is_judged else 1
+
+
+def _print_replay(opened: OpenedStudy) -> None:
+    """Print the command that trains the best member of a population again, with its whole schedule."""
+    search = opened.search
+    if search.population is not None and (best := best_trials(search.scheduler.study, 1)):
+        for seed in opened.settings.seeds:
+            file = trial_folder(search.folder, best[0].number) / f"seed_{seed}" / RUN_FILE
+            run_id = json.loads(file.read_text())["run_id"]
+            print(f"replay    {armscan_command('runs', 'reproduce', run_id, tracking=opened.config.tracking.uri)}")
 
 
 def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:

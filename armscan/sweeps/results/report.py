@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,16 +17,22 @@ from optuna.trial import FrozenTrial, TrialState
 from armscan.reports.html import folded, table, video_address, write_page
 from armscan.sweeps.results.charts import charts_of
 from armscan.sweeps.results.judgement import HOW, Judgement, judge
+from armscan.sweeps.results.population_charts import population_charts
 from armscan.sweeps.results.selection import candidates_of, decided, score_rows
 from armscan.sweeps.results.summary import ConfigResult, final_results, final_table
+from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import (
     ENV_STEPS,
     FAILURE,
     FINALIST,
+    GENERATION,
     LEASE,
+    MEMBER,
     METRICS,
+    PARENT,
     RETRIED,
     RETRY_OF,
+    SCHEDULE,
     STOP,
     TAKEN_FROM,
     StudyState,
@@ -86,7 +93,7 @@ def write_report(
         ],
         "endings": _endings(trials),
         "failures": [
-            {"trial": trial.number, "cause": _cause(trial), "values": " ".join(overrides_of(trial.params))}
+            {"trial": trial.number, "cause": _cause(trial), "values": " ".join(overrides_of(searched_values(trial)))}
             for trial in trials
             if trial.state == TrialState.FAIL
         ],
@@ -102,6 +109,7 @@ def write_report(
         _result(found, trials) if found else "<p>No final evaluation yet.</p>",
         decided(final, judgement, candidates, StudyState.of(trials)) if final is not None else "",
         _running(trials),
+        *population_charts(trials, objectives[0], *best_trials(study, 1) or (None,)),
         *charts_of(study, trials, objectives, shares),
         _videos(final_trials),
         "<h2>Trials</h2>",
@@ -227,6 +235,8 @@ def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> dict[str, Any]:
         "env_steps": trial.user_attrs.get(ENV_STEPS),
         "retry_of": trial.user_attrs.get(RETRY_OF),
         **({"taken_from": trial.user_attrs[TAKEN_FROM]} if TAKEN_FROM in trial.user_attrs else {}),
+        **{name: trial.user_attrs[name] for name in (MEMBER, GENERATION, PARENT) if name in trial.user_attrs},
+        **({SCHEDULE: json.dumps(trial.user_attrs[SCHEDULE])} if SCHEDULE in trial.user_attrs else {}),
         "mlflow_run": trial.user_attrs.get(RUN),
         **trial.params,
         **metrics,

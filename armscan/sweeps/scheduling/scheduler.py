@@ -120,7 +120,10 @@ class TrialScheduler:
     def has_more(self, state: StudyState) -> bool:
         """Return whether a trial can be claimed now."""
         enough = len(state.finished) + len(state.running) >= self.limits.n_trials
-        return not enough and self.end(state) is None
+        return not enough and self.end(state) is None and self._has_next(state)
+
+    def _has_next(self, state: StudyState) -> bool:
+        return self._plan is None or bool(state.waiting) or bool(self._plan())
 
     def end(self, state: StudyState) -> str | None:
         """Return why no further trial is claimed; None while trials are missing."""
@@ -132,7 +135,8 @@ class TrialScheduler:
             return reason
         if self.stopped:
             return f"the study was stopped {self.stopped}"
-        if self._plan is not None and not state.waiting and not self._plan():
+        # What comes of a running trial may be planned with.
+        if not state.running and not self._has_next(state):
             return f"{len(state.finished)} trials have finished, {len(state.failed)} failed"
         return self.limits.spent(state)
 

@@ -27,8 +27,11 @@ CONTROL = -1
 EPISODES = "episodes"
 # Of a trial, or of a study: who asked it to stop, and when; an empty text where a study goes on again.
 STOP = "stop"
+# Of a member of a population: its number, its generation, the environment steps at which that begins and ends, the
+# trial whose checkpoint it begins from, and all values since the first generation, as `training.schedule` has them.
+MEMBER, GENERATION, INTERVAL, PARENT, SCHEDULE = "member", "generation", "interval", "parent", "schedule"
 # What a retry has from the attempt before.
-KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED, STOP, ENQUEUED_FROM)
+KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED, STOP, ENQUEUED_FROM, MEMBER, GENERATION, INTERVAL, PARENT, SCHEDULE)
 # Of a study: trials whose failures are ignored.
 RESET_FAILURES = "forgiven"
 # In a lease: the worker that holds the trial.

@@ -33,6 +33,9 @@ MAX_REASON_CHARS = 300
 LARGEST = 2**63 - 1
 MAX_STEP_DIGITS = 18
 Number = Annotated[int, Field(ge=0, le=LARGEST, description="a whole number of at least 0")]
+# Nothing that a class is named by.
+ScheduledKey = Annotated[str, Field(pattern=r"^(from_env_steps|agent\.[a-z]\w*)$")]
+Segment = dict[ScheduledKey, bool | int | Annotated[float, Field(allow_inf_nan=False)]]
 # Without what no path can have.
 Text = Annotated[str, Field(pattern=r"^[^\x00]*$", description="a text")]
 
@@ -86,6 +89,13 @@ class TrialAttributes(_Attributes):
     seeds: dict[Annotated[str, Field(pattern=r"^[0-9]{1,10}$")], dict[str, float]] = Field(
         default={}, description="the metrics of each seed"
     )
+    member: Number = 0
+    generation: Number = 0
+    interval: tuple[Number, Number] = Field(
+        default=(0, 0), strict=False, description="two numbers of environment steps"
+    )
+    parent: Number = 0
+    schedule: list[Segment] = Field(default=[], description="numbers and truth values by keys of agent")
     judged: int = Field(default=0, ge=-1, le=LARGEST, description="a whole number of at least 0, or -1 for the control")
     judged_seed: int = Field(default=0, ge=0, le=LARGEST_SEED, description=f"a whole number from 0 to {LARGEST_SEED}")
     mlflow_run: Text = ""
@@ -127,6 +137,8 @@ def check_trial(trial: FrozenTrial, study_name: str, n_objectives: int) -> None:
     """
     where = place_of(study_name, trial)
     TrialAttributes.read(f"{where}.user_attrs", trial.user_attrs)
+    if trial.user_attrs.get("parent", -1) >= trial.number:
+        raise StudyError(f"{where}.user_attrs.parent is {trial.user_attrs['parent']}, but it must be a trial before it")
     if wrong := _wrong_numbers(trial, n_objectives):
         raise StudyError(f"{where} {wrong}")
     if study_name.endswith(FINAL_SUFFIXES):

@@ -18,8 +18,9 @@ from pydantic import Field
 
 from armscan.config.legacy import renamed
 from armscan.errors import StudyError
+from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.racing import Race, budget, race
-from armscan.sweeps.scheduling.state import CONTROL, FINAL_SEED, FINALIST, RETRIED, PlannedTrial
+from armscan.sweeps.scheduling.state import CONTROL, FINAL_SEED, FINALIST, RETRIED, SCHEDULE, PlannedTrial
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.settings import (
@@ -160,7 +161,7 @@ class FinalEvaluation:
         begun = set(map(training_of, study.get_trials(deepcopy=False)))
         searched = self.search.get_trials(deepcopy=False)
         return [
-            PlannedTrial(settings_of(searched, number), {FINALIST: number, FINAL_SEED: seed})
+            PlannedTrial(settings_of(searched, number), _attributes(searched, number, seed))
             for number, seed in trainings
             if (number, seed) not in begun
         ]
@@ -188,7 +189,12 @@ def settings_of(searched: Sequence[FrozenTrial], number: int) -> dict[str, Any]:
         searched: Trials of the search.
         number: Number of one of them, or that of the control.
     """
-    return {} if number == CONTROL else renamed(searched[number].params)
+    return {} if number == CONTROL else renamed(searched_values(searched[number]))
+
+
+def _attributes(searched: Sequence[FrozenTrial], number: int, seed: int) -> dict[str, Any]:
+    schedule = {} if number == CONTROL else searched[number].user_attrs.get(SCHEDULE, {})
+    return {FINALIST: number, FINAL_SEED: seed} | ({SCHEDULE: schedule} if schedule else {})
 
 
 def n_trainings(settings: FinalEvalSettings) -> tuple[int, int]:

@@ -15,8 +15,9 @@ from omegaconf import DictConfig
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.config.defaults import to_plain
+from armscan.sweeps.scheduling.population import Population, searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL, FINALIST, Limits
+from armscan.sweeps.scheduling.state import CONTROL, FINALIST, SCHEDULE, Limits
 from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.space.space import Space
@@ -25,11 +26,13 @@ from armscan.sweeps.study.components import make_terminator
 from armscan.sweeps.study.constraints import constrained
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.final_eval import FinalEvaluation, training_of
+from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import STUDY_RUN, make_study, name_objectives
 from armscan.sweeps.tasks.attempt import RUN, STORAGE_TAG, STUDY_TAG, TRIAL_TAG, Attempt, Task, trial_folder
 from armscan.tracking import TrackingStore, abandon, open_store, run_of_study, source
 from armscan.tracking.run import FAILURE_TAG
+from armscan.utils.files import LAST_CHECKPOINT
 from armscan.utils.retry import RETRY_S
 
 NO_END = 10**9
@@ -55,6 +58,7 @@ class Phase:
         client: Client of the tracking store.
         experiment_id: MLflow experiment ID of the tracked runs.
         run_id: MLflow run ID of the study.
+        population: Population of which each trial trains a member. Default: None, trials are independent.
     """
 
     name: str
@@ -71,6 +75,18 @@ class Phase:
     client: TrackingStore
     experiment_id: str
     run_id: str
+    population: Population | None = None
+
+    def remove_checkpoints(self) -> None:
+        """Remove the last checkpoints of a population's trials that nobody can continue from any more."""
+        if self.population is None:
+            return
+        trials = self.scheduler.study.get_trials(deepcopy=False)
+        kept = self.population.takeable(trials)
+        for trial in trials:
+            if trial.number not in kept:
+                for file in trial_folder(self.folder, trial.number).glob(f"seed_*/{LAST_CHECKPOINT}"):
+                    file.unlink(missing_ok=True)
 
     def tags_of(self, trial: FrozenTrial | Trial) -> dict[str, str]:
         """Return the tags by which tracked runs of a trial are known."""
@@ -78,7 +94,11 @@ class Phase:
 
     def suggest(self, trial: Trial) -> dict[str, Value]:
         """Return the values of a trial by their keys; the control has none."""
-        return {} if trial.user_attrs.get(FINALIST) == CONTROL else self.space.suggest(trial)
+        if trial.user_attrs.get(FINALIST) == CONTROL:
+            return {}
+        chosen = self.space.suggest(trial)
+        # Of a member of a population, also what has changed since its beginning.
+        return searched_values(trial) if SCHEDULE in trial.user_attrs else chosen
 
     def close_runs_of(self, trial: FrozenTrial) -> None:
         """Close the tracked runs that a dead worker has left open, except those that a retry has resumed."""
@@ -167,9 +187,11 @@ def open_for_work(
         return str(run.info.run_id)
 
     objectives = tuple(settings.objectives)
+    population = population_of(settings, config)
+    plan = None if population is None else lambda: population.plan(study.get_trials(deepcopy=False))
     search = Phase(
         name=settings.name,
-        scheduler=TrialScheduler(study, storage, settings, termination=_termination(settings, study, storage)),
+        scheduler=TrialScheduler(study, storage, settings, plan, termination=_termination(settings, study, storage)),
         space=settings.space,
         objectives=objectives,
         reported=objectives,
@@ -182,6 +204,7 @@ def open_for_work(
         client=client,
         experiment_id=experiment_id,
         run_id=storage.exclusive(tracked_run),
+        population=population,
     )
     final_eval = FinalEvaluation.opened(storage, settings, study) if settings.final_eval.top_k else None
     finals = _final_phases(search, settings, task, final_eval) if final_eval is not None else ()
@@ -197,7 +220,13 @@ def _termination(settings: StudySettings, study: optuna.Study, storage: Storage)
 
 def _final_phases(search: Phase, settings: StudySettings, task: Task, final: FinalEvaluation) -> tuple[Phase, Phase]:
     limits = Limits(n_trials=NO_END, max_failures=settings.max_failures, max_retries=settings.max_retries)
-    shared = partial(dataclasses.replace, search, reported=(), seeds_of=lambda trial: (training_of(trial)[1],))
+    shared = partial(
+        dataclasses.replace,
+        search,
+        reported=(),
+        seeds_of=lambda trial: (training_of(trial)[1],),
+        population=None,
+    )
     storage = search.scheduler.storage
     name_objectives(final.selection, search.objectives)
     name_objectives(final.judgement, [task.final_metric])

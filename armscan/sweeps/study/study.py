@@ -15,7 +15,8 @@ from optuna.trial import FrozenTrial, TrialState
 from armscan.config.defaults import ADDED, NOT_COMPARED
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError
-from armscan.sweeps.scheduling.state import is_feasible
+from armscan.sweeps.scheduling.population import searched_values
+from armscan.sweeps.scheduling.state import GENERATION, is_feasible
 from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.components import make
@@ -133,15 +134,17 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:
     """Return the best trials of a study, each with other values, the best first.
 
-    Trials that violate a constraint are left out. With several objectives these are those that no other is better than
-    in all of them, by the first objective.
+    Trials that violate a constraint are left out; of a population, all but the members of its latest generation. With
+    several objectives these are those that no other is better than in all of them, by the first objective.
     """
     several = len(study.directions) > 1
     trials = study.best_trials if several else study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     trials = list(filter(is_feasible, trials))
+    latest = max((trial.user_attrs.get(GENERATION, 0) for trial in trials), default=0)
+    trials = [trial for trial in trials if trial.user_attrs.get(GENERATION, 0) == latest]
     is_down = study.directions[0] == optuna.study.StudyDirection.MINIMIZE
     ranked = sorted(trials, key=lambda trial: (trial.values[0] if is_down else -trial.values[0], trial.number))
     different: dict[str, FrozenTrial] = {}
     for trial in ranked:
-        different.setdefault(json.dumps(trial.params, sort_keys=True), trial)
+        different.setdefault(json.dumps(searched_values(trial), sort_keys=True), trial)
     return list(different.values())[:n_best]

@@ -20,7 +20,7 @@ from optuna.trial import Trial
 from armscan.config.compose import compose
 from armscan.config.defaults import CLUSTER, to_plain
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.scheduling.state import ENV_STEPS, EPISODES, RETRY_OF, SEEDS, PendingWrites
+from armscan.sweeps.scheduling.state import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, SEEDS, PendingWrites
 from armscan.sweeps.storage.reports import keep_report, reports_of
 from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
@@ -89,6 +89,18 @@ class Attempt:
         number = self.trial.user_attrs.get(RETRY_OF)
         return None if number is None else trial_folder(self.study_folder, number)
 
+    @property
+    def parent_folder(self) -> Path | None:
+        """Folder of the trial whose checkpoints it begins from; None where it begins untrained."""
+        number = self.trial.user_attrs.get(PARENT)
+        return None if number is None else trial_folder(self.study_folder, number)
+
+    @property
+    def interval(self) -> tuple[int, int] | None:
+        """Environment steps at which its part of a training begins and ends; None where it trains the whole."""
+        interval = self.trial.user_attrs.get(INTERVAL)
+        return None if interval is None else (int(interval[0]), int(interval[1]))
+
     def config(self, seed: int) -> tuple[DictConfig, dict[str, str]]:
         """Return the configuration of one of its trainings, and the choice of each group."""
         config, choices = self.composed
@@ -121,7 +133,16 @@ class Attempt:
         storage, trial_id = self.trial.storage, self.trial._trial_id
         self.writes.append(partial(storage.set_trial_system_attr, trial_id, EPISODES, plain))
 
-    def report(self, metrics: Mapping[str, float], *, seed: int, n_env_steps: int, grid: int, total: int) -> None:
+    def report(
+        self,
+        metrics: Mapping[str, float],
+        *,
+        seed: int,
+        n_env_steps: int,
+        grid: int,
+        total: int,
+        n_inherited: int = 0,
+    ) -> None:
         """Report how a training is going.
 
         Args:
@@ -131,12 +152,13 @@ class Attempt:
             n_env_steps: Environment steps so far.
             grid: Environment steps between two reports, so that trials are compared at the same steps.
             total: Environment steps of a whole training.
+            n_inherited: Environment steps that its parent has taken. Default: 0.
 
         Raises:
             optuna.TrialPruned: If the trial is pruned.
         """
         done = [one for each, one in self.seeds_done.items() if each in self.seeds]
-        self.env_steps = sum(int(one[ENV_STEPS]) for one in done) + n_env_steps
+        self.env_steps = sum(int(one[ENV_STEPS]) for one in done) + n_env_steps - n_inherited
         progress = {"seed": seed, ENV_STEPS: self.env_steps}
         self.report_progress(progress | ({"return": metrics["mean_return"]} if "mean_return" in metrics else {}))
         if not self.objectives or any(name not in metrics for name in self.objectives):

@@ -23,6 +23,7 @@ from armscan.experiment.runner import VIDEO_SEED, train_agent
 from armscan.stats.aggregation import interquartile_mean
 from armscan.sweeps.scheduling.state import ENV_STEPS
 from armscan.sweeps.tasks.attempt import STUDY_TAG, Attempt, volumes_of
+from armscan.sweeps.tasks.generation import begin_generation, best_of_generation, inherited
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, run_of_study, take_over
 from armscan.tracking.run import PARENT_TAG
 from armscan.training import (
@@ -62,6 +63,9 @@ class _Reporter:
 
     def on_epoch(self, report: EpochReport) -> None:
         self.reports.append(report)
+        before = inherited(self.attempt, self.reports)
+        if before is not None and report.epoch <= before.epoch:
+            return
         grid = self.budget.eval_every_env_steps
         # On the grid: how far the environments of a vector step beyond it says nothing of a trial.
         so_far = dict(zip(TRAINING_METRICS, (report.n_env_steps // grid * grid, report.wall_s, 0.0), strict=True))
@@ -71,6 +75,7 @@ class _Reporter:
             n_env_steps=report.n_env_steps,
             grid=grid,
             total=self.budget.env_steps,
+            n_inherited=before.n_env_steps if before is not None else 0,
         )
 
     def _validation(self) -> Evaluation:
@@ -174,7 +179,13 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
         with tracked:
             try:
                 result = train_agent(
-                    setup, folder, [tracked, reporter], run_id=tracked.run_id, tell=log, earlier=earlier
+                    setup,
+                    folder,
+                    [tracked, reporter],
+                    run_id=tracked.run_id,
+                    tell=log,
+                    earlier=earlier,
+                    until_env_steps=attempt.interval[1] if attempt.interval else None,
                 )
             except optuna.TrialPruned as error:
                 pruned = error
@@ -183,15 +194,18 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
                 concluded = conclude(setup, result, tracked, folder) if conclude else {}
             draw_learning_curve(reporter.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
             attempt.show_picture(folder / LEARNING_CURVE_FILE)
-            # A finished training is not resumed; the best checkpoint stays.
-            (folder / LAST_CHECKPOINT).unlink(missing_ok=True)
+            if attempt.interval is None:
+                # A finished training is not resumed; the best checkpoint stays.
+                (folder / LAST_CHECKPOINT).unlink(missing_ok=True)
             tracked.log_results(folder)
             tracked.log_files(folder / RUN_FILE)
         attempt.opened(None)
     if pruned is not None:
         raise pruned
-    best = result.best.evaluation.metrics()
-    measured = (result.reports[-1].n_env_steps, result.wall_s, float(result.is_solved))
+    before = inherited(attempt, result.reports)
+    best = best_of_generation(result.reports, before, setup.budget.best_by).evaluation.metrics()
+    n_before, before_s = (before.n_env_steps, before.wall_s) if before is not None else (0, 0.0)
+    measured = (result.reports[-1].n_env_steps - n_before, result.wall_s - before_s, float(result.is_solved))
     return best | dict(zip(TRAINING_METRICS, measured, strict=True)) | concluded
 
 
@@ -221,7 +235,7 @@ def _begun(
     invocation = Invocation(folder, attempt.overrides, attempt.command, choices, job)
     tracked = start_tracking(config, invocation, setup, tags=attempt.tags, retry_s=RETRY_S)
     atomic_write(begun, lambda file: file.write(json.dumps({"run_id": tracked.run_id}).encode()))
-    return setup, tracked, []
+    return setup, tracked, begin_generation(attempt, setup, folder, run_id=tracked.run_id)
 
 
 def _take_over(attempt: Attempt, folder: Path) -> None:

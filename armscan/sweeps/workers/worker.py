@@ -63,6 +63,7 @@ class Worker:
             # One round trip for the trial before and the next: with many workers these add up.
             trial = self._heartbeat.claim(outcome, conclude)
             self._heartbeat.clean_up()
+            self._phase.remove_checkpoints()
             outcome, conclude = None, None
             if trial is not None:
                 outcome = self._run(trial)

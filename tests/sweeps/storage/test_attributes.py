@@ -68,6 +68,7 @@ def test_every_attribute_is_checked():
         names.ENQUEUED_FROM,
         names.ATTEMPT,
         names.SEEDS,
+        *(names.MEMBER, names.GENERATION, names.INTERVAL, names.PARENT, names.SCHEDULE),
         FINALIST,
         FINAL_SEED,
         attempt.RUN,

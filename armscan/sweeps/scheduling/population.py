@@ -1,0 +1,255 @@
+"""Population-based training: which member trains next, from which checkpoint, and with which values.
+
+A trial trains one member for one generation, an interval of environment steps, from the last checkpoint of its parent.
+Members wait for nobody (the asynchronous form of Jaderberg et al. 2017, arXiv:1711.09846). Everything here is a
+function of the trials in the storage and of the study's seed, so nothing is lost with a worker.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
+from optuna.samplers import RandomSampler
+from optuna.trial import FrozenTrial, Trial, TrialState
+
+from armscan.agents.schedule import FROM
+from armscan.sweeps.scheduling.state import (
+    FINISHED,
+    GENERATION,
+    INTERVAL,
+    MEMBER,
+    PARENT,
+    RETRIED,
+    RETRY_OF,
+    SCHEDULE,
+    PlannedTrial,
+)
+from armscan.sweeps.space.space import Space
+from armscan.utils.validation import check_float, check_int
+
+TRAINING_SCHEDULE = "training.schedule"
+ACTIVE = (TrialState.RUNNING, TrialState.WAITING)
+# A number is multiplied with one of them, as in the paper.
+FACTORS = (0.8, 1.2)
+Values = dict[str, Any]
+
+
+class PopulationSampler(RandomSampler):
+    """Settings of a population; draws the values of its first generation at random.
+
+    Args:
+        population: Number of members, 2 or more.
+        interval_env_steps: Environment steps of a generation; divides those of the whole training.
+        quantile: Share of the members, above 0 and at most 0.5, that are worst and continue from one of the best, of
+            which there are as many.
+        resample_probability: Probability that a value is drawn anew, and not changed by a fifth.
+        seed: Seed of the draws. Default: None, other draws each time.
+    """
+
+    def __init__(
+        self,
+        population: int,
+        interval_env_steps: int,
+        quantile: float = 0.25,
+        resample_probability: float = 0.25,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__(seed)
+        self.population = check_int("study.sampler.population", population, at_least=2)
+        self.interval_env_steps = check_int("study.sampler.interval_env_steps", interval_env_steps, at_least=1)
+        self.quantile = check_float("study.sampler.quantile", quantile, above=0.0, at_most=0.5)
+        self.resample_probability = check_float(
+            "study.sampler.resample_probability", resample_probability, at_least=0.0, at_most=1.0
+        )
+
+
+@dataclass(frozen=True)
+class Population:
+    """The population of a study.
+
+    Args:
+        settings: Size and rules.
+        space: Keys that are searched.
+        total_env_steps: Environment steps of a whole training, a multiple of those of a generation.
+        is_maximized: Whether a higher value of the objective is better.
+        seed: Seed of the study.
+    """
+
+    settings: PopulationSampler
+    space: Space
+    total_env_steps: int
+    is_maximized: bool
+    seed: int
+
+    @property
+    def n_generations(self) -> int:
+        """Number of generations."""
+        return self.total_env_steps // self.settings.interval_env_steps
+
+    @property
+    def n_trials(self) -> int:
+        """Number of trials of the whole study."""
+        return self.settings.population * self.n_generations
+
+    def plan(self, trials: Sequence[FrozenTrial]) -> list[PlannedTrial]:
+        """Return the next trial; nothing while all members train, and at the end.
+
+        It is that of the member that is furthest behind. A member among the worst of its generation so far continues
+        from a checkpoint of one of the best, with changed values; so does one whose training has failed.
+
+        Args:
+            trials: All trials of the study.
+        """
+        rng = np.random.default_rng(np.random.SeedSequence((self.seed, len(trials))))
+        trials = _members(trials)
+        ended = {_place(trial): trial for trial in trials if trial.state in FINISHED}
+        active = {trial.user_attrs[MEMBER] for trial in trials if trial.state in ACTIVE}
+        nexts = {each: sum(member == each for _, member in ended) for each in range(self.settings.population)}
+        for generation, member in sorted((generation, member) for member, generation in nexts.items()):
+            if generation == self.n_generations or member in active:
+                continue
+            if generation == 0:
+                return [self._planned(member, 0, None, self._drawn(rng), [])]
+            has_failed = any(_place(trial) == (generation, member) for trial in trials if _has_failed(trial))
+            parent = self._parent(ended[generation - 1, member], trials, rng, has_failed=has_failed)
+            if parent is not None:
+                is_copy = has_failed or parent.user_attrs[MEMBER] != member
+                values = self._explored(parent.params, rng) if is_copy else parent.params
+                return [self._planned(member, generation, parent.number, values, parent.user_attrs[SCHEDULE])]
+        return []
+
+    def takeable(self, trials: Sequence[FrozenTrial]) -> set[int]:
+        """Return the numbers of the trials whose last checkpoints somebody may still continue from.
+
+        Those of a generation that all members have passed are not among them, nor those that cannot be among the best.
+
+        Args:
+            trials: All trials of the study.
+        """
+        trials = _members(trials)
+        active = [trial for trial in trials if trial.state in ACTIVE]
+        kept = {trial.number for trial in active}
+        # A retry begins from what the attempt before has left, or from the same parent again.
+        kept |= {trial.user_attrs[name] for trial in active for name in (RETRY_OF, PARENT) if name in trial.user_attrs}
+        n_best = math.ceil(self.settings.quantile * self.settings.population)
+        passed = {_place(trial) for trial in trials if trial.state in FINISHED}
+        for generation in range(self.n_generations - 1):
+            behind = {each for each in range(self.settings.population) if (generation + 1, each) not in passed}
+            ranked = self._ranked(trials, generation)
+            # Others that complete this generation can only push a trial down.
+            kept |= {trial.number for trial in ranked[:n_best] if behind}
+            kept |= {trial.number for trial in ranked if trial.user_attrs[MEMBER] in behind}
+        return kept
+
+    def _ranked(self, trials: Sequence[FrozenTrial], generation: int) -> list[FrozenTrial]:
+        """Return the complete trials of a generation, the best first."""
+        sign = -1.0 if self.is_maximized else 1.0
+        complete = [
+            trial
+            for trial in trials
+            if trial.state == TrialState.COMPLETE and trial.user_attrs[GENERATION] == generation
+        ]
+        return sorted(complete, key=lambda trial: (sign * trial.values[0], trial.number))
+
+    def _parent(
+        self, own: FrozenTrial, trials: Sequence[FrozenTrial], rng: np.random.Generator, *, has_failed: bool
+    ) -> FrozenTrial | None:
+        """Return the trial that a member continues from: its own, or one of the best; None if there is none yet."""
+        ranked = self._ranked(trials, own.user_attrs[GENERATION])
+        n_worst = min(math.ceil(self.settings.quantile * len(ranked)), len(ranked) // 2)
+        is_worst = own.number in [trial.number for trial in ranked[len(ranked) - n_worst :]]
+        if own.state == TrialState.COMPLETE and not is_worst and not has_failed:
+            return own
+        best = ranked[: max(1, n_worst)]
+        return best[int(rng.integers(len(best)))] if best else None
+
+    def _planned(
+        self, member: int, generation: int, parent: int | None, values: Values, schedule: Sequence[Values]
+    ) -> PlannedTrial:
+        start = generation * self.settings.interval_env_steps
+        now = {key: value for segment in schedule for key, value in segment.items()}
+        changed = {key: value for key, value in values.items() if key not in now or now[key] != value}
+        attributes: Values = {
+            MEMBER: member,
+            GENERATION: generation,
+            INTERVAL: [start, start + self.settings.interval_env_steps],
+            SCHEDULE: [*schedule, *([{FROM: start, **changed}] if changed else [])],
+        }
+        return PlannedTrial(values, attributes | ({} if parent is None else {PARENT: parent}))
+
+    def _drawn(self, rng: np.random.Generator) -> Values:
+        return {each.name: _draw(each.name, each.distribution, rng) for each in self.space.parameters}
+
+    def _explored(self, values: Mapping[str, Any], rng: np.random.Generator) -> Values:
+        """Return changed values."""
+        explored = {}
+        for each in self.space.parameters:
+            if rng.random() < self.settings.resample_probability:
+                explored[each.name] = _draw(each.name, each.distribution, rng)
+            else:
+                explored[each.name] = _perturb(values[each.name], each.distribution, rng)
+        return explored
+
+
+def searched_values(trial: FrozenTrial | Trial) -> Values:
+    """Return the values of a trial by their keys; of a member with what has changed since its beginning."""
+    schedule = trial.user_attrs.get(SCHEDULE)
+    if not schedule:
+        return dict(trial.params)
+    first, *later = schedule
+    values = {key: value for key, value in first.items() if key != FROM}
+    return values | ({TRAINING_SCHEDULE: later} if later else {})
+
+
+def lineage(trials: Sequence[FrozenTrial], last: FrozenTrial) -> Iterator[FrozenTrial]:
+    """Yield the trials that a trial continues from, the first generation first, and itself."""
+    parent = last.user_attrs.get(PARENT)
+    if parent is not None:
+        yield from lineage(trials, trials[parent])
+    yield last
+
+
+def _members(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+    """Return the trials of members, without those that somebody else has enqueued."""
+    return [trial for trial in trials if MEMBER in trial.user_attrs]
+
+
+def _place(trial: FrozenTrial) -> tuple[int, int]:
+    return int(trial.user_attrs[GENERATION]), int(trial.user_attrs[MEMBER])
+
+
+def _has_failed(trial: FrozenTrial) -> bool:
+    return trial.state == TrialState.FAIL and RETRIED not in trial.user_attrs
+
+
+def _draw(name: str, distribution: BaseDistribution, rng: np.random.Generator) -> Any:
+    sampler = RandomSampler(int(rng.integers(2**31)))
+    # Neither study nor trial has a part in it.
+    return sampler.sample_independent(cast(Any, None), cast(Any, None), name, distribution)
+
+
+def _perturb(value: Any, distribution: BaseDistribution, rng: np.random.Generator) -> Any:
+    """Return a value a fifth higher or lower, within its range; a choice beside it."""
+    is_up = bool(rng.integers(2))
+    if isinstance(distribution, CategoricalDistribution):
+        choices = distribution.choices
+        beside = [place for place in _beside(choices.index(value)) if 0 <= place < len(choices)]
+        return choices[beside[is_up % len(beside)]] if beside else value
+    limits = cast(Any, distribution)
+    moved = value * FACTORS[is_up]
+    if limits.step:
+        n_steps = round((moved - limits.low) / limits.step)
+        if n_steps == round((value - limits.low) / limits.step):
+            n_steps += 1 if is_up else -1
+        moved = limits.low + n_steps * limits.step
+    moved = min(max(moved, limits.low), limits.high)
+    return int(moved) if isinstance(distribution, IntDistribution) else float(moved)
+
+
+def _beside(place: int) -> tuple[int, int]:
+    return place - 1, place + 1
