@@ -25,6 +25,7 @@ import numpy as np
 import optuna
 from optuna._hypervolume import compute_hypervolume
 from optuna.pruners import BasePruner, NopPruner
+from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from armscan.sweeps.scheduling.state import ENV_STEPS, env_steps_of
@@ -34,6 +35,7 @@ from armscan.sweeps.study.pruners import ParetoPruner
 from benchmarks.sweeps.bench.table import VALIDATION, read_rows, table_file
 
 WORDS = ("projection=y", "training.env_steps=8000", "training.eval_every_env_steps=1000")
+DIRECTIONS = (StudyDirection.MAXIMIZE, StudyDirection.MINIMIZE)
 
 
 @dataclass(frozen=True)
@@ -48,16 +50,16 @@ class Unpruned:
     """
 
     name: str
-    directions: tuple[str, str]
+    directions: tuple[StudyDirection, StudyDirection]
     first_rung: int
     trials: Sequence[FrozenTrial]
 
     def losses(self, trials: Sequence[FrozenTrial]) -> np.ndarray:
         """Return the values of trials, lower ones better, from 0 for the best to 1 for the worst of all trials."""
-        signs = [-1.0 if direction == "maximize" else 1.0 for direction in self.directions]
+        signs = [-1.0 if direction == StudyDirection.MAXIMIZE else 1.0 for direction in self.directions]
         of_all, values = (np.array([trial.values for trial in each]) * signs for each in (self.trials, trials))
         best, worst = of_all.min(axis=0), of_all.max(axis=0)
-        return (values - best) / np.where(worst > best, worst - best, 1.0)
+        return np.asarray((values - best) / np.where(worst > best, worst - best, 1.0))
 
     def hypervolume(self, trials: Sequence[FrozenTrial]) -> float:
         """Return the hypervolume of trials as a share of the box of all trials."""
@@ -80,7 +82,7 @@ def speed_vs_success(folder: Path, n_trials: int) -> Unpruned:
         )
     study = optuna.load_study(study_name="y", storage=open_storage(str(folder / "optuna.journal")).optuna)
     trials = study.get_trials(states=(TrialState.COMPLETE,))
-    return Unpruned("speed_vs_success (success rate, environment steps)", ("maximize", "minimize"), 2000, trials)
+    return Unpruned("speed_vs_success (success rate, environment steps)", DIRECTIONS, 2000, trials)
 
 
 def sac_y() -> Unpruned:
@@ -97,7 +99,7 @@ def sac_y() -> Unpruned:
         values = list(reports.values())[-1]
         of_reports = {f"{REPORT}{step}": report for step, report in reports.items()}
         trials.append(create_trial(values=values, system_attrs=of_reports, user_attrs={ENV_STEPS: max(reports)}))
-    return Unpruned("sac_y (mean steps, processor seconds)", ("minimize", "minimize"), 2500, trials)
+    return Unpruned("sac_y (mean steps, processor seconds)", (StudyDirection.MINIMIZE,) * 2, 2500, trials)
 
 
 def replay(unpruned: Unpruned, trials: Sequence[FrozenTrial], pruner: BasePruner) -> tuple[float, int, int]:
