@@ -102,10 +102,16 @@ def main() -> int:
     sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in MULTIRUN)
     try:
         check_words(sys.argv[1:])
-        if any(word == PLAN or word.startswith(f"{SWEEP}=") for word in sys.argv[1:]):
+        if any(word.startswith(f"{SWEEP}=") for word in sys.argv[1:]):
             from armscan.sweeps.command import run_study
 
             return run_study(sys.argv[1:], launch)
+        if PLAN in sys.argv[1:]:
+            # Deferred, because few commands need it.
+            from armscan.launch.grid_plan import print_grid_plan
+
+            print_grid_plan(sys.argv[1:])
+            return 0
         if any(word.startswith(f"{RESUME}=") for word in sys.argv[1:]):
             # Before Hydra composes a configuration, and makes a folder: a run that goes on has both.
             from armscan.experiment.resume import resume

@@ -102,6 +102,11 @@ class TianshouLearner(BaseLearner):
         """Return how the actions of evaluations are chosen: `deterministic` or `sampled`."""
         return "deterministic" if self._algorithm.policy.deterministic_eval else "sampled"
 
+    @property
+    def warm_up_note(self) -> str | None:
+        """What comes before the first update, for a reader of the log; None where nothing does."""
+        return f"{self._learning_starts:,} random steps before the first update" if self._learning_starts else None
+
     def warm_up(self) -> None:
         """Fill the replay buffer with random steps."""
         self._begin_epoch()

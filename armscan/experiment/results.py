@@ -39,6 +39,8 @@ TITLES = {
 # Metrics of evaluations have this among them, below the name of their group, which a run shortens.
 EVALUATED = "/success_rate"
 NAMES = {name.replace(" ", "_"): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
+# Metrics of a model of MLflow, beside the on-plane rates.
+OF_MODEL = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
 # With fewer volumes intervals are clearly too narrow: docs/metrics.md.
 FEWEST_VOLUMES = 8
 WHAT_HELPS = "more wrists, data=mixed, or cross-validation (data.folds=leave_one_out) would help"
@@ -97,6 +99,18 @@ class RunResult:
         for name, evaluation in self.evaluations.items():
             metrics[name] |= evaluation.metrics()
         return metrics
+
+    def markdown(self) -> str:
+        """Return the table of the agent on the test volumes and the baselines there, and the notes, in Markdown."""
+        shown = {name: each for name, each in self.figures.items() if name == TEST or name in self.baselines}
+        table = result_table({name: each for name, each in shown.items() if name != self.own_baseline})
+        return "\n\n".join([table.markdown(), *self.notes()])
+
+    def model_metrics(self) -> dict[str, list[str]]:
+        """Return the names of the run's metrics that its checkpoint is known by, by the part of their volumes."""
+        names = [*(limits.metric for limits in self.evaluations[TEST].on_plane), *OF_MODEL]
+        groups = {"test": TEST.replace(" ", "_"), "validation": "validation"}
+        return {part: [f"{group}/{name}" for name in names] for part, group in groups.items()}
 
     def notes(self) -> list[str]:
         """Return the notes on the volumes; see `volume_notes`."""

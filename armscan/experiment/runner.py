@@ -21,6 +21,7 @@ from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
 from armscan.experiment.results import RunResult
 from armscan.tracking import TrackedRun, draw_learning_curve
+from armscan.tracking.view import artifact_address
 from armscan.training import (
     VALIDATION,
     Callback,
@@ -139,6 +140,8 @@ def train_agent(
     assert isinstance(agent, Learner)
     if note := agent.update_note:
         tell(f"update: {note}")
+    if not earlier and (note := getattr(agent, "warm_up_note", None)):
+        tell(f"random steps: {note}")
     seed = VALIDATION_SEED + setup.seed
     validate = partial(
         evaluate,
@@ -177,9 +180,12 @@ def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: Ru
             tracked.log_metrics(figures, n_env_steps=result.best.n_env_steps if result else 0)
     if result:
         tracked.log_metrics({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
+        tracked.log_model(reached.model_metrics(), n_env_steps=result.best.n_env_steps)
         draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
     reached.write(folder, title=tracked.name)
     tracked.log_results(folder)
+    curve = f"\n\n![learning curve]({artifact_address(tracked.run_id, LEARNING_CURVE_FILE)})" if result else ""
+    tracked.set_note(reached.markdown() + curve)
 
 
 @contextlib.contextmanager

@@ -58,8 +58,17 @@ def colours(n: int) -> list[str]:
     return [str(palette[number % len(palette)]) for number in range(n)]
 
 
-def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str, str]) -> Figure:
-    """Return the figures of `titles` below each other, with switches for the axis and for the lines of single seeds."""
+def learning_curves(
+    groups: Sequence[Group], curves: Curves, titles: Mapping[str, str], *, is_detailed: bool = True
+) -> Figure:
+    """Return metrics below each other, with switches for the axis and for the lines of single seeds.
+
+    Args:
+        groups: Groups that are drawn.
+        curves: Their curves.
+        titles: Title of each metric, by its name.
+        is_detailed: Whether bands and the lines of single seeds are drawn. Default: true.
+    """
     entry_px = SAMPLE_PX + LETTER_PX * max(len(group.label) for group in groups)
     legend_px = LEGEND_ROW_PX * math.ceil(len(groups) / max(1, LEGEND_PX // entry_px))
     shown = "bands and seeds" if len(groups) <= MANY else "neither"
@@ -68,7 +77,7 @@ def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str
     for row, (name, title) in enumerate(titles.items(), start=1):
         for number, (group, colour) in enumerate(zip(groups, colours(len(groups)), strict=True)):
             of_axes = [curves.get((name, axis, number), NOTHING) for axis in AXES]
-            for trace in _traces(of_axes, colour):
+            for trace in _traces(of_axes, colour, is_detailed=is_detailed):
                 figure.add_scatter(
                     **trace.look, **trace.over[0], name=group.label, legendgroup=str(number), row=row, col=1
                 )
@@ -132,10 +141,10 @@ def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
     return figure.update_layout(height=height, margin={"t": 20, "b": 50, "l": 10, "r": 20})
 
 
-def _traces(of_axes: Sequence[Curve], colour: str) -> Iterator[Trace]:
+def _traces(of_axes: Sequence[Curve], colour: str, *, is_detailed: bool) -> Iterator[Trace]:
     """Yield the band, the lines of the seeds, and the line of all of them together."""
     curve = of_axes[0]
-    if curve.n_seeds > 1:
+    if curve.n_seeds > 1 and is_detailed:
         unseen = {"mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
         faint = "rgba({}, {}, {}, 0.2)".format(*hex_to_rgb(colour))
         yield Trace(BANDS, unseen, [_points(each.places, each.band.lows) for each in of_axes])

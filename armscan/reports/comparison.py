@@ -20,7 +20,7 @@ from armscan.reports.significance import (
     baseline_metrics,
     compare_groups,
     complement,
-    evaluated_trainings,
+    evaluations_by_seed,
     final_metrics,
 )
 from armscan.reports.videos import videos
@@ -37,6 +37,7 @@ HOW_CURVES = (
     "its group ends. "
     "Seconds are wall time of training and validation, on the machine of the run."
 )
+MEANS_ALONE = "Of so many groups only the means are drawn: curves.csv has the bands, seed_curves.csv the seeds."
 HOW_FINAL = (
     "The final evaluation, with the weights of the best epoch, on test volumes that had no part in anything before, "
     "over all episodes of all seeds, beside the baselines. In the chart diamonds are these figures, dots the seeds."
@@ -52,6 +53,8 @@ HOW_BETTER = (
 
 # More groups are compared in a table that is folded.
 MANY_PAIRS = 12
+# Of more groups, nobody can tell the bands apart.
+MOST_DETAILED = 24
 LEADING = "on-plane rate"
 
 
@@ -76,7 +79,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
         if (curve := curve_of(group, figure, axis))
     }
     reached = [final_metrics(group) for group in groups]
-    pairs = {figure: list(compare_groups(groups, figure)) for figure in COMPARED_BY}
+    pairs = compare_groups(groups)
     parts = [
         _summary(groups),
         notes_on(groups, left_out, has_other_volumes=any(each.probability is None for each in pairs["on_plane_rate"])),
@@ -100,17 +103,24 @@ def _figures(groups: Sequence[Group]) -> list[str]:
 
 def _summary(groups: Sequence[Group]) -> str:
     n_trainings = sum(len(group.trainings) for group in groups)
+    by = "the seed and the fold" if any(group.n_folds for group in groups) else "the seed"
     rows = [
         {
             "group": Markup(f'<span style="color: {colour}">●</span> {html.escape(group.title)}'),
-            "runs, with their seeds": ", ".join(f"{each.id} ({each.seed or '–'})" for each in group.trainings),
+            "runs, with their seeds": ", ".join(f"{each.id} ({_told(each)})" for each in group.trainings),
             "environment steps": _span([training.env_steps for training in group.trainings]),
             "training, s": _span([training.wall_s for training in group.trainings]),
         }
         for group, colour in zip(groups, colours(len(groups)), strict=True)
     ]
     counted = f"{_counted(n_trainings, 'run')} in {_counted(len(groups), 'group')}"
-    return f"<p>{counted}: those of a group differ by nothing but the seed.</p>{table(rows, what='groups')}"
+    return f"<p>{counted}: those of a group differ by nothing but {by}.</p>{table(rows, what='groups')}"
+
+
+def _told(training: TrackedTraining) -> str:
+    """Return the seed of a training, and the fold that it was tested on."""
+    seed = training.seed or "–"
+    return seed if training.fold is None else f"{seed}, fold {training.fold}"
 
 
 def _counted(number: int, what: str) -> str:
@@ -121,14 +131,17 @@ def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
     yield "<h2>Learning curves</h2>"
     titles = validation_titles(figure for figure, *_ in curves)
     if titles:
-        yield f"<p>{HOW_CURVES}</p>{chart(learning_curves(groups, curves, titles))}"
+        is_detailed = len(groups) <= MOST_DETAILED
+        how = HOW_CURVES if is_detailed else f"{HOW_CURVES} {MEANS_ALONE}"
+        yield f"<p>{how}</p>{chart(learning_curves(groups, curves, titles, is_detailed=is_detailed))}"
     else:
         yield "<p>None of these runs has been validated: nothing was to be learned, or nothing has been yet.</p>"
 
 
 def _of_the_training(groups: Sequence[Group], curves: Curves, figures: Sequence[str]) -> Iterator[str]:
     if figures:
-        drawn = chart(learning_curves(groups, curves, {name: _title_of_training(name) for name in figures}))
+        titles = {name: _title_of_training(name) for name in figures}
+        drawn = chart(learning_curves(groups, curves, titles, is_detailed=len(groups) <= MANY))
         yield folded("Metrics of the training itself: losses, returns, speed", drawn)
 
 
@@ -149,8 +162,9 @@ def final_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
     """Return the table of the groups' results, and of the baselines."""
     nothing = MetricEstimates.of_metrics({})
     figures = {group.label: each or nothing for group, each in zip(groups, reached, strict=True)}
-    baselines = {group.label: baseline_metrics(group) for group in groups if evaluated_trainings(group)}
-    return ResultTable(with_baselines(figures, baselines))
+    evaluated = [group for group in groups if evaluations_by_seed(group)]
+    labels = [group.label for group in evaluated]
+    return ResultTable(with_baselines(figures, dict(zip(labels, baseline_metrics(evaluated), strict=True))))
 
 
 def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[str]:
@@ -175,7 +189,7 @@ def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
     is_few = len(groups) <= MANY
     for pair in pairs:
         theirs = complement(pair.probability) if pair.probability else None
-        n_seeds = min(len(evaluated_trainings(groups[number])) for number in (pair.ours, pair.theirs))
+        n_seeds = min(len(evaluations_by_seed(groups[number])) for number in (pair.ours, pair.theirs))
         how = {"is_few": is_few, "is_sure": n_seeds >= FEWEST_SEEDS}
         cells[pair.ours, pair.theirs] = _cell(pair.probability, **how)
         cells[pair.theirs, pair.ours] = _cell(theirs, **how)

@@ -55,7 +55,7 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
         return None
     places = _places(known)
     scores = np.array([np.interp(places, *line) for _, line in known])
-    band = band_over_seeds(scores, np.mean)
+    band = band_over_seeds(scores)
     return Curve(places, band, len(known), {training.label: line for training, line in known})
 
 

@@ -1,4 +1,4 @@
-"""Groups of trainings that differ only in their seed, and their names."""
+"""Groups of trainings that differ only in their seed and their fold, and their names."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from armscan.config.defaults import ADDED, NOT_COMPARED
-from armscan.reports.load import TrackedTraining
+from armscan.reports.load import FOLD, TrackedTraining
 
-LEFT_OUT = (*NOT_COMPARED, "data.cache_dir")
+LEFT_OUT = (*NOT_COMPARED, "data.cache_dir", FOLD)
 SEED_IN_NAME = re.compile(r"-seed\d+$")
 MAX_LABEL_CHARS = 72
 # The sections before a key.
@@ -29,13 +29,23 @@ class Group:
         number: Number of the group, from 1.
         name: Keys and values by which it differs from the other groups.
         label: Number and name, short enough for a legend.
-        trainings: Its trainings, each with another seed.
+        trainings: Its trainings, each with another seed, or tested on another fold.
     """
 
     number: int
     name: str
     label: str
     trainings: tuple[TrackedTraining, ...]
+
+    @property
+    def n_seeds(self) -> int:
+        """Number of seeds; all folds of a seed count once."""
+        return len({training.seed or training.run_id for training in self.trainings})
+
+    @property
+    def n_folds(self) -> int:
+        """Number of folds of a cross-validation that its trainings were tested on."""
+        return len({training.fold for training in self.trainings if training.fold is not None})
 
     @property
     def title(self) -> str:

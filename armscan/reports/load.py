@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from mlflow.entities import Run
+from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
 
 from armscan.config.legacy import migrate
 from armscan.errors import TrackingError
 from armscan.reports.select import ID_CHARS, SelectedRuns
 from armscan.stats.on_plane import leading_of, limits_among
 from armscan.tracking import TrackingStore
+from armscan.tracking.histories import History, metric_histories
 from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
 from armscan.training import TEST, Evaluation
@@ -32,6 +34,8 @@ OF_VALIDATION = "validation/"
 # The beginnings of what else is drawn.
 OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
 BUDGET = "training.env_steps"
+# Of a cross-validation, and MLflow's parameter of what is not set.
+FOLDS, FOLD, UNSET = "data.folds", "data.fold", "None"
 CHOICE = "choice."
 T = TypeVar("T")
 
@@ -94,9 +98,15 @@ class TrackedTraining:
         return self.params.get("seed")
 
     @property
+    def fold(self) -> str | None:
+        """Fold of a cross-validation that it was tested on; None where it is of none."""
+        return self.params.get(FOLD) if self.params.get(FOLDS, UNSET) != UNSET else None
+
+    @property
     def label(self) -> str:
-        """Label within its group: the seed, or the run ID."""
-        return f"seed {self.seed}" if self.seed is not None else f"run {self.id}"
+        """Label within its group: the seed or the run ID, and the fold."""
+        label = f"seed {self.seed}" if self.seed is not None else f"run {self.id}"
+        return label if self.fold is None else f"{label}, fold {self.fold}"
 
     @property
     def env_steps(self) -> float:
@@ -127,22 +137,27 @@ def validation_titles(names: Iterable[str]) -> dict[str, str]:
     return titles | {name: title for name, title in VALIDATION.items() if name in known}
 
 
-def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> TrackedTraining:
-    """Return the training of a run.
+def read_trainings(store: TrackingStore, found: Sequence[SelectedRuns], folder: Path) -> list[TrackedTraining]:
+    """Return what runs say of their trainings.
 
     Args:
-        store: Store of the run.
-        found: Run to read.
-        folder: New folder that takes its files.
+        store: Store that they are in.
+        found: The runs.
+        folder: Folder that takes their files.
 
     Raises:
-        TrackingError: If a file of it is damaged, or the store cannot be used.
+        TrackingError: If a file of them is damaged, or the store cannot be used.
     """
-    run, tags = found.run, found.run.data.tags
-    folder.mkdir()
+    runs = [each.run for each in found]
     with store_errors(store.uri):
-        series = _series(store, run)
-        files = _files(store, run, folder)
+        histories = metric_histories(store, {run.info.run_id: _wanted(run) for run in runs})
+        files = [_files(store, run, folder / run.info.run_id) for run in runs]
+    return [_training(each, histories[each.run.info.run_id], of_run) for each, of_run in zip(found, files, strict=True)]
+
+
+def _training(found: SelectedRuns, histories: Mapping[str, History], files: Mapping[str, bytes]) -> TrackedTraining:
+    run, tags = found.run, found.run.data.tags
+    series = _series(histories)
     evaluation = _parsed(run, files, EVALUATION_FILE, lambda contents: Evaluation.of_dict(contents[TEST]))
     baselines = _parsed(
         run, files, BASELINES_FILE, lambda contents: {name: Evaluation.of_dict(each) for name, each in contents.items()}
@@ -166,27 +181,32 @@ def read_training(store: TrackingStore, found: SelectedRuns, folder: Path) -> Tr
     )
 
 
-def _series(store: TrackingStore, run: Run) -> dict[str, Series]:
-    shown = {*VALIDATION, f"{OF_VALIDATION}{leading_of(migrate(run.data.params)).metric}"}
-    wanted = [name for name in run.data.metrics if name in shown or name.startswith(OF_THE_TRAINING)]
-    wall_s = _history(store, run, WALL) if WALL in run.data.metrics else {}
+def _wanted(run: Run) -> list[str]:
+    """Return the names of the metrics of a run that a comparison draws, and of those that it draws them over."""
+    shown = {WALL, *VALIDATION, f"{OF_VALIDATION}{leading_of(migrate(run.data.params)).metric}"}
+    return [name for name in run.data.metrics if name in shown or name.startswith(OF_THE_TRAINING)]
+
+
+def _series(histories: Mapping[str, History]) -> dict[str, Series]:
+    wall_s = histories.get(WALL, {})
     series = {}
-    for name in sorted(wanted):
-        points = sorted(_history(store, run, name).items())
-        steps, values = (np.array(each, dtype=float) for each in zip(*points, strict=True))
-        series[name] = Series(steps, np.array([wall_s.get(step, np.nan) for step, _ in points]), values)
+    for name, history in sorted(histories.items()):
+        if name != WALL and history:
+            steps = sorted(history)
+            values = np.array([history[step] for step in steps], dtype=float)
+            seconds = np.array([wall_s.get(step, np.nan) for step in steps])
+            series[name] = Series(np.array(steps, dtype=float), seconds, values)
     return series
-
-
-def _history(store: TrackingStore, run: Run, name: str) -> dict[int, float]:
-    return {point.step: point.value for point in store.get_metric_history(run.info.run_id, name)}
 
 
 def _files(store: TrackingStore, run: Run, folder: Path) -> dict[str, bytes]:
     """Return the files that a run has kept of those that a comparison needs."""
-    names = {artifact.path for artifact in store.list_artifacts(run.info.run_id)}
+    folder.mkdir(parents=True)
+    # `MlflowClient.download_artifacts` reads the run again for each file.
+    repository: Any = get_artifact_repository(run.info.artifact_uri, tracking_uri=store.mlflow.tracking_uri)
+    names = {artifact.path for artifact in repository.list_artifacts()}
     return {
-        name: Path(store.download_artifacts(run.info.run_id, name, str(folder))).read_bytes()
+        name: Path(repository.download_artifacts(name, str(folder))).read_bytes()
         for name in names & {EVALUATION_FILE, BASELINES_FILE, VIDEO_FILE, VOLUMES_FILE}
     }
 

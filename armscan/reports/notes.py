@@ -13,6 +13,7 @@ from armscan.stats.aggregation import FEWEST_SEEDS
 def notes_on(groups: Sequence[Group], left_out: Sequence[TrackedTraining], *, has_other_volumes: bool) -> str:
     """Return the notes as a list, nothing where there are none; `left_out` are trainings that repeat another one."""
     notes = [
+        *_on_folds(groups),
         *_on_seeds(groups),
         *_on_unfinished(groups),
         *_on_missing(groups),
@@ -24,13 +25,23 @@ def notes_on(groups: Sequence[Group], left_out: Sequence[TrackedTraining], *, ha
     return f"<ul>{''.join(f'<li>{html.escape(note)}</li>' for note in notes)}</ul>" if notes else ""
 
 
+def _on_folds(groups: Sequence[Group]) -> Iterator[str]:
+    for group in groups:
+        if group.n_folds:
+            yield (
+                f"Group {group.number} is a cross-validation of {group.n_folds} folds: the figures on the test volumes "
+                "are over all of them, each wrist tested on by trainings that have not seen it, and intervals draw "
+                "wrists. In learning curves each fold of a seed is a line."
+            )
+
+
 def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
-    if single := [group.number for group in groups if len(group.trainings) == 1]:
+    if single := [group.number for group in groups if group.n_seeds == 1]:
         yield (
             f"{_numbered(single, groups)}: one seed says nothing of how others would go; intervals are of volumes and "
             "episodes alone."
         )
-    if few := [group.number for group in groups if 1 < len(group.trainings) < FEWEST_SEEDS]:
+    if few := [group.number for group in groups if 1 < group.n_seeds < FEWEST_SEEDS]:
         yield (
             f"{_numbered(few, groups)}: of two or three seeds the 95 % interval of a curve is only the range from the "
             "lowest to the highest, which holds the median of all seeds in 50 % or 75 % of cases. The other intervals "

@@ -39,11 +39,11 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
     # Deferred: runs that are not there are answered before these are loaded.
     from armscan.reports.comparison import write_comparison
     from armscan.reports.groups import group_trainings
-    from armscan.reports.load import read_training
+    from armscan.reports.load import read_trainings
 
     print(f"reading   {len(found)} run{'s' if len(found) > 1 else ''}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        trainings = [read_training(store, each, Path(folder) / each.run.info.run_id) for each in found]
+        trainings = read_trainings(store, found, Path(folder))
     groups, left_out = group_trainings(trainings)
     title = f"Runs {', '.join(named)}" if len(", ".join(named)) <= MAX_NAME_CHARS else f"{len(trainings)} runs"
     return write_comparison(groups, left_out, title, Path(out) if out else REPORTS / _folder_name(named))

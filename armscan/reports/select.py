@@ -65,7 +65,7 @@ def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[SelectedR
         for name in named:
             trainings = _in_experiment(store, name) if name.startswith(EXPERIMENT) else _meant(store, name)
             found |= {run.info.run_id: run for run in trainings}
-        return [_selected(store, run) for run in found.values()]
+        return _selected(store, list(found.values()))
 
 
 def _meant(store: TrackingStore, name: str) -> list[Run]:
@@ -105,12 +105,21 @@ def _in_experiment(store: TrackingStore, name: str) -> list[Run]:
     return trainings
 
 
-def _selected(store: TrackingStore, run: Run) -> SelectedRuns:
-    """Return a training with whether its trial was pruned."""
-    check_version(run)
-    tags = run.data.tags
-    is_of_trial = TRIAL_TAG in tags and PARENT_TAG in tags
-    return SelectedRuns(run, is_of_trial and PRUNED_TAG in store.get_run(tags[PARENT_TAG]).data.tags)
+def _selected(store: TrackingStore, runs: Sequence[Run]) -> list[SelectedRuns]:
+    """Return trainings with whether their trials were pruned."""
+    for run in runs:
+        check_version(run)
+    trials = {
+        run.info.run_id: (run.info.experiment_id, run.data.tags[PARENT_TAG])
+        for run in runs
+        if TRIAL_TAG in run.data.tags and PARENT_TAG in run.data.tags
+    }
+    pruned = {
+        (experiment_id, each.info.run_id)
+        for experiment_id in {experiment_id for experiment_id, _ in trials.values()}
+        for each in _runs(store, experiment_id, f"tags.`{PRUNED_TAG}` IS NOT NULL")
+    }
+    return [SelectedRuns(run, trials.get(run.info.run_id) in pruned) for run in runs]
 
 
 def _runs(store: TrackingStore, experiment_id: str, condition: str = "") -> Iterator[Run]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 
 import numpy as np
 
 from armscan.reports.groups import Group
 from armscan.reports.load import TrackedTraining
-from armscan.stats.aggregation import probability_of_improvement
+from armscan.stats.aggregation import probabilities_of_improvement
 from armscan.stats.bootstrap import Estimate
-from armscan.training import MetricEstimates
+from armscan.training import Evaluation, MetricEstimates
 from armscan.volumes.plane import FloatArray
 
 # Rate of the leading limits, and metrics of `Evaluation.metrics`, that groups are compared by; true where higher is
@@ -36,31 +38,34 @@ class Pair:
     probability: Estimate | None
 
 
-def evaluated_trainings(group: Group) -> list[TrackedTraining]:
-    """Return the trainings of a group that have a final evaluation."""
-    return [training for training in group.trainings if training.evaluation is not None]
+def evaluations_by_seed(group: Group) -> dict[str, Evaluation]:
+    """Return the final evaluations of a group by seed; all folds of a seed are one, in which each wrist is once."""
+    played: dict[str, list[Evaluation]] = defaultdict(list)
+    for training in group.trainings:
+        if training.evaluation is not None:
+            played[training.seed or training.run_id].append(training.evaluation)
+    return {seed: _joined(evaluations) for seed, evaluations in played.items()}
 
 
 def final_metrics(group: Group) -> MetricEstimates | None:
     """Return the final metrics of a group, with intervals over seeds, volumes and episodes; None if not evaluated."""
-    played = {each.run_id: each.evaluation for each in group.trainings if each.evaluation is not None}
+    played = evaluations_by_seed(group)
     return MetricEstimates.of_trainings(played) if played else None
 
 
-def compare_groups(groups: Sequence[Group], figure: str) -> Iterator[Pair]:
-    """Yield the comparison of every pair of groups that were evaluated.
-
-    Args:
-        groups: Groups of trainings, in the order of their indices.
-        figure: Name of the metric, one of `COMPARED_BY`.
-    """
+def compare_groups(groups: Sequence[Group]) -> dict[str, list[Pair]]:
+    """Return the comparison of every pair of groups that were evaluated, by each metric of `COMPARED_BY`."""
     volumes = [_volumes(group) for group in groups]
-    scores = [_scores(group, figure) * (1.0 if COMPARED_BY[figure] else -1.0) for group in groups]
-    for ours, theirs in combinations(range(len(groups)), 2):
-        if not (evaluated_trainings(groups[ours]) and evaluated_trainings(groups[theirs])):
-            continue
-        is_comparable = _are_same(volumes[ours], volumes[theirs])
-        yield Pair(ours, theirs, probability_of_improvement(scores[ours], scores[theirs]) if is_comparable else None)
+    metrics = [[_compared(each) for each in evaluations_by_seed(group).values()] for group in groups]
+    pairs = list(combinations([number for number, of_group in enumerate(metrics) if of_group], 2))
+    comparable = [pair for pair in pairs if _are_same(*(volumes[number] for number in pair))]
+    compared = {}
+    for figure, is_higher_better in COMPARED_BY.items():
+        scores = [_scores(of_group, figure) * (1.0 if is_higher_better else -1.0) for of_group in metrics]
+        found = probabilities_of_improvement([(scores[ours], scores[theirs]) for ours, theirs in comparable])
+        known = dict(zip(comparable, found, strict=True))
+        compared[figure] = [Pair(*pair, known.get(pair)) for pair in pairs]
+    return compared
 
 
 def complement(probability: Estimate) -> Estimate:
@@ -75,35 +80,48 @@ def metrics_by_volume(training: TrackedTraining) -> dict[str, dict[str, float]]:
     return {name: each.metrics() for name, each in sorted(training.evaluation.by_volume().items())}
 
 
-def baseline_metrics(group: Group) -> dict[str, MetricEstimates]:
-    """Return the metrics of the baselines on the test volumes of a group, by their names; its trainings have the same.
+def baseline_metrics(groups: Sequence[Group]) -> list[dict[str, MetricEstimates]]:
+    """Return the metrics of the baselines on the test volumes of each group, by their names.
 
-    The baselines are not trained, and play the same episodes for every seed.
+    The baselines are not trained, and play the same episodes for every seed; so do those of groups that were evaluated
+    on the same volumes by the same rules.
     """
-    kept = next((training.baselines for training in group.trainings if training.baselines), {})
-    return {name: MetricEstimates.of(evaluation) for name, evaluation in kept.items()}
+    metrics = cache(MetricEstimates.of)
+    return [{name: metrics(_joined(each)) for name, each in _baselines(group).items()} for group in groups]
 
 
-def _scores(group: Group, figure: str) -> FloatArray:
-    """Return a metric of the group's trainings, shape (seeds, volumes), on the volumes that all of them share."""
-    rows = [_compared(training) for training in evaluated_trainings(group)]
-    common = sorted(set.intersection(*(set(row) for row in rows))) if rows else []
-    return np.array([[row[volume][figure] for volume in common] for row in rows])
+def _baselines(group: Group) -> dict[str, list[Evaluation]]:
+    """Return the baselines' evaluations, of each fold once, by their names."""
+    of_fold = {each.fold: each.baselines for each in reversed(group.trainings) if each.baselines}
+    names = dict.fromkeys(name for baselines in of_fold.values() for name in baselines)
+    return {name: [each[name] for each in of_fold.values() if name in each] for name in names}
 
 
-def _compared(training: TrackedTraining) -> dict[str, dict[str, float]]:
-    by_volume = training.evaluation.by_volume() if training.evaluation else {}
+def _joined(evaluations: Sequence[Evaluation]) -> Evaluation:
+    episodes = tuple(episode for each in evaluations for episode in each.episodes)
+    return Evaluation(episodes, evaluations[0].on_plane)
+
+
+def _scores(trainings: Sequence[Mapping[str, Mapping[str, float]]], figure: str) -> FloatArray:
+    """Return a metric of trainings, shape (seeds, volumes), on the volumes that all of them share."""
+    common = sorted(set.intersection(*map(set, trainings))) if trainings else []
+    return np.array([[training[volume][figure] for volume in common] for training in trainings])
+
+
+def _compared(evaluation: Evaluation) -> dict[str, dict[str, float]]:
+    by_volume = evaluation.by_volume()
     return {name: each.metrics() | {"on_plane_rate": each.on_plane_rate} for name, each in by_volume.items()}
 
 
 def _volumes(group: Group) -> Mapping[str, str | None] | None:
-    """Return the volumes that a group was evaluated on, with fingerprints; None if its trainings differ."""
-    of_trainings = [
-        {name: (training.volumes or {}).get(name) for name in metrics_by_volume(training)}
-        for training in evaluated_trainings(group)
-    ]
-    is_one = all(_are_same(of_trainings[0], each) for each in of_trainings[1:])
-    return of_trainings[0] if of_trainings and is_one else None
+    """Return the volumes that a group was evaluated on, with fingerprints; None if its seeds differ."""
+    of_seeds: dict[str, dict[str, str | None]] = defaultdict(dict)
+    for training in group.trainings:
+        if training.evaluation is not None:
+            prints = {name: (training.volumes or {}).get(name) for name in training.evaluation.by_volume()}
+            of_seeds[training.seed or training.run_id] |= prints
+    first, *others = of_seeds.values() or [None]
+    return first if all(_are_same(first, each) for each in others) else None
 
 
 def _are_same(some: Mapping[str, str | None] | None, others: Mapping[str, str | None] | None) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from functools import cache, partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from armscan.policies.model import ONNX_FILE, model_sha256
 from armscan.runs.model_card import Card
 from armscan.tracking import FoundRun, check_artifacts, load_run
 from armscan.tracking.client import reason_in
+from armscan.tracking.logged_model import VERSIONS_TAG, model_of
 from armscan.tracking.run import MODEL_FILE
 from armscan.tracking.store import store_errors
 from armscan.training import TEST
@@ -27,6 +29,8 @@ from armscan.utils.files import POLICY_FOLDER
 MAX_NAME_CHARS = 256
 # The alias of the version that was registered last, `models:/NAME@champion`.
 CHAMPION = "champion"
+# The tag of a version that names the model of MLflow of the same checkpoint.
+MODEL_TAG = "logged_model"
 # A policy computes its most likely action in 32 bits on the CPU, however the run trained and evaluated it.
 PLAIN_COMPUTE = {"device": "cpu", "precision": "float32", "compile": False}
 
@@ -140,6 +144,11 @@ def _registered(run: FoundRun, name: str, card: Card) -> str:
     except MlflowException as error:
         if error.error_code != "RESOURCE_ALREADY_EXISTS":
             raise
-    version = run.client.create_model_version(name, source, run.run_id, tags=card.tags, description=card.text)
+    model = model_of(run.client.mlflow, run.client.get_run(run.run_id))
+    tags = card.tags | ({MODEL_TAG: model.model_id} if model else {})
+    version = run.client.create_model_version(name, source, run.run_id, tags=tags, description=card.text)
     run.client.set_registered_model_alias(name, CHAMPION, version.version)
+    if model:
+        registered = [*json.loads(model.tags.get(VERSIONS_TAG, "[]")), {"name": name, "version": str(version.version)}]
+        run.client.set_logged_model_tags(model.model_id, {VERSIONS_TAG: json.dumps(registered)})
     return f"models:/{name}/{version.version}"

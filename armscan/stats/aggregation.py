@@ -7,7 +7,8 @@ interval, though somewhat too narrow for few.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,8 @@ from armscan.volumes.plane import FloatArray
 QUARTER = 0.25
 # With fewer seeds an interval is no more than their range.
 FEWEST_SEEDS = 4
+# Quantiles at the ends of an interval.
+ENDS = (1 - LEVEL) / 2, (1 + LEVEL) / 2
 
 Mean = Callable[..., Any]
 
@@ -58,22 +61,20 @@ def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
     return Estimate(value, float(low), float(high))
 
 
-def band_over_seeds(scores: FloatArray, mean: Mean) -> Band:
+def band_over_seeds(scores: FloatArray) -> Band:
     """Return the mean over the seeds at each point, with an interval; a resample has the same seeds at all points.
 
     Args:
         scores: Scores, shape (seeds, points), all finite.
-        mean: Function that aggregates the values over an axis, such as `numpy.mean`.
 
     Returns:
         The band, without an interval where there is one seed.
     """
-    values = np.asarray(mean(scores, axis=0), dtype=float)
+    values = scores.mean(axis=0)
     if len(scores) < 2 or not scores.size:
         return Band(values, *(np.full(len(values), np.nan) for _ in range(2)))
-    at_once = max(1, MOST_VALUES // scores.size)
-    low, high = _ends((scores,), mean, vectorized=True, axis=0, batch=at_once)
-    return Band(values, np.asarray(low), np.asarray(high))
+    drawn = _times_drawn(len(scores), np.random.default_rng(0)) @ scores / len(scores)
+    return Band(values, *np.quantile(drawn, ENDS, axis=0))
 
 
 def probability_of_improvement(ours: FloatArray, theirs: FloatArray) -> Estimate:
@@ -92,24 +93,45 @@ def probability_of_improvement(ours: FloatArray, theirs: FloatArray) -> Estimate
     Raises:
         InvalidValueError: If the volumes are not as many.
     """
+    return probabilities_of_improvement([(ours, theirs)])[0]
+
+
+def probabilities_of_improvement(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> list[Estimate]:
+    """Return `probability_of_improvement` of each pair, for many pairs at once."""
+    estimates: dict[int, Estimate] = {}
+    of_shape: dict[tuple[int, ...], list[tuple[int, FloatArray]]] = defaultdict(list)
+    for number, pair in enumerate(pairs):
+        wins = _wins(*pair)
+        estimates[number] = Estimate(float(wins.mean()), np.nan, np.nan)
+        of_shape[wins.shape].append((number, wins))
+    for (n_ours, n_theirs), of_pairs in of_shape.items():
+        if min(n_ours, n_theirs) < 2:
+            continue
+        rng = np.random.default_rng(0)
+        ours, theirs = _times_drawn(n_ours, rng), _times_drawn(n_theirs, rng)
+        at_once = max(1, MOST_VALUES // ours.size)
+        for first in range(0, len(of_pairs), at_once):
+            numbers, wins_of = zip(*of_pairs[first : first + at_once], strict=True)
+            drawn = ((theirs @ np.swapaxes(wins_of, 1, 2)) * ours).sum(axis=-1) / (n_ours * n_theirs)
+            for number, low, high in zip(numbers, *np.quantile(drawn, ENDS, axis=-1), strict=True):
+                estimates[number] = estimates[number]._replace(low=float(low), high=float(high))
+    return [estimates[number] for number in range(len(pairs))]
+
+
+def _wins(ours: FloatArray, theirs: FloatArray) -> FloatArray:
+    """Return how often a seed of ours is better, by volume, shape (our seeds, their seeds); a tie is half a win."""
     if ours.shape[1:] != theirs.shape[1:]:
         raise InvalidValueError(
             f"scores are of {ours.shape[1]} and of {theirs.shape[1]} volumes, but they must be of the same ones"
         )
     pairs = ours[:, None], theirs[None, :]
-    # 1 where ours is greater, 0.5 where they are equal, shape (our seeds, their seeds).
-    wins = (np.greater(*pairs) + 0.5 * np.equal(*pairs)).mean(axis=-1)
-    value = float(wins.mean())
-    if min(wins.shape) < 2:
-        return Estimate(value, np.nan, np.nan)
+    return np.asarray((np.greater(*pairs) + 0.5 * np.equal(*pairs)).mean(axis=-1))
 
-    def of_drawn(our_seeds: NDArray[np.intp], their_seeds: NDArray[np.intp], axis: int) -> Any:
-        return wins[our_seeds[..., :, None], their_seeds[..., None, :]].mean(axis=(-2, -1))
 
-    drawn = tuple(np.arange(n) for n in wins.shape)
-    at_once = max(1, MOST_VALUES // wins.size)
-    low, high = _ends(drawn, of_drawn, vectorized=True, axis=-1, batch=at_once)
-    return Estimate(value, float(low), float(high))
+def _times_drawn(n_seeds: int, rng: np.random.Generator) -> FloatArray:
+    """Return how often each seed is drawn in each resample, shape (resamples, seeds)."""
+    drawn = rng.integers(n_seeds, size=(N_RESAMPLES, n_seeds))
+    return np.asarray((drawn[..., None] == np.arange(n_seeds)).sum(axis=1), dtype=float)
 
 
 def _ends(samples: tuple[NDArray[Any], ...], statistic: Mean, *, seed: int = 0, **how: Any) -> tuple[Any, Any]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -40,7 +41,10 @@ class Estimate(NamedTuple):
 
 def mean(samples: FloatArray) -> FloatArray:
     """Return the mean over the last axis, ignoring NaN; NaN: all values are NaN."""
-    counts = (~np.isnan(samples)).sum(axis=-1)
+    is_known = ~np.isnan(samples)
+    if is_known.all():
+        return np.asarray(samples.mean(axis=-1))
+    counts = is_known.sum(axis=-1)
     return np.where(counts > 0, np.nansum(samples, axis=-1) / np.maximum(counts, 1), np.nan)
 
 
@@ -107,6 +111,7 @@ def estimates(
     }
 
 
+@cache
 def wilson(n_successes: int, n_trials: int) -> Estimate:
     """Return a rate with Wilson's interval, as if all trials were independent."""
     if n_trials == 0:

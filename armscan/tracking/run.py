@@ -14,10 +14,10 @@ from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import DIFF_SUM, environment_tags, source
 from armscan.tracking.notes import forget
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
-from armscan.tracking.sanitize import params_of, tags_of
+from armscan.tracking.sanitize import MAX_TAG_CHARS, params_of, shortened, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.uploader import Uploader
-from armscan.utils.files import RESULTS, RESUMED_DIFF_FILE, atomic_write
+from armscan.utils.files import RESULTS, RESULTS_PAGE, RESUMED_DIFF_FILE, atomic_write
 from armscan.utils.log import log
 
 if TYPE_CHECKING:
@@ -173,6 +173,19 @@ class TrackedRun:
         ]
         if points:
             self._add(metrics=points)
+
+    def log_model(self, metrics: Mapping[str, Sequence[str]], *, n_env_steps: int) -> None:
+        """Show the best checkpoint as a model of MLflow, which has these of the run's metrics.
+
+        Args:
+            metrics: Names of metrics, by the part (training, validation, test) of the volumes that they are of.
+            n_env_steps: Environment step of the checkpoint, at which they were logged.
+        """
+        self._add(model=[n_env_steps, {part: list(names) for part, names in metrics.items()}])
+
+    def set_note(self, text: str) -> None:
+        """Give the run a description in Markdown, shown first on its page of MLflow, unless somebody gave it one."""
+        self._add(note=shortened(text, MAX_TAG_CHARS, RESULTS_PAGE))
 
     def log_files(self, *files: Path) -> None:
         """Keep files as artifacts; they stay as they are until the run has ended."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from armscan.config.trust import TRUST
 from armscan.errors import TrackingError, UntrustedError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, why_away
+from armscan.tracking.logged_model import deliver_model
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
 from armscan.tracking.sanitize import MAX_PARAM_CHARS, shortened
 from armscan.utils.files import VOLUMES_FILE
@@ -28,6 +29,8 @@ AT_ONCE = {"metrics": ("Metric", 1000), "params": ("Param", 100), "tags": ("RunT
 ENTRIES_AT_ONCE = 200
 # Of a dataset, at most 36 in MLflow.
 DIGEST_CHARS = 16
+# MLflow's own, of the description of a run.
+NOTE_TAG = "mlflow.note.content"
 LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
 
 
@@ -202,6 +205,13 @@ def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any])
         case "datasets":
             for datasets in values:
                 client.log_inputs(run_id, [dataset_input(*each) for each in datasets])
+        case "model":
+            for step, metrics in values:
+                deliver_model(client, run_id, step, metrics)
+        case "note":
+            # Written by a person while the run went on.
+            if NOTE_TAG not in client.get_run(run_id).data.tags:
+                client.set_tag(run_id, NOTE_TAG, values[-1])
         case "address":
             return
         case _:

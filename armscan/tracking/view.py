@@ -23,6 +23,11 @@ SECTION = "learning-curves"
 LETTER_PX, AROUND_PX = 6, 40
 
 
+def artifact_address(run_id: str, file: str) -> str:
+    """Return the address of an artifact of a run, relative to the pages of MLflow's UI."""
+    return f"get-artifact?path={file}&run_uuid={run_id}"
+
+
 def _line(metric: str, title: str) -> dict[str, object]:
     """Return a chart of a metric by environment step, as MLflow describes it."""
     return {

@@ -93,6 +93,9 @@ class EpisodeResult:
 
 
 EPISODE_FIELDS = tuple(each.name for each in fields(EpisodeResult))
+KINDS = get_type_hints(EpisodeResult)
+# Older evaluations have nothing of the nerve, nor of what is expected.
+OPTIONAL = {each.name for each in fields(EpisodeResult) if each.default is None}
 
 
 @dataclass(frozen=True)
@@ -202,15 +205,12 @@ class Evaluation:
 
 
 def _episode_of(plain: object) -> EpisodeResult:
-    kinds = get_type_hints(EpisodeResult)
-    # Older evaluations have nothing of the nerve, nor of what is expected.
-    optional = {each.name for each in fields(EpisodeResult) if each.default is None}
-    if not isinstance(plain, dict) or not kinds.keys() - optional <= plain.keys() <= kinds.keys():
-        raise InvalidValueError(f"an episode is {plain!r}, but it must have {', '.join(kinds)}, and nothing else")
+    if not isinstance(plain, dict) or not KINDS.keys() - OPTIONAL <= plain.keys() <= KINDS.keys():
+        raise InvalidValueError(f"an episode is {plain!r}, but it must have {', '.join(KINDS)}, and nothing else")
     for name, value in plain.items():
-        if name in optional and value is None:
+        if name in OPTIONAL and value is None:
             continue
-        kind = float if name in optional else kinds[name]
+        kind = float if name in OPTIONAL else KINDS[name]
         # A truth value is a number to Python; JSON writes some floats as integers.
         is_of_kind = type(value) is kind or (kind is float and type(value) is int)
         if not is_of_kind or (kind in (int, float) and not -LARGEST < value < LARGEST):

@@ -4,10 +4,13 @@ import json
 from dataclasses import replace
 
 import pytest
+from hydra.errors import HydraException
 
+from armscan.config.error_messages import one_line_message
 from armscan.errors import InvalidValueError, VolumeError
 from armscan.launch.folds_grid import with_folds
 from armscan.launch.folds_table import AGENT, folds_table
+from armscan.launch.grid_plan import print_grid_plan
 from armscan.training import TEST, Evaluation, MetricEstimates
 from tests.training.test_train import evaluation_of
 
@@ -29,6 +32,28 @@ def test_folds_make_a_grid_of_one_run_for_each_subject(folder):
     # With what a grid varies anyway.
     assert with_folds(["-m", *words, "seed=0,1,2"]) == ["-m", *words, "seed=0,1,2", "data.fold=0,1"]
     assert with_folds([*words, "agent=sac,ppo"]) == ["-m", *words, "agent=sac,ppo", "data.fold=0,1"]
+
+
+def test_plan_lists_the_folds_beside_what_else_a_grid_varies(folder, capsys):
+    print_grid_plan(["experiment=few_wrists", f"data.path={folder}", "seed=3,4", "--plan"])
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "a grid of 4 jobs"
+    assert [line.split()[1:] for line in printed[1:]] == [
+        [f"seed={seed}", f"data.fold={fold}"] for seed in (3, 4) for fold in (0, 1)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["seed=1", "--plan"], "--plan is given, but this is a single run: it shows the jobs of a grid"),
+        (["-m", "agent=sac,nothing", "--plan"], "agent is 'nothing', but it must be"),
+    ],
+)
+def test_plan_of_what_is_no_grid_or_cannot_run_is_answered_in_one_line(words, line):
+    with pytest.raises((InvalidValueError, HydraException)) as raised:
+        print_grid_plan(words)
+    assert line in one_line_message(raised.value)
 
 
 def test_experiment_may_ask_for_folds(folder):

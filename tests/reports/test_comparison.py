@@ -8,6 +8,8 @@ import pytest
 from armscan.reports.comparison import write_comparison
 from armscan.reports.groups import group_trainings
 from armscan.reports.significance import compare_groups, final_metrics
+from armscan.training import Evaluation
+from tests.reports.conftest import make_episode
 
 
 @pytest.fixture
@@ -37,16 +39,23 @@ def test_twenty_groups_have_a_report(written, make_training):
     assert steps == {f"agent.lr={lr}": lr for lr in range(1, 21)}
 
 
+def test_curves_of_very_many_groups_are_means_alone_and_the_page_says_so(written, make_training):
+    page, rows = written(
+        *(make_training(seed, params={"agent.lr": str(lr)}) for lr in range(1, 26) for seed in range(2))
+    )
+    assert "only the means are drawn" in page
+    assert len(rows("seed_curves")) == 25 * 2 * 2 * 2
+    assert {row["low"] for row in rows("curves")} != {""}
+
+
 def test_fewer_steps_are_better_and_equal_ones_are_no_difference(make_training):
     trainings = [
         make_training(seed, params={"agent.lr": str(lr)}, mean_steps=steps)
         for lr, steps in ((1, 2), (2, 5), (3, 2))
         for seed in range(3)
     ]
-    pairs = {
-        (pair.ours, pair.theirs): pair.probability
-        for pair in compare_groups(group_trainings(trainings)[0], "mean_steps")
-    }
+    compared = compare_groups(group_trainings(trainings)[0])["mean_steps"]
+    pairs = {(pair.ours, pair.theirs): pair.probability for pair in compared}
     assert pairs == {(0, 1): (1.0, 1.0, 1.0), (0, 2): (0.5, 0.5, 0.5), (1, 2): (0.0, 0.0, 0.0)}
 
 
@@ -123,3 +132,27 @@ def test_long_tables_are_folded_and_name_their_cells_for_a_phone(written, make_t
 def test_many_groups_are_compared_below_a_line_that_opens_them(written, make_training):
     page, _ = written(*(make_training(0, params={"agent.lr": str(lr)}) for lr in range(13)))
     assert "<summary>Each of 13 groups against each other</summary>" in page
+
+
+def test_folds_of_a_grid_are_one_configuration_with_intervals_by_wrist(written, make_training):
+    def fold(seed, number, mean_steps):
+        volume = f"w{number}"
+        return make_training(
+            seed,
+            params={"data.folds": "leave_one_out", "data.fold": str(number)},
+            run_id=f"{10 * seed + number:032x}",
+            evaluation=Evaluation(tuple(make_episode(volume, mean_steps) for _ in range(4))),
+            volumes={volume: volume},
+        )
+
+    trainings = [fold(seed, number, steps) for seed in range(2) for number, steps in enumerate((2, 4, 9))]
+    groups, left_out = group_trainings(trainings)
+    assert (len(groups), left_out) == (1, [])
+    assert (groups[0].n_seeds, groups[0].n_folds) == (2, 3)
+    figures = final_metrics(groups[0])
+    assert (figures.n_seeds, figures.n_volumes, figures.n_episodes) == (2, 3, 24)
+    # Both seeds are alike: the interval is of wrists.
+    assert figures.estimates["mean_steps"] == (5.0, 2.0, 9.0)
+    page, _ = written(*trainings)
+    assert "cross-validation of 3 folds" in page
+    assert "differ by nothing but the seed and the fold" in page

@@ -14,6 +14,7 @@ from armscan.stats.aggregation import (
     band_over_seeds,
     interquartile_mean,
     over_seeds,
+    probabilities_of_improvement,
     probability_of_improvement,
 )
 
@@ -95,32 +96,41 @@ def test_interval_over_seeds_holds_the_truth_only_if_they_are_drawn_with_all_the
 @given(arrays(float, st.tuples(st.integers(2, 7), st.integers(1, 5)), elements=st.floats(-10, 10, width=32)))
 @settings(max_examples=40)
 def test_band_lies_within_the_seeds_and_is_the_same_each_time(values):
-    band = band_over_seeds(values, interquartile_mean)
-    assert np.allclose(band.values, [aggregate_iqm(values[:, [place]]) for place in range(values.shape[1])])
+    band = band_over_seeds(values)
+    assert np.allclose(band.values, values.mean(axis=0))
     slack = 1e-9
     assert (values.min(axis=0) - slack <= band.lows).all()
     assert (band.lows <= band.highs + slack).all()
     assert (band.highs <= values.max(axis=0) + slack).all()
-    assert all(map(np.array_equal, band, band_over_seeds(values, interquartile_mean)))
+    assert all(map(np.array_equal, band, band_over_seeds(values)))
 
 
 @pytest.mark.parametrize("n_seeds", [2, 3])
 def test_band_of_two_or_three_seeds_is_their_range(n_seeds):
     values = np.random.default_rng(0).normal(size=(n_seeds, 4))
-    band = band_over_seeds(values, interquartile_mean)
+    band = band_over_seeds(values)
     assert np.allclose(band.lows, values.min(axis=0))
     assert np.allclose(band.highs, values.max(axis=0))
 
 
-def test_band_is_of_the_mean_that_is_asked_for():
-    values = np.array([[0.0], [1.0], [1.0], [1.0]])
-    assert band_over_seeds(values, np.mean).values == [0.75]
-    assert band_over_seeds(values, interquartile_mean).values == [1.0]
+def test_band_is_the_interval_over_seeds_at_each_point():
+    values = np.random.default_rng(0).gamma(2.0, 2.0, (6, 3))
+    band = band_over_seeds(values)
+    for place in range(values.shape[1]):
+        found = [each[place] for each in band]
+        assert found == pytest.approx(over_seeds(values[:, [place]], np.mean))
+
+
+@given(st.lists(two_groups(), min_size=2, max_size=5))
+@settings(max_examples=20)
+def test_many_improvements_at_once_are_those_of_each_pair_alone(pairs):
+    together = probabilities_of_improvement(pairs)
+    assert together == [probability_of_improvement(*pair) for pair in pairs]
 
 
 def test_one_seed_has_no_interval():
     one = np.array([[1.0, 2.0]])
-    assert np.isnan(band_over_seeds(one, np.mean).lows).all()
+    assert np.isnan(band_over_seeds(one).lows).all()
     assert np.isnan(over_seeds(one, np.mean)[1:]).all()
     assert np.isnan(probability_of_improvement(one, one)[1:]).all()
 

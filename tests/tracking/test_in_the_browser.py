@@ -83,3 +83,32 @@ def test_volumes_are_datasets_with_a_digest_of_their_fingerprints(tracked, store
     }
     assert len({each.dataset.digest for each in inputs.values()}) == 1
     assert json.loads(inputs["training volumes"].dataset.source) == {"volumes": "a b"}
+
+
+def test_best_checkpoint_is_a_model_with_metrics_of_its_run_and_their_volumes_once(tracked, store):
+    tracked.log_datasets({"test": {"a": "1" * 64}})
+    tracked.log_metrics({RATE: 0.5, STEPS: 3.0}, n_env_steps=7)
+    for _ in range(2):
+        # As where a server has not answered: an entry is delivered again.
+        tracked.log_model({"test": [RATE, "test_volumes/none"]}, n_env_steps=7)
+    run = run_of(tracked, store)
+    client, experiment_id = store()
+    (found,) = client.search_logged_models([experiment_id])
+    model = client.get_logged_model(found.model_id)
+    assert (model.name, str(model.status), model.source_run_id) == ("a-0001", "READY", run.info.run_id)
+    assert [(each.key, each.value, each.step, each.dataset_name) for each in model.metrics] == [
+        (RATE, 0.5, 7, "test volumes")
+    ]
+    assert [(each.model_id, each.step) for each in run.outputs.model_outputs] == [(model.model_id, 7)]
+    # The run's own metrics stay as they are.
+    assert len(client.get_metric_history(run.info.run_id, RATE)) == 1
+
+
+def test_description_of_a_run_is_its_table_unless_somebody_wrote_one(tracked, store, tmp_path):
+    client, experiment_id = store()
+    tracked.set_note("| table |")
+    assert run_of(tracked, store).data.tags["mlflow.note.content"] == "| table |"
+    with TrackedRun.start(client, experiment_id, name="b", config={}, tags={}, folder=tmp_path / "b") as other:
+        client.set_tag(other.run_id, "mlflow.note.content", "mine")
+        other.set_note("| table |")
+    assert client.get_run(other.run_id).data.tags["mlflow.note.content"] == "mine"

@@ -85,6 +85,11 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
     assert run.data.metrics["test_volumes/mean_steps_low"] == 2.0
     assert run.data.metrics["random/mean_steps"] == 9.0
     assert run.data.metrics["best_env_step"] == 300
+    note = run.data.tags["mlflow.note.content"]
+    assert note.startswith("| with 95 % intervals | agent, test | random, test |")
+    assert note.endswith(f"![learning curve](get-artifact?path=learning_curve.png&run_uuid={tracked.run_id})")
+    (model,) = client.search_logged_models([experiment_id])
+    assert [each.model_id for each in run.outputs.model_outputs] == [model.model_id]
     history = client.get_metric_history(tracked.run_id, "validation/mean_steps")
     assert [(point.step, point.value) for point in history] == [(100, 9.0), (200, 4.0), (300, 3.0)]
     files = {file.path for file in client.list_artifacts(tracked.run_id)}

@@ -1,0 +1,78 @@
+"""Histories of many runs' metrics, by one request for each metric rather than one for each run."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any
+
+from armscan.tracking.client import TrackingStore
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+# What an MLflow server answers at once; a database is asked for no more.
+MOST_RUNS, MOST_POINTS = 100, 25_000
+# Of MLflow's own UI: `MlflowClient` has no such request.
+ROUTE = "/ajax-api/2.0/mlflow/metrics/get-history-bulk"
+
+History = dict[int, float]
+# MLflow run ID, step and value.
+Point = tuple[str, int, float]
+
+
+def metric_histories(store: TrackingStore, names: Mapping[str, Collection[str]]) -> dict[str, dict[str, History]]:
+    """Return histories of metrics.
+
+    Args:
+        store: Store of the runs, which is not waited for.
+        names: Names of the metrics that are wanted of each run, by its MLflow run ID.
+
+    Returns:
+        By run ID and name, the values by step; of several at one step, the last.
+    """
+    runs_of: dict[str, list[str]] = defaultdict(list)
+    histories: dict[str, dict[str, History]] = {run_id: {name: {} for name in names[run_id]} for run_id in names}
+    for run_id, wanted in names.items():
+        for name in wanted:
+            runs_of[name].append(run_id)
+    for name, run_ids in runs_of.items():
+        for first in range(0, len(run_ids), MOST_RUNS):
+            for run_id, step, value in _points(store.mlflow, run_ids[first : first + MOST_RUNS], name):
+                histories[run_id][name][step] = value
+    return histories
+
+
+def _points(client: MlflowClient, run_ids: Sequence[str], name: str) -> Iterator[Point]:
+    """Yield all points of a metric, those of a run in the order in which they were logged."""
+    found = _bulk(client, run_ids, name)
+    if found is not None and len(found) < MOST_POINTS:
+        yield from found
+    elif found is not None and len(run_ids) > 1:
+        # Cut off.
+        middle = len(run_ids) // 2
+        yield from _points(client, run_ids[:middle], name)
+        yield from _points(client, run_ids[middle:], name)
+    else:
+        for run_id in run_ids:
+            yield from ((run_id, each.step, each.value) for each in client.get_metric_history(run_id, name))
+
+
+def _bulk(client: MlflowClient, run_ids: Sequence[str], name: str) -> list[Point] | None:
+    """Return at most `MOST_POINTS` points of a metric; None where the store does not answer such a request."""
+    store: Any = client._tracking_client.store
+    if hasattr(store, "get_metric_history_bulk"):
+        points = store.get_metric_history_bulk(run_ids, name, MOST_POINTS)
+        return [(each.run_id, each.step, each.value) for each in points]
+    if not hasattr(store, "get_host_creds"):
+        return None
+    from mlflow.utils.rest_utils import http_request, verify_rest_response
+
+    asked = {"run_id": run_ids, "metric_key": name, "max_results": MOST_POINTS}
+    request: Any = http_request
+    response = request(store.get_host_creds(), ROUTE, "GET", params=asked)
+    if response.status_code == HTTPStatus.NOT_FOUND:
+        return None
+    answer = verify_rest_response(response, ROUTE).json()
+    return [(each["run_id"], each["step"], each["value"]) for each in answer["metrics"]]

@@ -1,0 +1,107 @@
+"""Processor and wall seconds of `armscan report` and `runs list` in a store of many runs.
+
+    python -m benchmarks.speed.many_runs [--runs N] [--epochs N] [--before CHECKOUT]
+
+The runs are copies of a real, short one: its parameters, tags, metrics and files, with learning curves of so many
+epochs (default: 200 runs, 20 epochs). They are read from a SQLite file and through an MLflow server on it. With
+`--before`, each process of this checkout follows one of the other, whose figures stand beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from mlflow import MlflowClient
+from mlflow.entities import Metric, Param, RunTag
+
+from tests.support.mlflow_server import mlflow_server
+
+HERE = Path(__file__).resolve().parents[2]
+SMALL = (
+    "training.env_steps=2000",
+    "training.eval_every_env_steps=500",
+    "evaluation.episodes=40",
+    "env.max_steps=10",
+    "agent.learning_starts=500",
+)
+COMMANDS = {
+    "`report --runs experiment:many`": ("report", "--runs", "experiment:many", "--out", "report"),
+    "`runs list`": ("runs", "list", "--experiment", "many"),
+}
+AT_ONCE = 1000
+
+
+def armscan(checkout: Path, folder: Path, *words: str, uri: str) -> tuple[float, float]:
+    """Return the processor seconds of a command, and its wall seconds."""
+    before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run(
+        [sys.executable, "-m", "armscan", *words],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1", "MLFLOW_TRACKING_URI": uri},
+        capture_output=True,
+        check=True,
+    )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    processor_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return processor_s, time.perf_counter() - start_s
+
+
+def copy_run(client: MlflowClient, folder: Path, *, n_runs: int, n_epochs: int) -> None:
+    """Copy the only run of a store into another experiment, each copy with another seed; three of a configuration."""
+    (run,) = client.search_runs(["1"])
+    experiment_id = client.create_experiment("many", artifact_location=(folder / "many").as_uri())
+    files = Path(client.download_artifacts(run.info.run_id, "", str(folder / "files")))
+    curves = {name for name in run.data.metrics if len(client.get_metric_history(run.info.run_id, name)) > 1}
+    points = [
+        Metric(name, value, epoch, 1000 * epoch)
+        for name, value in run.data.metrics.items()
+        for epoch in range(1, n_epochs + 1 if name in curves else 2)
+    ]
+    kept = {"config.yaml", "volumes.json", "evaluation.json", "baselines.json", "episode.gif"}
+    for number in range(n_runs):
+        changed = {"seed": str(number % 3), "agent.batch_size": str(number // 3 + 64)}
+        tags = [RunTag(*each) for each in run.data.tags.items()]
+        made = client.create_run(experiment_id, run_name=f"{run.info.run_name}-{number}").info.run_id
+        for first in range(0, len(points), AT_ONCE):
+            client.log_batch(made, metrics=points[first : first + AT_ONCE])
+        params = [Param(*each) for each in ({**run.data.params} | changed).items()]
+        for first in range(0, len(params), 100):
+            client.log_batch(made, params=params[first : first + 100], tags=tags if first == 0 else ())
+        for name in kept:
+            if (files / name).is_file():
+                client.log_artifact(made, str(files / name))
+        client.set_terminated(made)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--runs", type=int, default=200, help="runs in the store (default: 200)")
+    parser.add_argument("--epochs", type=int, default=20, help="epochs of each (default: 20)")
+    parser.add_argument("--before", type=Path, metavar="CHECKOUT", help="another checkout to measure beside this one")
+    given = parser.parse_args()
+    checkouts = {**({"before": given.before.resolve()} if given.before else {}), "now": HERE}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        uri = f"sqlite:///{folder}/mlruns.db"
+        armscan(HERE, folder, "run", *SMALL, uri=uri)
+        copy_run(MlflowClient(uri), folder, n_runs=given.runs, n_epochs=given.epochs)
+        print(f"| {given.runs} runs: processor s (wall s) | {' | '.join(checkouts)} |")
+        print(f"| --- |{' ---: |' * len(checkouts)}")
+        with mlflow_server(folder / "server", uri) as server:
+            for store, address in {"SQLite": uri, "a server": server.uri}.items():
+                for command, words in COMMANDS.items():
+                    both = (armscan(checkout, folder, *words, uri=address) for checkout in checkouts.values())
+                    cells = (f"{processor_s:.1f} ({wall_s:.1f})" for processor_s, wall_s in both)
+                    print(f"| {command}, {store} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
