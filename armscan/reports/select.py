@@ -18,7 +18,8 @@ EXPERIMENT = "experiment:"
 # Only a run of `armscan run` or a training of a study has it, not its parents.
 OF_A_TRAINING = "choice.agent"
 PRUNED_TAG, TRIAL_TAG = "pruned", "trial"
-PAGE_SIZE = 1000
+# A loaded server takes longer for more than it is waited for.
+PAGE_SIZE = 100
 N_SHOWN = 6
 ID_CHARS = 8
 

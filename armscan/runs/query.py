@@ -14,7 +14,8 @@ from armscan.errors import InvalidValueError, listed
 from armscan.tracking import TrackingStore, find_run
 from armscan.tracking.client import reason_in
 
-PER_PAGE = 1000
+# A loaded server takes longer for more than it is waited for.
+PER_PAGE = 100
 
 
 def find(
