@@ -11,8 +11,9 @@ from optuna.trial import TrialState
 
 from armscan.sweeps.results.judgement import best_metrics, judge
 from armscan.sweeps.results.selection import candidates_of
+from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL, FINALIST, METRICS, RETRIED, Limits
+from armscan.sweeps.scheduling.state import CONTROL, FINALIST, GENERATION, MEMBER, METRICS, RETRIED, SCHEDULE, Limits
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, training_of
 from armscan.sweeps.study.settings import FinalEvalSettings
@@ -187,6 +188,24 @@ def test_final_evaluation_is_read_from_the_storage_and_that_of_an_earlier_versio
     assert FinalEvaluation.stored(storage, search) is None
     final = FinalEvaluation.opened(storage, asked, search)
     assert FinalEvaluation.stored(open_storage(storage_uri), search).settings == final.settings
+
+
+def test_member_of_the_latest_generation_is_trained_with_its_whole_schedule(storage_uri):
+    storage, asked, search = searched(storage_uri)
+    schedule = [{"from_env_steps": 0, "agent.lr": 0.001}, {"from_env_steps": 400, "agent.lr": 0.002}]
+    search.enqueue_trial({"agent.lr": 0.002}, user_attrs={MEMBER: 0, GENERATION: 1, SCHEDULE: schedule})
+    member = search.ask()
+    member.suggest_float("agent.lr", 1e-4, 1e-2)
+    search.tell(member, 99.0)
+    final = FinalEvaluation.opened(storage, asked, search)
+    # Better values of earlier generations are not those of whole trainings.
+    assert final.candidates() == [CONTROL, member.number]
+    planned = [each for each in final.missing_of_selection() if each.attributes[FINALIST] == member.number]
+    assert len(planned) == FINAL_EVAL["min_seeds"]
+    scheduler = TrialScheduler(final.selection, storage, Limits(n_trials=9), lambda: planned)
+    trial = scheduler.claim({})
+    assert searched_values(trial) == {"agent.lr": 0.001, "training.schedule": schedule[1:]}
+    assert trial.suggest_float("agent.lr", 1e-4, 1e-2) == 0.001
 
 
 def test_settings_of_an_earlier_version_are_read():
