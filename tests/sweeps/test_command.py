@@ -1,5 +1,6 @@
 """Studies as a person starts them: real workers, killed and interrupted, on phantoms."""
 
+import csv
 import json
 import os
 import signal
@@ -7,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import optuna
 import pytest
 from hydra.errors import HydraException
@@ -70,6 +72,35 @@ def workers_in(folder):
     return [json.loads(file.read_text())["pid"] for file in files]
 
 
+def check_result(folder):
+    """Compare the result in the report with its episodes, by NumPy alone."""
+    report = [sys.executable, "-m", "armscan", "report", "--study", "sac_y", "--out", "report"]
+    subprocess.run(report, cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    with (folder / "report" / "result.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["of"] == "agent"]
+    printed = {(row["trial"], row["figure"].removeprefix("test/")): float(row["value"]) for row in rows}
+    episodes = {}
+    for trial in trials_of(folder, "sac_y-judged"):
+        name = "control" if trial.user_attrs["judged"] < 0 else str(trial.user_attrs["judged"])
+        (file,) = (folder / trial.user_attrs["folder"]).glob("seed_*/evaluation.json")
+        episodes.setdefault(name, []).extend(json.loads(file.read_text())["test volumes"]["episodes"])
+    assert "control" in episodes
+    for name, of_seeds in episodes.items():
+        distance_mm, distance_deg, steps = (
+            np.array([each[key] for each in of_seeds]) for key in ("distance_mm", "distance_deg", "n_steps")
+        )
+        recomputed = {
+            "on_plane_5mm_10deg": np.mean((distance_mm <= 5) & (distance_deg <= 10)),
+            "on_plane_2mm_5deg": np.mean((distance_mm <= 2) & (distance_deg <= 5)),
+            "median_distance_mm": np.median(distance_mm),
+            "p90_distance_mm": np.percentile(distance_mm, 90),
+            "median_distance_deg": np.median(distance_deg),
+            "success_rate": np.mean([each["is_success"] for each in of_seeds]),
+            "mean_steps": steps.mean(),
+        }
+        assert {key: printed[name, key] for key in recomputed} == pytest.approx(recomputed)
+
+
 @pytest.mark.full
 def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_more(tmp_path, monkeypatch):
     ended = run(*TINY, "study.n_trials=2", cwd=tmp_path)
@@ -83,6 +114,7 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
         "result: ",
     ):
         assert line in ended.stdout
+    check_result(tmp_path)
     client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
     runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
     by_id = {each.info.run_id: each for each in runs}
