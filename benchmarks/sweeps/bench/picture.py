@@ -61,14 +61,11 @@ def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[tuple[int, 
     n_trainings = [each.n_trainings.mean() for each in fixed]
     axes.plot(n_trainings, curve[:, 0], marker=".", color="tab:grey", label="the same seeds for all")
     axes.fill_between(n_trainings, curve[:, 1], curve[:, 2], color="tab:grey", alpha=0.2)
-    raced = curve_of([each.regret for each in races.values()])
-    of_races = [each.n_trainings.mean() for each in races.values()]
-    ends = np.abs(raced[:, 1:].T - raced[:, 0])
-    axes.errorbar(of_races, raced[:, 0], yerr=ends, fmt="o", capsize=2, color="tab:orange", label="a race over seeds")
-    for number, (n_taken, (_, _, high), seeds) in enumerate(zip(of_races, raced, races, strict=True)):
-        # One above the other, because races may lie close together.
-        at = {"textcoords": "offset points", "xytext": (0, 4 + 11 * number), "ha": "center", "fontsize": 8}
-        axes.annotate(f"{seeds[0]} to {seeds[1]} seeds", (n_taken, high), **at)
+    for ((low, high), race), marker in zip(races.items(), "os^D", strict=True):
+        ((value, *ends),) = curve_of([race.regret])
+        lengths = [[abs(end - value)] for end in ends]
+        look = {"fmt": marker, "capsize": 2, "label": f"a race, {low} to {high} seeds"}
+        axes.errorbar(race.n_trainings.mean(), value, yerr=lengths, **look)
     axes.set_xscale("log")
     axes.set_xlabel("trainings of the choice")
     axes.set_ylabel("mean steps above the best candidate")

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from armscan.stats.bootstrap import Estimate
 from armscan.volumes.plane import FloatArray
-from benchmarks.sweeps.bench.replay import Rule, choose, search
+from benchmarks.sweeps.bench.replay import Rule, choose, scores_of, search
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 # Seeds of all candidates, and the fewest and most of a race; the first race is armscan's default.
 FIXED = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24)
-RACES = ((2, 6), (2, 10), (2, 16), (3, 16))
+RACES = ((2, 6), (2, 16), (5, 10), (5, 16))
 N_REPEATS, N_RESAMPLES = 10, 2000
 
 
@@ -56,18 +56,25 @@ def candidates_of(
     return [[each.config for each in of_study.candidates[:top_k]] for of_study in found]
 
 
-def choices_of(candidates: Sequence[Sequence[SimulatedConfig]], min_seeds: int, max_seeds: int) -> Choices:
-    """Return what a race over these seeds chooses in each study; with as many seeds at first nobody is dropped."""
-    regrets = np.empty((len(candidates), N_REPEATS))
-    n_trainings = np.empty_like(regrets)
+def choices_of(
+    candidates: Sequence[Sequence[SimulatedConfig]], seeds: Iterable[tuple[int, int]]
+) -> dict[tuple[int, int], Choices]:
+    """Return what races choose in each study, all of them of the same simulated trainings.
+
+    Args:
+        candidates: Configurations of each study.
+        seeds: Fewest and most seeds of each race; where these are equal, nobody is dropped.
+    """
+    seeds = tuple(seeds)
+    found = np.empty((len(seeds), 2, len(candidates), N_REPEATS))
     for number, of_study in enumerate(candidates):
         truths = [each.truth for each in of_study]
         for repeat in range(N_REPEATS):
-            rng = np.random.default_rng([number, repeat, min_seeds, max_seeds])
-            chosen = choose(of_study, rng, min_seeds=min_seeds, max_seeds=max_seeds)
-            regrets[number, repeat] = truths[chosen.place] - min(truths)
-            n_trainings[number, repeat] = chosen.n_trainings
-    return Choices(regrets.mean(axis=1), n_trainings.mean(axis=1))
+            scores = scores_of(of_study, max(high for _, high in seeds), np.random.default_rng([number, repeat]))
+            for place, (low, high) in enumerate(seeds):
+                chosen = choose(scores, min_seeds=low, max_seeds=high)
+                found[place, :, number, repeat] = truths[chosen.place] - min(truths), chosen.n_trainings
+    return {each: Choices(*found[place].mean(axis=-1)) for place, each in enumerate(seeds)}
 
 
 def compare(fixed: Sequence[Choices], races: dict[tuple[int, int], Choices]) -> list[Comparison]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
@@ -10,17 +11,17 @@ import pandas as pd
 
 from armscan.stats.aggregation import band_over_seeds, probability_of_improvement
 from armscan.volumes.plane import FloatArray
-from benchmarks.sweeps.bench.replay import Rule, choose, search
+from benchmarks.sweeps.bench.replay import Rule, choose, scores_of, search
 from benchmarks.sweeps.bench.surrogate import Surrogate
 
 SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "halving")
-# The Gaussian process takes a hundred times longer than others to propose a trial: a tenth of the studies.
-SLOW = ("gp",)
+# The Gaussian process takes a hundred times longer than others to propose a trial: a tenth of the studies, none of few.
+SLOW, FEWEST_STUDIES = ("gp",), 10
 # What all are compared with.
 REFERENCE = Rule("random", "none")
 # Candidates of the final evaluation, and the fewest and most seeds of each.
 TOP_K = 3
-FINALS = {"search": None, "fixed": (5, 5), "race": (2, 6)}
+FINALS = {"fixed": (5, 5), "race": (2, 6)}
 
 
 def rules() -> Iterator[Rule]:
@@ -40,7 +41,7 @@ def studies_of(
         surrogate: Simulates the trainings.
         sweep: Name of the sweep.
         compared: Rules of the studies.
-        n_studies: Studies of each rule; a tenth of them with a slow sampler.
+        n_studies: Studies of each rule; a tenth of them with a slow sampler, none where that is fewer than ten.
         n_trainings: Budget of each search, in whole trainings.
 
     Returns:
@@ -50,18 +51,17 @@ def studies_of(
     _, best = surrogate.best()
     rows = []
     for rule in compared:
-        for number in range(max(1, n_studies // 10) if rule.sampler in SLOW else n_studies):
+        n_slow = n_studies // 10 if n_studies // 10 >= FEWEST_STUDIES else 0
+        for number in range(n_slow if rule.sampler in SLOW else n_studies):
             found = search(surrogate, sweep, rule, n_trainings=n_trainings, seed=number)
             tops = [candidate.config for candidate in found.candidates[:TOP_K]]
             row = {**vars(rule), "study": number, "n_trials": found.n_trials, "search": tops[0].truth - best}
-            for name, n_seeds in FINALS.items():
-                if n_seeds is not None:
-                    low, high = n_seeds
-                    rng = np.random.default_rng([number, high])
-                    chosen = choose(tops, rng, min_seeds=low, max_seeds=high)
-                    row |= {name: tops[chosen.place].truth - best, f"{name}_trainings": chosen.n_trainings}
+            scores = scores_of(tops, max(high for _, high in FINALS.values()), np.random.default_rng(number))
+            for name, (low, high) in FINALS.items():
+                chosen = choose(scores, min_seeds=low, max_seeds=high)
+                row |= {name: tops[chosen.place].truth - best, f"{name}_trainings": chosen.n_trainings}
             rows.append(row)
-        print(f"{rule}: simulated", flush=True)
+        print(f"{rule}: simulated", file=sys.stderr, flush=True)
     return pd.DataFrame(rows)
 
 
@@ -77,6 +77,7 @@ def ranked(studies: pd.DataFrame, by: str = "race") -> pd.DataFrame:
         at random without pruning, with its own.
     """
     keys = list(vars(REFERENCE))
+    columns = ["n_trials", "search", *FINALS, *(f"{name}_trainings" for name in FINALS)]
     regrets = {Rule(*key): each[by].to_numpy() for key, each in studies.groupby(keys)}
     rows = []
     for rule, each in regrets.items():
@@ -88,10 +89,7 @@ def ranked(studies: pd.DataFrame, by: str = "race") -> pd.DataFrame:
                 **vars(rule),
                 **dict(zip(("regret", "low", "high"), (float(end[0]) for end in regret), strict=True)),
                 **dict(zip(("better", "better_low", "better_high"), better, strict=True)),
-                **{
-                    name: float(of_rule[name].mean())
-                    for name in ("n_trials", *FINALS, "fixed_trainings", "race_trainings")
-                },
+                **{name: float(of_rule[name].mean()) for name in columns},
                 "n_studies": len(each),
             }
         )

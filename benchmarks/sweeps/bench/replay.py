@@ -16,6 +16,7 @@ from optuna.trial import Trial, TrialState
 from armscan.config.compose import compose
 from armscan.stats.aggregation import interquartile_mean
 from armscan.sweeps.scheduling.racing import race
+from armscan.volumes.plane import FloatArray
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 # Of one study, a sampler that proposes pruned points again and again must not go on for ever.
@@ -124,23 +125,25 @@ class Choice:
     n_trainings: int
 
 
-def choose(
-    candidates: Sequence[SimulatedConfig], rng: np.random.Generator, *, min_seeds: int, max_seeds: int
-) -> Choice:
-    """Let candidates race over fresh seeds, judged on the validation volumes; with as many seeds at first, none drops.
+def choose(scores: FloatArray, *, min_seeds: int, max_seeds: int) -> Choice:
+    """Let candidates race over fresh seeds; with as many seeds at first as at most, nobody is dropped.
 
     Args:
-        candidates: The configurations.
-        rng: Draws the trainings.
+        scores: Scores that the trainings would have, shape (candidates, at least `max_seeds`), greater is better.
         min_seeds: Seeds of all candidates.
         max_seeds: Seeds of those that are never dropped.
     """
-    scores: dict[int, dict[int, float]] = {place: {} for place in range(len(candidates))}
-    while not (stands := race(scores, range(max_seeds), min_seeds=min_seeds)).is_over:
+    known: dict[int, dict[int, float]] = {place: {} for place in range(len(scores))}
+    while not (stands := race(known, range(max_seeds), min_seeds=min_seeds)).is_over:
         for place, seed in stands.missing:
-            scores[place][seed] = -float(candidates[place].train(rng).curve.min())
+            known[place][seed] = float(scores[place, seed])
     assert stands.chosen is not None
-    return Choice(stands.chosen, sum(map(len, scores.values())))
+    return Choice(stands.chosen, sum(map(len, known.values())))
+
+
+def scores_of(candidates: Sequence[SimulatedConfig], n_seeds: int, rng: np.random.Generator) -> FloatArray:
+    """Return scores of fresh trainings, minus the steps of the best validation, shape (candidates, seeds)."""
+    return -np.array([[each.train(rng).curve.min() for _ in range(n_seeds)] for each in candidates])
 
 
 @lru_cache

@@ -40,11 +40,13 @@ def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, pi
     _print_power(power)
     keys = keys_of(curves, n_resamples)
     _print_keys(keys)
+    found = candidates_of(surrogate, sweep, DEFAULT, n_studies=n_studies, n_trainings=n_trainings, top_k=max(TOP_KS))
     races = {}
     for top_k in TOP_KS:
-        candidates = candidates_of(surrogate, sweep, DEFAULT, n_studies=n_studies, n_trainings=n_trainings, top_k=top_k)
-        fixed = [choices_of(candidates, n_seeds, n_seeds) for n_seeds in FIXED]
-        raced = {seeds: choices_of(candidates, *seeds) for seeds in RACES}
+        seeds = [*((n_seeds, n_seeds) for n_seeds in FIXED), *RACES]
+        chosen = choices_of([of_study[:top_k] for of_study in found], seeds)
+        fixed = [chosen[n_seeds, n_seeds] for n_seeds in FIXED]
+        raced = {each: chosen[each] for each in RACES}
         races[top_k] = fixed, raced
         _print_races(top_k, fixed, compare(fixed, raced))
     studies = studies_of(surrogate, sweep, rules(), n_studies=n_studies, n_trainings=n_trainings)

@@ -1,12 +1,12 @@
-"""Trainings of any configuration, simulated from the table: the mean by a random forest, chance from real trainings.
+"""Trainings of any configuration, simulated from the table: the mean by a forest, chance from real trainings.
 
 A table alone has too few points for a sampler to search: mapped to the nearest of them, what samplers propose would be
-spoiled, those most that search locally (Pfisterer et al. 2022, YAHPO Gym). So a random forest over the configurations
-gives weights to those of the table (Meinshausen 2006), and the mean curve of a configuration is the weighted mean of
-theirs. A training adds what one real training, drawn by the same weights, was off its own configuration's mean: in all
-epochs and in the test at once, so that chance is as large, as skewed and as lasting as in the table. All of it is of
-the logarithm of the mean steps of an episode. What a configuration is truly worth is then known: the mean over all
-trainings that could be drawn.
+spoiled, those most that search locally (Pfisterer et al. 2022, YAHPO Gym). So extremely randomised trees (Geurts et al.
+2006) over the configurations give weights to those of the table (Meinshausen 2006), and the mean curve of a
+configuration is the weighted mean of theirs; of one in the table it is its own. A training adds what one real
+training, drawn by the same weights, was off its own configuration's mean: in all epochs and in the test at once, so
+that chance is as large, as skewed and as lasting as in the table. All of it is of the logarithm of the mean steps of an
+episode. What a configuration is truly worth is then known: the mean over all trainings that could be drawn.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
-from sklearn.ensemble import RandomForestRegressor
+from sklearn.ensemble import ExtraTreesRegressor
 
 from armscan.sweeps.space.space import Space
 from armscan.volumes.plane import FloatArray
@@ -84,7 +84,7 @@ class Surrogate:
         chance = (logs - means[curves.config_of]) * np.sqrt(n_seeds / (n_seeds - 1))
         places = curves.places()
         is_in = np.arange(len(places)) % N_FOLDS != (-1 if without is None else without)
-        forest = RandomForestRegressor(N_TREES, random_state=seed).fit(places[is_in], means[is_in])
+        forest = ExtraTreesRegressor(N_TREES, random_state=seed).fit(places[is_in], means[is_in])
         corners = [_boxes(tree.tree_) for tree in forest.estimators_]
         leaves = forest.apply(places).T
         low, high = (
