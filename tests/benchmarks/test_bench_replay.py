@@ -15,7 +15,7 @@ def test_a_surrogate_finds_settings_that_are_truly_good(surrogate):
     space = surrogate.space
     values, _ = surrogate.best()
     everywhere = [true_log(places_of(space, values_at(space, row))) for row in sobol(len(space.parameters), 1000)]
-    assert true_log(places_of(space, values)) < np.quantile(everywhere, 0.05)
+    assert true_log(places_of(space, values)) < np.quantile(everywhere, 0.1)
 
 
 def test_a_surrogate_knows_configurations_that_it_has_not_seen(curves):

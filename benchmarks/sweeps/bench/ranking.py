@@ -82,7 +82,7 @@ def ranked(studies: pd.DataFrame, by: str = "race") -> pd.DataFrame:
     rows = []
     for rule, each in regrets.items():
         of_rule = studies[(studies[keys] == pd.Series(vars(rule))).all(axis=1)]
-        regret = band_over_seeds(each[:, np.newaxis], np.mean)
+        regret = band_over_seeds(each[:, np.newaxis])
         better = probability_of_improvement(-each[:, np.newaxis], -regrets[REFERENCE][:, np.newaxis])
         rows.append(
             {
@@ -98,4 +98,4 @@ def ranked(studies: pd.DataFrame, by: str = "race") -> pd.DataFrame:
 
 def curve_of(regrets: Sequence[FloatArray]) -> FloatArray:
     """Return the mean regret of each column with its interval, shape (columns, 3)."""
-    return np.array(band_over_seeds(np.column_stack(regrets), np.mean)).T
+    return np.array(band_over_seeds(np.column_stack(regrets))).T
