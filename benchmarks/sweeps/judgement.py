@@ -81,7 +81,7 @@ def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float, *, see
         common = min(raced.standings[number].n_seeds for number in (0, chosen))
         differences = own[study, chosen] - own[study, 0]
         of_seeds = differences.mean(axis=-1, keepdims=True)
-        band = band_over_seeds(of_seeds, np.mean)
+        band = band_over_seeds(of_seeds)
         held.append(
             (
                 holds(differences, truth),
