@@ -110,7 +110,7 @@ def phase_of(storage_uri: str, tracking_uri: str | None, folder: Path, n_trials:
         scheduler=TrialScheduler(study, storage, Limits(n_trials=n_trials)),
         space=Space.read(SPACE),
         objectives=("mean_steps",),
-        reported="mean_steps",
+        reported=("mean_steps",),
         run=reporting,
         seeds_of=lambda _: (0,),
         sampler=SAMPLER,
