@@ -67,13 +67,15 @@ class Multirun(Callback):
 
     @staticmethod
     def _start(config: DictConfig) -> None:
-        from armscan.tracking import open_store, source
-
         if config.get("study") is not None:
             # It has a run of its own, which outlives many starts of workers.
             return
         check_launcher(config.hydra.runtime.choices[LAUNCHER])
         folder = Path(config.hydra.sweep.dir)
+        print(f"preparing a multirun in {folder}", flush=True)
+        # Deferred: what loads MLflow comes after the first line.
+        from armscan.tracking import open_store, source
+
         if not isinstance(config.tracking, DictConfig):
             raise InvalidValueError(f"tracking is {config.tracking!r}, but it must be a section, such as its default")
         tracking = to_plain(config.tracking)

@@ -30,6 +30,8 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
         The exit code: 0 if there is a result, 1 where too many trials failed.
     """
     given = StudyCommand.read(words)
+    if not given.is_plan:
+        print("preparing a study: its space is checked first", flush=True)
     silence_library_warnings()
     trial_words = words_of_trials(given.words)
     settings, task, config = read_settings(trial_words)
