@@ -104,7 +104,7 @@ class TianshouLearner(BaseLearner):
 
     @property
     def warm_up_note(self) -> str | None:
-        """What comes before the first update, for a reader of the log; None where nothing does."""
+        """Return a note on the random steps before the first update; None if there are none."""
         return f"{self._learning_starts:,} random steps before the first update" if self._learning_starts else None
 
     def warm_up(self) -> None:

@@ -59,6 +59,7 @@ def environments() -> Any:
         def get_attr(self, attr_name: str, indices: Any = None) -> Any:
             return [getattr(self.envs, attr_name, None)] * N_ENVS
 
+        # Abstract in Stable-Baselines3; its trainings call neither of the two.
         def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
             raise NotImplementedError
 

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from armscan.reports.chart_style import BLUE, GREY, ORANGE
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.paired import paired_difference
-from armscan.sweeps.scheduling.racing import Race, race
+from armscan.sweeps.scheduling.race import Race, race
 
 PICTURE = Path(__file__).parents[2] / "docs" / "images" / "how_a_study_decides.svg"
 N_TRIALS, N_VALIDATION, N_TEST, MAX_SEEDS, N_JUDGING = 30, 8, 12, 6, 5

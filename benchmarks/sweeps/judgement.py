@@ -4,7 +4,7 @@
 
 A simulated study has four candidates and the control. The score of a training on a volume is the sum of its
 configuration's true value, an effect of the training, one of the configuration on the volume, and a rest, all normal.
-The configuration is selected by `armscan.sweeps.scheduling.racing`. Of the studies that do not choose the control, the
+The configuration is selected by `armscan.sweeps.scheduling.race`. Of the studies that do not choose the control, the
 table has the share of those whose 95 % interval of chosen less control holds the true difference:
 
 - `paired`: as armscan judges, with seeds of its own, and `armscan.stats.paired`;
@@ -22,7 +22,7 @@ import numpy as np
 
 from armscan.stats.aggregation import band_over_seeds
 from armscan.stats.paired import crossed_mean
-from armscan.sweeps.scheduling.racing import race
+from armscan.sweeps.scheduling.race import race
 
 N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MAX_SEEDS = 4, 8, 2, 6
 # Standard deviations of the effects of trainings, of volumes for each configuration, and of the rest.

@@ -1,4 +1,4 @@
-"""What pruning with two objectives is worth: the hypervolume that is kept, and the environment steps that it takes.
+"""Pruning with two objectives: the hypervolume kept and the environment steps taken.
 
     python -m benchmarks.sweeps.pareto [folder=FOLDER] [trials=60] [replays=200]
 
@@ -12,8 +12,6 @@ time. A trial of the replay is the same training as far as it goes, so that what
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -30,9 +28,9 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from armscan.sweeps.scheduling.state import ENV_STEPS, env_steps_of
 from armscan.sweeps.storage.reports import REPORT, keep_report, reports_of
-from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.pruners import ParetoPruner
 from benchmarks.sweeps.bench.table import VALIDATION, read_rows, table_file
+from benchmarks.sweeps.studies import run_study
 
 WORDS = ("projection=y", "training.env_steps=8000", "training.eval_every_env_steps=1000")
 DIRECTIONS = (StudyDirection.MAXIMIZE, StudyDirection.MINIMIZE)
@@ -68,19 +66,8 @@ class Unpruned:
 
 def speed_vs_success(folder: Path, n_trials: int) -> Unpruned:
     """Run a small variant of `speed_vs_success` without pruning."""
-    words = ["-m", "sweep=speed_vs_success", "study.name=y", f"study.n_trials={n_trials}", *WORDS]
-    words += ["study.final_eval.top_k=0", "study/sampler=random", "study/pruner=none", "study.workers=1"]
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "y.log").open("a") as log:
-        subprocess.run(
-            [sys.executable, "-m", "armscan.run", *words],
-            cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
-            stdout=log,
-            stderr=log,
-            check=True,
-        )
-    study = optuna.load_study(study_name="y", storage=open_storage(str(folder / "optuna.journal")).optuna)
+    words = [*WORDS, f"study.n_trials={n_trials}", "study/sampler=random", "study/pruner=none", "study.workers=1"]
+    study = run_study(folder, "speed_vs_success", "y", *words)
     trials = study.get_trials(states=(TrialState.COMPLETE,))
     return Unpruned("speed_vs_success (success rate, environment steps)", DIRECTIONS, 2000, trials)
 

@@ -8,37 +8,22 @@ as far as it goes, and what differs is the pruning. A folder that has studies al
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.sweeps.scheduling.state import StudyState, env_steps_of
-from armscan.sweeps.storage.storage import open_storage
+from benchmarks.sweeps.studies import run_study
 
 STUDIES = {"plain": ["study/pruner=none"], "pruned": []}
 
 
 def trials_of(folder: Path, seed: int, name: str, n_trials: int) -> list[FrozenTrial]:
     """Run a study, and return its trials in the order in which they ended."""
-    words = ["-m", "sweep=sac_y", f"study.name={name}", f"study.seed={seed}", f"study.n_trials={n_trials}"]
-    words += ["study.final_eval.top_k=0", "study/sampler=random", *STUDIES[name]]
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / f"{name}.log").open("a") as log:
-        subprocess.run(
-            [sys.executable, "-m", "armscan.run", *words],
-            cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
-            stdout=log,
-            stderr=log,
-            check=True,
-        )
-    storage = open_storage(str(folder / "optuna.journal"))
-    study = optuna.load_study(study_name=name, storage=storage.optuna)
+    words = [f"study.seed={seed}", f"study.n_trials={n_trials}", "study/sampler=random", *STUDIES[name]]
+    study = run_study(folder, "sac_y", name, *words)
     return sorted(StudyState.of(study.trials).finished, key=lambda trial: str(trial.datetime_complete))
 
 

@@ -16,6 +16,8 @@ from armscan.sweeps.storage.storage import open_storage
 N_WORKERS = 4
 NAME, JOURNAL = "benchmark", "optuna.journal"
 REPOSITORY = Path(__file__).parents[2]
+# Of every study here.
+WITHOUT_FINAL_EVAL = ("study.final_eval.top_k=0",)
 SLEEPING = (
     *("study.task._target_=benchmarks.sweeps.sleeping.Sleeping", "study/sampler=random", "study/pruner=none"),
     *(f"study.workers={N_WORKERS}", "+study.space={agent.lr:{low:1.0e-4,high:1.0e-2,log:true}}"),
@@ -32,11 +34,42 @@ sys.exit(main())
 def started(folder: Path, *words: str) -> subprocess.Popen[bytes]:
     """Start a study in a folder, without the judging of its best trials."""
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
-    words = ("-m", "sweep=sac_y", f"study.name={NAME}", "study.final_eval.top_k=0", *words)
+    words = ("-m", "sweep=sac_y", f"study.name={NAME}", *WITHOUT_FINAL_EVAL, *words)
     with (folder / "printed").open("ab") as printed:
         return subprocess.Popen(
             [sys.executable, "-c", PROGRAM, *words], cwd=folder, env=environment, stdout=printed, stderr=printed
         )
+
+
+def run_study(folder: Path, sweep: str, name: str, *words: str) -> optuna.Study:
+    """Run a study without final evaluation to its end, or resume it, and return it.
+
+    Args:
+        folder: Folder of the study, made if it is not there.
+        sweep: Name of the sweep.
+        name: Name of the study, and of its log.
+        *words: Further overrides.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / f"{name}.log").open("a") as log:
+        subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "armscan.run",
+                "-m",
+                f"sweep={sweep}",
+                f"study.name={name}",
+                *WITHOUT_FINAL_EVAL,
+                *words,
+            ],
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+            stdout=log,
+            stderr=log,
+            check=True,
+        )
+    return optuna.load_study(study_name=name, storage=open_storage(str(folder / JOURNAL)).optuna)
 
 
 def finish(folder: Path, *words: str) -> StudyState:

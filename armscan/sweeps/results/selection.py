@@ -15,7 +15,7 @@ from armscan.reports.html import chart, table
 from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.results.charts import PERCENT
 from armscan.sweeps.results.judgement import Judgement
-from armscan.sweeps.scheduling.racing import DROP_LEVEL, Race
+from armscan.sweeps.scheduling.race import DROP_LEVEL, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of

@@ -19,8 +19,17 @@ from pydantic import Field
 from armscan.config.legacy import renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.racing import Race, budget, race
-from armscan.sweeps.scheduling.state import CONTROL, FINAL_SEED, FINALIST, RETRIED, SCHEDULE, PlannedTrial
+from armscan.sweeps.scheduling.race import Race, budget, race
+from armscan.sweeps.scheduling.state import (
+    CONTROL,
+    ENQUEUED_FROM,
+    FINAL_SEED,
+    FINALIST,
+    FROM_DEFAULT,
+    RETRIED,
+    SCHEDULE,
+    PlannedTrial,
+)
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.settings import (
@@ -41,7 +50,7 @@ ENDED_WITHOUT_SCORE = (TrialState.FAIL, TrialState.PRUNED)
 
 
 class _Stored(Section):
-    """What the study of the selection has kept: its settings, and the largest seed of the search."""
+    """Settings of the selection, and the largest seed of the search, as the study of the selection keeps them."""
 
     settings: FinalEvalSettings = Field(description="a section with top_k, min_seeds, max_seeds and judge_seeds")
     search_seed: int = Field(ge=0, le=LARGEST_SEARCH_SEED, description="the largest seed of the search")
@@ -122,9 +131,11 @@ class FinalEvaluation:
 
     def candidates(self) -> list[int]:
         """Return the control and the numbers of the best trials; nothing where no trial has finished."""
-        best = [trial.number for trial in best_trials(self.search, self.settings.top_k)]
+        best = best_trials(self.search, self.settings.top_k + 1)
+        # A trial with the settings of the control is the control.
+        others = [trial.number for trial in best if trial.user_attrs.get(ENQUEUED_FROM) != FROM_DEFAULT]
         # First, so that it wins where it is as good.
-        return [CONTROL, *best] if best else []
+        return [CONTROL, *others[: self.settings.top_k]] if best and self.settings.top_k else []
 
     def scores(self) -> dict[int, dict[int, float]]:
         """Return the score of each training of the selection that has ended, by candidate and seed; NaN: it failed."""

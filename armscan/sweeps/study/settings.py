@@ -186,7 +186,7 @@ class StudySettings(Limits):
 
     @property
     def asked(self) -> str:
-        """What decides whether the study ends before its last trial: where it changes, an ended study goes on."""
+        """Return the trials asked for and the terminator as JSON; an ended study goes on if they change."""
         terminator = dict(self.terminator) if self.terminator is not None else None
         return json.dumps({"n_trials": self.n_trials, "terminator": terminator}, sort_keys=True)
 

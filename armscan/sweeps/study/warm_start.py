@@ -15,7 +15,15 @@ from optuna.trial import FrozenTrial, create_trial
 from armscan.config.defaults import to_plain
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError, listed
-from armscan.sweeps.scheduling.state import ENQUEUED_FROM, ENV_STEPS, FINISHED, METRICS, SEEDS, TAKEN_FROM
+from armscan.sweeps.scheduling.state import (
+    ENQUEUED_FROM,
+    ENV_STEPS,
+    FINISHED,
+    FROM_DEFAULT,
+    METRICS,
+    SEEDS,
+    TAKEN_FROM,
+)
 from armscan.sweeps.space.parameter import Value, as_kept, overrides_of, written
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
@@ -47,12 +55,14 @@ class Beginning:
         told: Line about the part that is taken, and why the rest is not.
         taken: Finished trials, with their values.
         enqueued: Settings to try first.
+        is_default: Whether these are the settings of the study's own configuration. Default: False.
     """
 
     origin: str
     told: str
     taken: tuple[FrozenTrial, ...] = ()
     enqueued: tuple[dict[str, Value], ...] = ()
+    is_default: bool = False
 
     def add(self, storage: Storage, study: optuna.Study) -> bool:
         """Add the trials to a study, once; returns whether this call has added them."""
@@ -66,8 +76,9 @@ class Beginning:
             for trial in self.taken:
                 if trial.user_attrs[TAKEN_FROM] not in places:
                     study.add_trial(trial)
+            origin = FROM_DEFAULT if self.is_default else self.origin
             for chosen in self.enqueued:
-                study.enqueue_trial(chosen, user_attrs={ENQUEUED_FROM: self.origin}, skip_if_exists=True)
+                study.enqueue_trial(chosen, user_attrs={ENQUEUED_FROM: origin}, skip_if_exists=True)
             study.set_user_attr(BEGUN_WITH, [*begun_with, self.origin])
             return True
 
@@ -103,15 +114,21 @@ def beginnings(
 
 
 def _of_preset(space: Space, name: str, words: Sequence[str]) -> Beginning:
-    config, choices = composed(words if name == DEFAULT else [f"experiment={name}"])
-    # Of a group the name that was chosen, of any other key its value.
-    found = {each.name: choices.get(each.name, OmegaConf.select(config, each.name)) for each in space.parameters}
-    plain = {key: to_plain(value) if OmegaConf.is_config(value) else value for key, value in found.items()}
-    chosen, misfit = space.fit({key: as_kept(value) for key, value in plain.items()})
+    chosen, misfit = _settings(space, words if name == DEFAULT else [f"experiment={name}"])
     if misfit:
         return Beginning(PRESET.format(name), f"preset {name} is not tried: {misfit}")
     told = f"preset {name} is tried first: {' '.join(overrides_of(chosen))}"
-    return Beginning(PRESET.format(name), told, (), (chosen,))
+    is_default = chosen == _settings(space, words)[0]
+    return Beginning(PRESET.format(name), told, (), (chosen,), is_default)
+
+
+def _settings(space: Space, words: Sequence[str]) -> tuple[dict[str, Value], str]:
+    """Return the settings of a configuration by key, and why they do not fit the space; empty if they fit."""
+    config, choices = composed(words)
+    # Of a group the name that was chosen, of any other key its value.
+    found = {each.name: choices.get(each.name, OmegaConf.select(config, each.name)) for each in space.parameters}
+    plain = {key: to_plain(value) if OmegaConf.is_config(value) else value for key, value in found.items()}
+    return space.fit({key: as_kept(value) for key, value in plain.items()})
 
 
 def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], storage: Storage | None) -> Beginning:

@@ -20,7 +20,7 @@ N_VALUES, N_PLACES = 9, 32
 
 
 class Key(NamedTuple):
-    """What is known of a key.
+    """Importance and effect of a key.
 
     Args:
         fanova: Share of the variance between configurations that fANOVA gives it.

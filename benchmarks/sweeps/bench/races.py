@@ -19,7 +19,7 @@ N_REPEATS, N_RESAMPLES = 10, 2000
 
 
 class Choices(NamedTuple):
-    """What a rule chooses, as means over repeated choices.
+    """Choices of a rule, as means over repeated choices.
 
     Args:
         regret: Mean steps that the chosen candidate is truly worse than the best one, shape (studies,).

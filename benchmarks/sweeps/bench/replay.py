@@ -15,7 +15,7 @@ from optuna.trial import Trial, TrialState
 
 from armscan.config.compose import compose
 from armscan.stats.aggregation import interquartile_mean
-from armscan.sweeps.scheduling.racing import race
+from armscan.sweeps.scheduling.race import race
 from armscan.volumes.plane import FloatArray
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
@@ -114,7 +114,7 @@ def _run(trial: Trial, config: SimulatedConfig, n_seeds: int, rng: np.random.Gen
 
 @dataclass(frozen=True)
 class Choice:
-    """What a final evaluation has chosen.
+    """Choice of a final evaluation.
 
     Args:
         place: Place of the chosen candidate.

@@ -88,7 +88,9 @@ def complete(simulation):
 
 @pytest.mark.parametrize("n_workers", [1, 2, SIZE, 2 * SIZE])
 @pytest.mark.parametrize(("p_death", "p_failure"), [(0.0, 0.0), (0.3, 0.0), (0.2, 0.2)])
-def test_each_member_completes_each_generation_once_whoever_dies_or_fails(tmp_path, n_workers, p_death, p_failure):
+def test_each_member_completes_each_generation_once_although_workers_die_and_trials_fail(
+    tmp_path, n_workers, p_death, p_failure
+):
     simulation = Simulation(tmp_path)
     takeable = []
 
@@ -105,7 +107,7 @@ def test_each_member_completes_each_generation_once_whoever_dies_or_fails(tmp_pa
             parent = trials[trial.user_attrs["parent"]]
             assert parent.state == TrialState.COMPLETE
             assert parent.user_attrs["generation"] == trial.user_attrs["generation"] - 1
-            # Whoever looked before it was claimed has kept what it begins from.
+            # Every decision before its claim has kept the checkpoint of its parent.
             before = [kept for n_trials, kept in takeable if parent.number < n_trials <= trial.number]
             assert all(parent.number in kept for kept in before)
         start = trial.user_attrs["generation"] * INTERVAL

@@ -18,7 +18,7 @@ NUMBERS = st.floats(-1e6, 1e6)
 
 
 class Attempt:
-    """What a constraint needs of an attempt."""
+    """Attempt, with the attributes that a constraint reads."""
 
     def __init__(self, trial):
         self.trial, self.writes = trial, PendingWrites()

@@ -13,7 +13,18 @@ from armscan.sweeps.results.judgement import best_metrics, judge
 from armscan.sweeps.results.selection import candidates_of
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL, FINALIST, GENERATION, MEMBER, METRICS, RETRIED, SCHEDULE, Limits
+from armscan.sweeps.scheduling.state import (
+    CONTROL,
+    ENQUEUED_FROM,
+    FINALIST,
+    FROM_DEFAULT,
+    GENERATION,
+    MEMBER,
+    METRICS,
+    RETRIED,
+    SCHEDULE,
+    Limits,
+)
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, training_of
 from armscan.sweeps.study.settings import FinalEvalSettings
@@ -33,7 +44,7 @@ def storage_uri(tmp_path):
     return str(tmp_path / "a.journal")
 
 
-def searched(uri, objectives=("mean_steps",), **changes):
+def searched(uri, objectives=("mean_steps",), defaults=(), **changes):
     """Makes a study whose search has ended; returns its storage, settings and study."""
     asked = settings(
         storage=uri,
@@ -46,6 +57,8 @@ def searched(uri, objectives=("mean_steps",), **changes):
         trial = search.ask()
         trial.suggest_float("agent.lr", 1e-4, 1e-2)
         trial.set_user_attr(METRICS, {"mean_steps": luck, "success_rate": 0.5})
+        if number in defaults:
+            trial.set_user_attr(ENQUEUED_FROM, FROM_DEFAULT)
         search.tell(trial, [luck] * len(objectives))
         assert trial.number == number
     return storage, asked, search
@@ -146,6 +159,13 @@ def test_control_that_is_the_best_is_the_result(storage_uri):
     assert "No setting beat the default configuration" in judgement.statement
     assert {number for number, _ in trained(final.judgement)} == {CONTROL}
     assert judgement.differences == ()
+
+
+@pytest.mark.parametrize(("top_k", "candidates"), [(0, []), (1, [CONTROL, 1]), (2, [CONTROL, 1, 2])])
+def test_trial_with_the_settings_of_the_control_is_no_candidate_beside_it(storage_uri, top_k, candidates):
+    storage, asked, search = searched(storage_uri, defaults=(0,), top_k=top_k)
+    final = FinalEvaluation.opened(storage, asked, search)
+    assert final.candidates() == candidates
 
 
 def test_training_that_failed_leaves_its_candidate_out_and_the_study_has_a_result(storage_uri):

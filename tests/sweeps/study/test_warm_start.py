@@ -1,5 +1,7 @@
 """What a study begins with: trials of others whose configuration is the same, else their best settings; and presets."""
 
+from dataclasses import replace
+
 import optuna
 import pytest
 from optuna.trial import TrialState
@@ -8,7 +10,7 @@ from armscan.config.defaults import to_plain
 from armscan.config.sources import sweeps_folder
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import TAKEN_FROM, Limits, StudyState
+from armscan.sweeps.scheduling.state import ENQUEUED_FROM, FROM_DEFAULT, TAKEN_FROM, Limits, StudyState
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
@@ -143,6 +145,17 @@ def test_preset_whose_values_lie_in_the_space_is_tried_first():
     other = {"agent.lr_end_factor": 0.1, "stack": 4, "memory": 2, "agent.target_entropy_per_dim": -3.0}
     assert best.enqueued == (own.enqueued[0] | other,)
     assert best.told.startswith("preset best_zy is tried first: agent.lr=0.001 agent.lr_end_factor=0.1 ")
+
+
+def test_preset_that_has_the_settings_of_the_study_itself_is_marked(study_in):
+    words = ["sweep=sac_y"]
+    asked, _, config = read_settings(words)
+    (best_y,) = beginnings(asked, words, to_plain(config), None)
+    own = Beginning("preset b", "", (), ({"agent.lr": 1e-3},))
+    _, storage, study = study_in("now", {"agent.lr": LR})
+    for each in (replace(best_y, enqueued=({"agent.lr": 2e-3},)), own):
+        each.add(storage, study)
+    assert [trial.user_attrs[ENQUEUED_FROM] for trial in study.trials] == [FROM_DEFAULT, "preset b"]
 
 
 def test_settings_of_a_taken_trial_are_not_tried_again(study_in):

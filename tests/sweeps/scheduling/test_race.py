@@ -1,4 +1,4 @@
-"""A race over seeds: whatever finishes first, the same trainings are run and the same configuration is chosen."""
+"""Race over seeds: trainings and choice do not depend on the order in which trainings finish."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from armscan.sweeps.scheduling.racing import budget, race
+from armscan.sweeps.scheduling.race import budget, race
 
 SEEDS = tuple(range(1000, 1006))
 score = st.one_of(st.floats(-9, 9), st.sampled_from([0.0, 1.0, math.nan]))
@@ -25,7 +25,7 @@ def run(table, min_seeds, order, seeds=SEEDS):
 
 
 @given(tables, st.integers(1, 6), st.randoms(use_true_random=False))
-def test_race_ends_within_its_budget_with_one_choice_in_whatever_order_trainings_finish(table, min_seeds, random):
+def test_race_ends_within_its_budget_with_one_choice_in_any_order_of_trainings(table, min_seeds, random):
     first, trained = run(table, min_seeds, lambda missing: missing[0])
     other, trained_otherwise = run(table, min_seeds, random.choice)
     fewest, most = budget(len(table), min_seeds=min_seeds, max_seeds=len(SEEDS))
