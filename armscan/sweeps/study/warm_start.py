@@ -122,8 +122,8 @@ def _of_preset(space: Space, name: str, words: Sequence[str]) -> Beginning:
     return Beginning(PRESET.format(name), told, (), (chosen,), is_default)
 
 
-def _settings(space: Space, words: Sequence[str]) -> tuple[dict[str, Value], str]:
-    """Return the settings of a configuration by key, and why they do not fit the space; empty if they fit."""
+def _settings(space: Space, words: Sequence[str]) -> tuple[dict[str, Value], str | None]:
+    """Return the settings of a configuration by key, and why they do not fit the space; None if they fit."""
     config, choices = composed(words)
     # Of a group the name that was chosen, of any other key its value.
     found = {each.name: choices.get(each.name, OmegaConf.select(config, each.name)) for each in space.parameters}
