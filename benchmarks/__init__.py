@@ -1,1 +1,1 @@
-"""What is measured, and the scripts that measure it."""
+"""Benchmarks: scripts that measure speed, learning and studies."""

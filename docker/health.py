@@ -1,4 +1,4 @@
-"""Whether a worker is at work in this container: the exit code is 0 where one is."""
+"""Health check of a worker: exit with 0 if one is at work in this container."""
 
 from __future__ import annotations
 

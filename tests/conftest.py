@@ -1,4 +1,4 @@
-"""What many tests need: volumes, an environment's arguments, a folder for cached phantoms."""
+"""Fixtures of many tests: volumes, arguments of environments, a folder for cached phantoms."""
 
 import contextlib
 import json
@@ -41,7 +41,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def phantom_cache(tmp_path_factory):
-    """Keeps the tests' phantoms out of the user's cache, for this process and those it starts."""
+    """Keep the tests' phantoms out of the user's cache, for this process and those it starts."""
     folder = tmp_path_factory.mktemp("phantoms")
     os.environ["ARMSCAN_CACHE"] = str(folder)
     return folder
@@ -49,7 +49,7 @@ def phantom_cache(tmp_path_factory):
 
 @pytest.fixture(scope="session", autouse=True)
 def activated():
-    """Puts the environment's programs on the path, so that suggested commands begin with their names alone."""
+    """Put the environment's programs on the path, so that suggested commands begin with their names alone."""
     os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
 
 
@@ -61,7 +61,7 @@ def data_folder():
 
 @pytest.fixture(scope="session")
 def more_volumes():
-    """Returns the folder of four further labelmaps, which only slow tests read."""
+    """Return the folder of four further labelmaps, which only slow tests read."""
     return DATA / "more_volumes"
 
 
@@ -74,7 +74,7 @@ def dataset(data_folder):
 
 @pytest.fixture
 def wrists(tmp_path, data_folder):
-    """A folder of volumes whose manifest splits them."""
+    """Return a folder of volumes whose manifest splits them."""
     import yaml
 
     folder = tmp_path / "wrists"
@@ -89,7 +89,7 @@ def wrists(tmp_path, data_folder):
 
 @pytest.fixture(scope="session")
 def golden():
-    """What an independent implementation saw in slices of these labelmaps."""
+    """Return what an independent implementation saw in slices of these labelmaps."""
     with np.load(DATA / "golden" / "slices_full.npz") as arrays:
         return dict(arrays)
 
@@ -103,7 +103,7 @@ def phantom():
 
 @pytest.fixture(scope="session")
 def tiny_volume():
-    """A small block of every landmark, spaced differently along each axis."""
+    """Return a small block of every landmark, spaced differently along each axis."""
     return make_tiny_volume()
 
 
@@ -119,7 +119,7 @@ def make_tiny_volume(name="tiny", optimal_action=None):
 
 @pytest.fixture
 def write_labelmap(tmp_path):
-    """Writes labels, indexed [x, y, z], as an image file; returns its path."""
+    """Write labels, indexed [x, y, z], as an image file; return its path."""
     import SimpleITK
 
     def write(name="wrist.nii.gz", labels=None, spacing=(0.3, 0.4, 0.5, 1.0)):
@@ -135,7 +135,7 @@ def write_labelmap(tmp_path):
 
 @pytest.fixture
 def write_manifest(tmp_path):
-    """Writes the manifest beside the labelmaps of `write_labelmap`; returns the folder."""
+    """Write the manifest beside the labelmaps of `write_labelmap`; return the folder."""
 
     def write(entries):
         text = entries if isinstance(entries, str) else json.dumps(entries)
@@ -147,7 +147,7 @@ def write_manifest(tmp_path):
 
 @pytest.fixture
 def unseen_windows():
-    """Lets windows open that nobody sees; those that are left open are closed."""
+    """Let windows open that nobody sees; those that are left open are closed."""
     from matplotlib import pyplot
 
     before = pyplot.get_backend()
@@ -159,7 +159,7 @@ def unseen_windows():
 
 @pytest.fixture
 def made_read_only():
-    """Makes a folder one that nobody can write to for a while, not even root: mounted upon itself, read-only."""
+    """Make a folder one that nobody can write to for a while, not even root: mounted upon itself, read-only."""
 
     @contextlib.contextmanager
     def read_only(folder):
@@ -177,7 +177,7 @@ def made_read_only():
 
 @pytest.fixture(scope="session")
 def postgres_programs():
-    """The folder of PostgreSQL's programs, which tests that start a server of their own need, too."""
+    """Return the folder of PostgreSQL's programs, which tests that start a server of their own need, too."""
     from tests.support.postgres import programs
 
     if (folder := programs()) is None:
@@ -187,7 +187,7 @@ def postgres_programs():
 
 @pytest.fixture(scope="session")
 def postgres(postgres_programs):
-    """A server for all tests of this process."""
+    """Yield a server for all tests of this process."""
     from tests.support.postgres import postgres_server
 
     with postgres_server() as server:
@@ -196,7 +196,7 @@ def postgres(postgres_programs):
 
 @pytest.fixture(scope="session")
 def tracking_server(postgres, tmp_path_factory):
-    """An MLflow server that keeps its runs in PostgreSQL, for all tests of this process."""
+    """Yield an MLflow server that keeps its runs in PostgreSQL, for all tests of this process."""
     from tests.support.mlflow_server import mlflow_server
 
     with mlflow_server(tmp_path_factory.mktemp("mlflow"), postgres.make_database()) as server:
@@ -205,7 +205,7 @@ def tracking_server(postgres, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory):
-    """A database with MLflow's tables, which take a second or more to make."""
+    """Return a database with MLflow's tables, which take a second or more to make."""
     from armscan.tracking import open_store
 
     folder = tmp_path_factory.mktemp("store")
@@ -215,7 +215,7 @@ def empty_database(tmp_path_factory):
 
 @pytest.fixture
 def database(tmp_path, empty_database):
-    """Returns the address of an empty tracking database in the test's folder, `mlruns.db`."""
+    """Return the address of an empty tracking database in the test's folder, `mlruns.db`."""
     shutil.copy(empty_database, tmp_path)
     return f"sqlite:///{tmp_path}/mlruns.db"
 
@@ -233,7 +233,7 @@ def browser(tmp_path):
 
 @pytest.fixture
 def armscan(tmp_path, monkeypatch, capsys):
-    """Runs `armscan` in this process, in an empty folder; returns its exit code and what it printed."""
+    """Run `armscan` in this process, in an empty folder; return its exit code and what it printed."""
     from armscan.cli.main import main
 
     def command(*words, cwd=tmp_path):
@@ -248,7 +248,7 @@ def armscan(tmp_path, monkeypatch, capsys):
 
 @pytest.fixture
 def answer(tmp_path, monkeypatch, capsys):
-    """Runs the command in this process, in an empty folder; returns its exit code and what it printed."""
+    """Run the command in this process, in an empty folder; return its exit code and what it printed."""
     from hydra.core.global_hydra import GlobalHydra
 
     from armscan import run

@@ -34,7 +34,7 @@ print(config_folder())
 
 
 def words_of(path):
-    """The words that choose a configuration file, given its path in `conf`."""
+    """Return the words that choose a configuration file, given its path in `conf`."""
     group, name = str(path.parent), path.stem
     if group == ".":
         return []
@@ -44,7 +44,7 @@ def words_of(path):
 
 
 def configs(checkout):
-    """The paths of all configuration files of a checkout; its studies are the group `sweep`."""
+    """Return the paths of all configuration files of a checkout; its studies are the group `sweep`."""
     groups = {path.relative_to(checkout / "conf") for path in checkout.glob("conf/**/*.yaml")}
     return groups | {Path("sweep", path.name) for path in checkout.glob("sweeps/*.yaml")}
 
@@ -75,14 +75,14 @@ def run(*command, cwd, **given):
 
 
 def build(checkout, target, folder):
-    """Builds a wheel or a source distribution of a checkout; returns the file."""
+    """Build a wheel or a source distribution of a checkout; return the file."""
     run(sys.executable, "-m", "hatchling", "build", "--target", target, "--directory", folder, cwd=checkout)
     (built,) = folder.glob("*.whl" if target == "wheel" else "*.tar.gz")
     return built
 
 
 def virtual_environment(folder, *installed):
-    """Makes an environment with nothing but what is installed, beside armscan's dependencies; returns its Python."""
+    """Make an environment with nothing but what is installed, beside armscan's dependencies; return its Python."""
     run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder.parent)
     (packages,) = folder.glob("lib/python3*/site-packages")
     # Of a folder that a .pth file names, other .pth files are not read: those of an editable armscan.
@@ -95,7 +95,7 @@ def virtual_environment(folder, *installed):
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory):
-    """A checkout with private files, which git does not track."""
+    """Return a checkout with private files, which git does not track."""
     folder = tmp_path_factory.mktemp("build") / "checkout"
     folder.mkdir()
     for name in BUILT_FROM:
@@ -114,7 +114,7 @@ def checkout(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def wheel(checkout):
-    """A wheel from the source distribution of the checkout."""
+    """Return a wheel from the source distribution of the checkout."""
     sdist = build(checkout, "sdist", checkout.parent)
     with tarfile.open(sdist) as archive:
         assert not [name for name in archive.getnames() if "private" in name or "/local/" in name]
@@ -138,7 +138,7 @@ def test_wheel_holds_every_config_and_nothing_private(wheel, checkout):
 
 @pytest.fixture(scope="module")
 def python(wheel):
-    """The Python of an environment in which the wheel is installed."""
+    """Return the Python of an environment in which the wheel is installed."""
     return virtual_environment(wheel.parent / "venv", wheel)
 
 

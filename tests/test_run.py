@@ -41,7 +41,7 @@ REPOSITORY = Path(__file__).parent.parent
 
 
 def armscan_run(*arguments, cwd, **environment):
-    """Runs the command in a process of its own."""
+    """Run the command in a process of its own."""
     return subprocess.run(
         [sys.executable, "-m", "armscan.run", *arguments],
         cwd=cwd,
@@ -418,7 +418,7 @@ def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
 
 
 def job_process_ids(launcher_pid):
-    """The processes of a multirun's jobs: children of the launcher's workers, or of itself where one core is had."""
+    """Return the processes of a multirun's jobs: children of the launcher's workers, or of itself on one core."""
     listing = subprocess.run(["ps", "-ewwo", "pid=,ppid=,args="], capture_output=True, text=True, check=True).stdout
     # Of a program in several lines, ps makes one.
     processes = [line.split(maxsplit=2) for line in listing.splitlines()]

@@ -1,4 +1,4 @@
-"""What a command imports before it answers; how long that takes is measured by benchmarks/speed/start.py."""
+"""Imports of commands before they answer; benchmarks/speed/start.py measures how long they take."""
 
 import shutil
 import subprocess

@@ -1,4 +1,4 @@
-"""How tests are shared among workers."""
+"""Distribution of tests among workers."""
 
 import os
 

@@ -62,7 +62,7 @@ class PlaneFinderLearner(SupervisedLearner):
         super().__init__(self._module, finder.lr, envs, setup)
         self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
         self.expected_error: tuple[float, float] | None = None
-        """How far off the plane that `act` chose last is expected to be, in mm and degrees."""
+        """Expected error of the plane that `act` chose last, in mm and degrees."""
         self.expected_errors: FloatArray = np.empty((0, 2))
         """The same of the planes that `act_all` chose last in each of its episodes, shape (n, 2)."""
 

@@ -39,7 +39,7 @@ class Policy(nn.Module):
         self.actor = plain_copy(actor).eval().requires_grad_(requires_grad=False)
         self._bounded = bounded
         self.differs = "the agent draws its actions, of which this is the most likely one" if is_sampling else None
-        """Why the learner's own `act` may give other numbers; None if it gives the same."""
+        """Reason why the learner's own `act` may give other numbers; None if it gives the same."""
         if self.differs is None and not compute.is_plain:
             self.differs = f"the agent has computed with {compute.precision} on {compute.torch_device}"
 

@@ -1,1 +1,1 @@
-"""What agents reach, beside baselines and published curves."""
+"""Benchmarks of learning: trained agents beside baselines and published curves."""

@@ -1,4 +1,4 @@
-"""How far from the labelled plane a slice can be without its reward saying so: what limits how near an agent comes.
+"""Measure how far from the labelled plane a slice can be at full reward, which limits how near an agent comes.
 
     python -m benchmarks.learning.distance FOLDER
 

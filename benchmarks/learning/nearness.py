@@ -1,4 +1,4 @@
-"""How near the labelled plane the agents of runs come, and what their own doubt says of it.
+"""Compare how near the labelled plane the agents of runs come with the error that they expect.
 
     python -m benchmarks.learning.nearness RUN [FOLDER | phantom] [--tracking URI] [--episodes N] [--rx DEG]
     python -m benchmarks.learning.nearness GRID ...

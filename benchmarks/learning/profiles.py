@@ -1,4 +1,4 @@
-"""Where bones, tendons, artery and nerve lie along the arm, seen from the labelled plane: labelmaps beside phantoms.
+"""Compare labelmaps and phantoms: places of bones, tendons, artery and nerve along the arm, from the labelled plane.
 
     python -m benchmarks.learning.profiles FOLDER [--phantoms N]
 

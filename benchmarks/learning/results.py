@@ -1,4 +1,4 @@
-"""What agents reach on wrists they were never trained on, beside baselines that do not learn.
+"""Evaluate trained agents on wrists that they have never seen, beside baselines that do not learn.
 
     python -m benchmarks.learning.results data=VOLUMES [folder=RUNS] [seeds=0,1,2] [workers=2] [ROW ...]
     python -m benchmarks.learning.results show

@@ -1,4 +1,4 @@
-"""How much less processor time collecting takes than by Tianshou's own collector.
+"""Measure the processor time of collecting beside Tianshou's own collector.
 
     python -m benchmarks.speed.collecting [ROUNDS]
 

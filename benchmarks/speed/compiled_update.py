@@ -1,4 +1,4 @@
-"""How much less processor time a compiled gradient step of SAC takes than Tianshou's own.
+"""Measure the processor time of a compiled gradient step of SAC beside Tianshou's own.
 
     python -m benchmarks.speed.compiled_update [ROUNDS]
 

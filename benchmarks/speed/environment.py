@@ -1,4 +1,4 @@
-"""How fast the environment steps, beside a plain pipeline of public parts, in one run.
+"""Measure steps a second of the environment beside a plain pipeline of public parts, in one run.
 
     python -m benchmarks.speed.environment [FOLDER]
 
@@ -42,7 +42,7 @@ RULES = {"projection": "zy", "rotation_bounds_deg": (90.0, 45.0), "stack": 8, "m
 
 
 def plain_reward(image: SimpleITK.Image, action: ManipulatorAction) -> float:
-    """The reward of a plane, by public parts alone."""
+    """Return the reward of a plane, by public parts alone."""
     transform = SimpleITK.AffineTransform(3)
     transform.SetMatrix(action.matrix.ravel())
     transform.SetTranslation(action.offset_mm)
@@ -117,7 +117,7 @@ def plain_pipeline(volume: LabelVolume) -> Callable[[], float]:
 
 
 def larger(volume: LabelVolume) -> LabelVolume:
-    """The same arm several times over, end to end: slices of the same size through a far larger volume."""
+    """Return the same arm several times over, end to end: slices of the same size through a far larger volume."""
     labels = np.tile(volume.labels, (1, TIMES_AS_LARGE, 1))
     return LabelVolume(labels, volume.spacing, f"{TIMES_AS_LARGE} x {volume.name}", volume.optimal_action)
 

@@ -1,4 +1,4 @@
-"""How fast episodes are judged side by side, beside the same episodes one by one, in one run.
+"""Measure evaluation of episodes side by side against the same episodes one by one, in one run.
 
     python -m benchmarks.speed.evaluation [PART-OF-A-NAME ...]
 

@@ -1,4 +1,4 @@
-"""How many pictures of an episode are drawn a second, and how long a step with its picture takes beside one without.
+"""Measure the pictures of an episode drawn a second, and a step with its picture beside one without.
 
     python -m benchmarks.speed.rendering [FOLDER]
 

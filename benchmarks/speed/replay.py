@@ -1,4 +1,4 @@
-"""What the replay of image observations takes in memory and time, beside a plain buffer, in one run.
+"""Measure memory and time of the replay of image observations beside a plain buffer, in one run.
 
     python -m benchmarks.speed.replay [FOLDER]
 
@@ -44,7 +44,7 @@ NEAR_SHORT, NEAR_LONG = (0.5, (0.0, 0.05), {}), (1.0, (0.15, 0.3), {"success_thr
 
 
 def played(folder: str | Path, near: tuple, seed: int) -> list[dict]:
-    """The transitions of one environment."""
+    """Return the transitions of one environment."""
     share, distances, rules = near
     env_factory = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES | rules)
     env, rng = env_factory.make_env(read_dataset(folder)), np.random.default_rng(seed)
@@ -63,29 +63,29 @@ def played(folder: str | Path, near: tuple, seed: int) -> list[dict]:
 
 
 def batches(folder: str | Path, near: tuple) -> list[Batch]:
-    """The transitions of all environments, a batch for each step."""
+    """Return the transitions of all environments, a batch for each step."""
     return [Batch(list(step)) for step in zip(*(played(folder, near, i) for i in range(N_ENVS)), strict=True)]
 
 
 def resident_bytes() -> int:
-    """What this process has in memory, once what it has freed is given back: that would be taken again unseen."""
+    """Return the memory of this process after freed memory is given back, which would otherwise be reused unseen."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def array_bytes(batch: Batch) -> int:
-    """The bytes of all arrays."""
+    """Return the bytes of all arrays."""
     return sum(array_bytes(part) if isinstance(part, Batch) else part.nbytes for part in batch.values())
 
 
 def frame_bytes(replay: Replay) -> int:
-    """The bytes of the compressed frames."""
+    """Return the bytes of the compressed frames."""
     return sum(images.frames.n_bytes for images in getattr(replay, "_images", {}).values())
 
 
 def counted_bytes(replay: Replay) -> int:
-    """The bytes of all that was added, without what Python and the allocator add to each frame."""
+    """Return the bytes of all that was added, without what Python and the allocator add to each frame."""
     return array_bytes(replay._meta) + frame_bytes(replay)
 
 
@@ -98,7 +98,7 @@ def filled(replay: Replay, steps: Iterable[Batch]) -> tuple[float, int]:
 
 
 def sampling_s(replay: Replay, seed: int) -> tuple[float, list[Batch]]:
-    """The seconds of all that an update asks for, and what it is given."""
+    """Return the seconds of all that an update asks for, and what it is given."""
     replay.seed(seed)
     start_s = time.perf_counter()
     batch, indices = replay.sample(BATCH_SIZE)
@@ -107,7 +107,7 @@ def sampling_s(replay: Replay, seed: int) -> tuple[float, list[Batch]]:
 
 
 def compared(image: Replay, to_plain: Replay, same: bool) -> tuple[float, float, float]:
-    """The median milliseconds of a sampling of each, and of their ratio; checks that both gave the same."""
+    """Return the median milliseconds of a sampling of each, and of their ratio; checks that both gave the same."""
     rounds = []
     for seed in range(N_ROUNDS):
         (image_s, given), (plain_s, wanted) = sampling_s(image, seed), sampling_s(to_plain, seed)

@@ -1,4 +1,4 @@
-"""How long a fresh process takes to `import armscan`, and from there to its first steps.
+"""Measure how long a fresh process takes to `import armscan`, and from there to its first steps.
 
     python -m benchmarks.speed.startup
 
@@ -33,7 +33,7 @@ PROGRAMS = {
 
 
 def seconds(program: str) -> float:
-    """What a fresh process says that it took."""
+    """Return the seconds that a fresh process prints."""
     answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     return float(answer.stdout.split()[-1])
 

@@ -1,4 +1,4 @@
-"""What tracking costs a training.
+"""Measure the time that tracking adds to a training.
 
     python -m benchmarks.speed.tracking [--rounds 3] [--env-steps 20000] [--every 1000]
 
@@ -42,7 +42,7 @@ LOOK_S = 0.05
 
 
 class Cost(NamedTuple):
-    """What a training took.
+    """Times of a training.
 
     Args:
         wall_s: all of it.
@@ -58,7 +58,7 @@ class Cost(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Of the training's time, at most."""
+        """Share of the training's time, at most."""
         return (self.calls_s + self.threads_s) / self.wall_s
 
 
@@ -69,15 +69,15 @@ class Timed:
         self._callback, self.calls_s = callback, []
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Times it."""
+        """Time it."""
         self._timed(lambda: self._callback.on_start(total_env_steps, earlier))
 
     def on_epoch(self, report: EpochReport) -> None:
-        """Times it."""
+        """Time it."""
         self._timed(lambda: self._callback.on_epoch(report))
 
     def on_end(self) -> None:
-        """Times it."""
+        """Time it."""
         self._timed(self._callback.on_end)
 
     def _timed(self, call: Callable[[], None]) -> None:
@@ -130,7 +130,7 @@ def trained(config: Any, tracking: dict[str, Any] | None, before: Callable[[], N
 
 @contextmanager
 def ways(folder: Path) -> Iterator[dict[str, Callable[[Any], Cost]]]:
-    """The ways of tracking that are compared, by what they are called."""
+    """Yield the ways of tracking that are compared, by what they are called."""
 
     def section(uri: str) -> dict[str, Any]:
         return {

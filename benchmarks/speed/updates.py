@@ -1,4 +1,4 @@
-"""How many updates a second an agent makes, by how its networks are computed.
+"""Measure the updates a second of an agent, by how its networks are computed.
 
     python -m benchmarks.speed.updates [PART-OF-A-NAME ...]
 

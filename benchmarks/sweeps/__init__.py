@@ -1,1 +1,1 @@
-"""What a study costs beside its trials, and what survives its failures."""
+"""Benchmarks of studies: cost beside the trials, failures, and how studies decide."""

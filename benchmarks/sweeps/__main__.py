@@ -1,4 +1,4 @@
-"""What a study costs beside its trials, and what is left of it when its workers are killed.
+"""Measure what a study costs beside its trials, and what is left of it when its workers are killed.
 
     python -m benchmarks.sweeps compare [folder=FOLDER] [trials=60] [shortest_s=6] [longest_s=30]
                                         the workers' time spent in trials, beside Hydra's own Optuna sweeper

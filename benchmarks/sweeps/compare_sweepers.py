@@ -30,7 +30,7 @@ HYDRA_OPTUNA = Path(__file__).parent / "hydra_optuna"
 
 @dataclass(frozen=True)
 class Sweep:
-    """What came of a sweep.
+    """Outcome of a sweep.
 
     Args:
         occupation: of its workers.

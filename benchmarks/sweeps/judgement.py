@@ -1,4 +1,4 @@
-"""How often the interval of a study's result holds the truth, simulated; and what other ways of judging would do.
+"""Simulate how often the interval of a study's result holds the true difference, beside other intervals.
 
     python -m benchmarks.sweeps.judgement [--studies 2000]
 

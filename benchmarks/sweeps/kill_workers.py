@@ -1,4 +1,4 @@
-"""What is left of a study whose workers are killed, and whose storage is away twice."""
+"""Run a study whose workers are killed and whose storage is away twice; count what is left."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ AWAY_S = 10.0
 
 
 def kill(folder: Path, *, trials: int = 200, every_s: float = 20.0, storage: str = "journal") -> None:
-    """Kills workers, and takes the storage away twice, until the study is done; counts what has become of it."""
+    """Kill workers, and take the storage away twice, until the study is done; count what has become of it."""
     with storage_of_kind(storage, folder) as (uri, take_away):
         process = started(folder, *SLEEPING, f"study.n_trials={trials}", f"study.storage={uri}")
         chance, n_killed, n_away, start_s = random.Random(0), 0, 0, time.monotonic()
@@ -57,7 +57,7 @@ def workers_in(folder: Path) -> list[int]:
 
 @contextmanager
 def storage_of_kind(kind: str, folder: Path) -> Iterator[tuple[str, Callable[[], None]]]:
-    """A storage, and what takes it away from the workers for a while."""
+    """Yield a storage, and the function that takes it away from the workers for a while."""
     match kind:
         case "journal":
             yield JOURNAL, partial(hold_lock, folder / f".{JOURNAL}.lock")

@@ -1,4 +1,4 @@
-"""How much of the time of a sweep's workers is spent in what its trials do.
+"""Measure the share of a sweep's worker time that is spent in its trials.
 
 The trials only wait, and what of the workers' time they do not wait is the sweeper's: choosing what to try, starting a
 trial, writing down what came of it, and above all workers with nothing to do although there are trials left.
@@ -20,7 +20,7 @@ from benchmarks.sweeps.wait import Waited
 
 @dataclass(frozen=True)
 class Occupation:
-    """What the workers of a sweep did from the first trial's begin to the last trial's end.
+    """Time of a sweep's workers, from the begin of the first trial to the end of the last.
 
     Args:
         of_worker: what each has waited.
@@ -35,17 +35,17 @@ class Occupation:
 
     @property
     def waited_s(self) -> float:
-        """What all trials had to wait, one after another."""
+        """Sum of the waiting times of all trials, in seconds."""
         return sum(each.length_s for one in self.of_worker.values() for each in one)
 
     @property
     def begin_s(self) -> float:
-        """When the first trial began to wait."""
+        """Time at which the first trial began to wait."""
         return min(each.begin_s for one in self.of_worker.values() for each in one)
 
     @property
     def ends_s(self) -> list[float]:
-        """When each worker's last trial had waited."""
+        """Time at which the last trial of each worker had waited."""
         return [max(each.end_s for each in one) for one in self.of_worker.values()]
 
     @property
@@ -55,7 +55,7 @@ class Occupation:
 
     @property
     def share_of_wall(self) -> float:
-        """Of that time of all workers, what the trials had to wait; the end, where some find no more trial, counts."""
+        """Share of the time of all workers in which trials waited; idle workers at the end count."""
         return self.waited_s / (N_WORKERS * self.wall_s)
 
     @property

@@ -1,4 +1,4 @@
-"""What a study adds to a trial beside its training.
+"""Measure the time that a study adds to a trial beside its training.
 
 A trial is at hand from its claim to its tell, by the storage. Its worker then still closes the trial's tracked run and
 claims the next one. All of that is the study's, but for what a single run of `armscan.run` does as well, which is what
@@ -72,7 +72,7 @@ def _timed(method: Callable[..., Any], name: str, spent_s: dict[str, float]) -> 
 
 @dataclass(frozen=True)
 class Shares:
-    """What the seconds of a trial went to, from its claim to its tell; all four together are all of them.
+    """Seconds of a trial from its claim to its tell, in four parts that add up to all of them.
 
     Args:
         training_s: learning, validating, tracking, checkpoints.

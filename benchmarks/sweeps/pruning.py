@@ -1,4 +1,4 @@
-"""What pruning is worth: the study `sac_y` with its pruner, and without one.
+"""Measure what pruning saves: the study `sac_y` with its pruner, and without one.
 
     python -m benchmarks.sweeps.pruning [folder=FOLDER] [seeds=0,1,2] [trials=40]
 

@@ -54,7 +54,7 @@ FROM pg_stat_statements JOIN pg_database ON pg_database.oid = dbid GROUP BY datn
 
 
 class Asked(NamedTuple):
-    """What a database was asked.
+    """Statements and transactions of a database.
 
     Args:
         statements: in all.
@@ -84,7 +84,7 @@ class NoStore:
 
 
 def reporting(attempt: Attempt) -> dict[str, float]:
-    """A trial that reports, and does nothing else."""
+    """Report as a trial does, and do nothing else."""
     total = N_REPORTS * STEPS_A_REPORT
     for part in range(1, N_REPORTS + 1):
         at = {"n_env_steps": part * STEPS_A_REPORT, "grid": STEPS_A_REPORT, "total": total}
@@ -139,7 +139,7 @@ def round_trips_counted() -> Iterator[dict[int, int]]:
 
 
 def work(phase: Phase, name: str) -> None:
-    """Works at a study as a worker's process does."""
+    """Work at a study as a worker's process does."""
     heartbeat = Heartbeat(
         phase.scheduler, name, is_told_to_leave=lambda: False, leave=lambda: None, on_death=lambda _: None
     )

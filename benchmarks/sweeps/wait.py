@@ -12,7 +12,7 @@ N_PARTS = 10
 
 
 class Waited(NamedTuple):
-    """What a trial did.
+    """Record of a trial.
 
     Args:
         length_s: that it had to wait.

@@ -1,4 +1,4 @@
-"""What agents are given, and every algorithm with every network that fits."""
+"""Inputs of agents, and every algorithm with every network that fits."""
 
 from functools import partial
 
@@ -35,7 +35,7 @@ def setup_for(env_factory, phantom, **changes):
 
 @pytest.fixture(params=list(ALGORITHMS))
 def algorithm(request):
-    """Makes the algorithm with a network and changed parameters."""
+    """Make the algorithm with a network and changed parameters."""
     kind, small = ALGORITHMS[request.param]
     return lambda network=None, **changes: kind(network=network or MLP((8,)), **small | changes)
 
@@ -47,12 +47,12 @@ def factory_and_network(request):
 
 @pytest.fixture
 def make_learner(algorithm, factory_and_network, phantom):
-    """Makes a learner of every algorithm, for vectors and for images."""
+    """Make a learner of every algorithm, for vectors and for images."""
     env_factory, network = factory_and_network
     return lambda **changes: algorithm(network, **changes).agent(setup_for(env_factory, phantom))
 
 
 @pytest.fixture
 def env(factory_and_network, phantom):
-    """An environment that `make_learner`'s learners can act in."""
+    """Return an environment that `make_learner`'s learners can act in."""
     return factory_and_network[0].make_env([phantom])

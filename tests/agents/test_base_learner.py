@@ -1,4 +1,4 @@
-"""What learners share, and what they spare every process."""
+"""The base of all learners, and the imports it defers."""
 
 import subprocess
 import sys

@@ -20,7 +20,7 @@ def agent_of(algorithm, phantom, projection="y"):
 
 
 def planes(agent, n, seed=0, bounds=BOUNDS, rewards=()):
-    """The first planes of an episode, told the reward of the one before each; -0.5 where none is given."""
+    """Return the first planes of an episode, told the reward of the one before each; -0.5 where none is given."""
     agent.begin(seed=seed, bounds=bounds)
     told = [-0.9, *rewards] + [-0.5] * n
     return np.array([agent.act(np.zeros(3, np.float32), reward) for reward in told[:n]])

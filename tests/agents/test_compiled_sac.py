@@ -30,7 +30,7 @@ N_ENVS, N_STEPS = 3, 40
 
 
 def filled_replay(n_obs, n_free, kind=Replay, **arguments):
-    """A buffer whose rings are filled to different lengths, with rewards and ends."""
+    """Return a buffer whose rings are filled to different lengths, with rewards and ends."""
     rng = np.random.default_rng(4)
     replay = kind(N_ENVS * N_STEPS, N_ENVS, **arguments)
     for step in range(N_STEPS // 2):
@@ -77,7 +77,7 @@ def compiled(replay, compute=None, **arguments):
 
 
 def updated(each, replay, n, *, batch_size=32, seed=1, at_once=1):
-    """The figures of n gradient steps, means of as many as are taken at once."""
+    """Return the figures of n gradient steps, means of as many as are taken at once."""
     replay.seed(seed)
     torch.manual_seed(seed)
     with policy_within_training_step(each.policy):
@@ -99,7 +99,7 @@ def differences(one, other):
 
 
 def hand_over(source, target):
-    """Gives one algorithm the other's state, as a checkpoint does."""
+    """Give one algorithm the other's state, as a checkpoint does."""
     if isinstance(source.alpha, sac.AutoAlpha):
         target.alpha._optim.load_state_dict(deepcopy(source.alpha._optim.state_dict()))
     target.load_state_dict(deepcopy(source.state_dict()))

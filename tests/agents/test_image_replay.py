@@ -35,7 +35,7 @@ def envs(request, phantom):
 
 
 def played(envs, n_steps, seed=0):
-    """Yields the transitions of all environments, a batch a step; episodes end after four steps at the latest."""
+    """Yield the transitions of all environments, a batch a step; episodes end after four steps at the latest."""
     envs.action_space.seed(seed)
     observations, _ = envs.reset(seed=seed)
     for _ in range(n_steps):

@@ -1,4 +1,4 @@
-"""What holds for every learner: SAC, PPO and the regression, with vectors and with images."""
+"""Contract of every learner: SAC, PPO and the regression, with vectors and with images."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Which network takes which observation, and what is in it."""
+"""Networks: the observations they take, and their layers."""
 
 import numpy as np
 import pytest

@@ -42,7 +42,7 @@ def made(phantom, rules=None, **changes):
 
 
 def played(learner, env, seed=0):
-    """The planes of an episode, normalised, and whether its last step terminated it."""
+    """Return the planes of an episode, normalised, and whether its last step terminated it."""
     observation, info = env.reset(seed=seed)
     learner.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
     actions, terminated, truncated = [info["action"]], False, False
@@ -74,7 +74,7 @@ def test_learner_goes_on_from_its_state_to_the_bit(phantom):
 
 
 def test_looks_lie_beside_what_is_found_and_the_last_on_it(phantom):
-    """Of a network that always says that the plane is 2 mm on and not tilted, every next look is known."""
+    """Every next look of a network that always says "2 mm on, not tilted" is known."""
     learner, env = made(phantom)
     learner.load_weights(
         {name: torch.zeros_like(w) if "place." in name else w for name, w in learner.weights().items()}

@@ -23,7 +23,7 @@ CHANGES = {
 
 @pytest.fixture
 def make_scheduled(algorithm, phantom):
-    """Makes a learner with a schedule, or one without."""
+    """Make a learner with a schedule, or one without."""
     env_factory, network = ENV_FACTORIES["vector"]
 
     def made(is_scheduled=True):

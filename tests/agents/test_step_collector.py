@@ -27,7 +27,7 @@ MEASURED_S = ("collect_time", "collect_speed")
 
 @pytest.fixture
 def of_tianshou(monkeypatch):
-    """Makes learners collect by Tianshou's collector into Tianshou's buffer."""
+    """Make learners collect by Tianshou's collector into Tianshou's buffer."""
 
     def add(self, batch, buffer_ids=None):
         return VectorReplayBuffer.add(self, Batch(batch), buffer_ids)
@@ -58,7 +58,7 @@ def collected(learner):
 
 
 def all_that_is_drawn(learner):
-    """The states of all random generators."""
+    """Return the states of all random generators."""
     rings = [learner._replay, *learner._replay.buffers]
     return [
         torch.get_rng_state().tolist(),

@@ -1,4 +1,4 @@
-"""What is seen in a slice."""
+"""Summaries of slices."""
 
 import numpy as np
 import pytest

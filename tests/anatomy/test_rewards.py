@@ -1,4 +1,4 @@
-"""What a slice is worth."""
+"""Rewards of slices."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""How tissues are clustered, by pixels and by millimetres."""
+"""Clustering of tissues, in pixels and in millimetres."""
 
 import pytest
 

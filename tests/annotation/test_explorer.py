@@ -20,7 +20,7 @@ MIDDLE = (0.5, 0.5)
 
 
 def drag(explorer, axes, *places):
-    """Presses the mouse at the first place in the axes, moves it over the others, and lets go at the last one."""
+    """Press the mouse at the first place in the axes, move it over the others, and let go at the last one."""
     canvas = explorer.figure.canvas
     kinds = ["button_press_event", *["motion_notify_event"] * (len(places) - 1), "button_release_event"]
     for kind, place in zip(kinds, (*places, places[-1]), strict=True):
@@ -33,7 +33,7 @@ def click(explorer, button):
 
 
 def on_screen(explorer):
-    """The picture as the window shows it, above the sliders."""
+    """Return the picture as the window shows it, above the sliders."""
     explorer.figure.canvas.draw()
     return np.asarray(explorer.figure.canvas.buffer_rgba())[:HEIGHT, :, :3]
 

@@ -18,7 +18,7 @@ from armscan.volumes import ManipulatorAction, open_dataset, plane_distance, rea
 
 @pytest.fixture
 def bare(data_folder, tmp_path):
-    """A folder of two volumes without a manifest."""
+    """Return a folder of two volumes without a manifest."""
     folder = tmp_path / "bare"
     folder.mkdir()
     for path in sorted(data_folder.glob("*.nii.gz"))[:2]:
@@ -33,13 +33,13 @@ def names(bare):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Takes larger steps than the command does."""
+    """Take larger steps than the command does."""
     search = partial(find_optimal_plane, rz_deg=20.0, rx_deg=10.0, step_deg=10.0, step_mm=6.0)
     monkeypatch.setattr(armscan.annotation.labelling, "find_optimal_plane", search)
 
 
 def refused(words, capsys):
-    """The one line that answers a mistake."""
+    """Return the one line that answers a mistake."""
     assert main(["data", "label", *words]) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("error: ")

@@ -9,12 +9,12 @@ N_SEEDS, N_EPOCHS = 4, 10
 
 
 def true_log(place):
-    """The logarithm of the mean steps that a place is truly worth: the learning rate matters most, the batch not."""
+    """Return the logarithm of the true mean steps of a place: the learning rate matters most, the batch not."""
     return 0.5 + 6.0 * (place[0] - 0.6) ** 2 + 0.3 * place[1] + 1.5 * (place[2] - 0.7) ** 2
 
 
 def synthetic_curves(n_configs, chance=0.1):
-    """The curves of a table whose truth is known."""
+    """Return the curves of a table whose truth is known."""
     design, rng = Design.of("sac_y", n_configs), np.random.default_rng(0)
     config_of = np.repeat(np.arange(n_configs), N_SEEDS)
     worth = np.array([true_log(places_of(design.space, values)) for values in design.configs])[config_of]

@@ -23,7 +23,7 @@ EXPORT, REGISTER = ("export", "--out=new"), ("register", "--name=n")
 
 @pytest.fixture
 def answer(armscan, tmp_path, monkeypatch, database):
-    """Runs `armscan policy`; returns its exit code and what it printed."""
+    """Run `armscan policy`; return its exit code and what it printed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", database)
     return partial(armscan, "policy")
@@ -183,7 +183,7 @@ def test_damaged_checkpoint_is_told_and_changes_nothing(answer, tmp_path):
 
 
 def registered(answer, folder, *words):
-    """A run whose policy is registered: its id, and the folder of the model among its artifacts."""
+    """Return a run whose policy is registered: its id, and the folder of the model among its artifacts."""
     run_id = tracked(folder, *words)
     assert answer("register", run_id, "--name=n")[0] == 0
     return run_id, folder / "artifacts" / run_id / "artifacts" / "policy"

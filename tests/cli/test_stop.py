@@ -11,13 +11,13 @@ from armscan.tracking import open_store
 
 @pytest.fixture
 def answer(armscan):
-    """Runs the command in an empty folder; returns its exit code and what it printed."""
+    """Run the command in an empty folder; return its exit code and what it printed."""
     return partial(armscan, "runs", "stop")
 
 
 @pytest.fixture
 def study(tmp_path):
-    """A study with a trial that runs, and one that has ended."""
+    """Return a study with a trial that runs, and one that has ended."""
     study = optuna.create_study(study_name="a", storage=open_storage(str(tmp_path / "optuna.journal")).optuna)
     for name in ("objectives", "space", "fixed_config"):
         study.set_user_attr(name, {"x": "minimize"} if name == "objectives" else {})
@@ -28,7 +28,7 @@ def study(tmp_path):
 
 @pytest.fixture
 def run_with(tmp_path):
-    """Makes a run with tags; returns its ID."""
+    """Make a run with tags; return its ID."""
 
     def make(status=None, **tags):
         settings = {"experiment": "a", "artifacts": str(tmp_path / "artifacts"), "wait_s": 10.0}

@@ -38,13 +38,13 @@ COMMANDS = {
 
 @pytest.fixture(autouse=True)
 def working_folder(database, tmp_path, monkeypatch):
-    """A folder with the store in which the user looks."""
+    """Return a folder with the store in which the user looks."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlruns.db")
 
 
 def run_with(folder, text=None, **sections):
-    """Tracks a run, replaces its configuration or sections of it, and lets its tag say that it was started so."""
+    """Track a run, replace its configuration or sections of it, and let its tag say that it was started so."""
     run_id = tracked(folder)
     file, client = folder / CONFIG_FILE, store_of(folder)
     file.write_text(text or yaml.safe_dump(yaml.safe_load(file.read_text()) | sections))
@@ -154,7 +154,7 @@ def test_grid_of_another_folder_is_not_resumed(tmp_path, monkeypatch):
 
 
 def grid_in(folder, words):
-    """Tracks the parent of a grid that was started in a folder."""
+    """Track the parent of a grid that was started in a folder."""
     client, experiment_id = open_store(
         f"sqlite:///{folder}/mlruns.db", experiment="armscan", artifacts=str(folder / "artifacts"), wait_s=60.0
     )

@@ -7,7 +7,7 @@ from tests.cluster.studies import StartedStudy
 
 @pytest.fixture
 def start(tmp_path, postgres, tracking_server):
-    """Starts a study in an empty folder; it is ended with the test."""
+    """Start a study in an empty folder; it is ended with the test."""
     started = []
 
     def start(*words, environment):

@@ -88,18 +88,18 @@ class StartedStudy:
 
     @property
     def workers_folder(self) -> Path:
-        """Where its workers write."""
+        """Folder of the logs of its workers."""
         (folder,) = (self.folder / "studies" / "sac_y" / "workers").iterdir()
         return folder
 
     def trials(self, name: str = "sac_y") -> list[FrozenTrial]:
-        """Returns its trials, none where it has not been made yet."""
+        """Return its trials, none where it has not been made yet."""
         if name not in optuna.get_all_study_names(self._storage):
             return []
         return optuna.load_study(study_name=name, storage=self._storage).trials
 
     def holder(self, number: int) -> dict[str, Any]:
-        """Waits until a worker is in the middle of a trial; returns its lease."""
+        """Wait until a worker is in the middle of a trial; return its lease."""
         found: list[dict[str, Any]] = []
 
         def is_there() -> bool:
@@ -112,39 +112,39 @@ class StartedStudy:
         return found[0]
 
     def kill_worker(self, number: int) -> None:
-        """Kills a worker in the middle of a trial."""
+        """Kill a worker in the middle of a trial."""
         os.kill(self.holder(number)["pid"], signal.SIGKILL)
 
     def wait(self, is_there: Callable[[], bool]) -> None:
-        """Waits for a moment while it is at work."""
+        """Wait for a moment while it is at work."""
         wait_until(is_there, process=self.process, log=self.told, poll_s=0.1)
 
     def end(self) -> int:
-        """Waits for its end; returns the exit code."""
+        """Wait for its end; return the exit code."""
         try:
             return self.process.wait(HANG_S)
         except subprocess.TimeoutExpired:
             raise AssertionError(self.told()) from None
 
     def kill(self) -> None:
-        """Kills the command, if it is still there; its workers leave then."""
+        """Kill the command, if it is still there; its workers leave then."""
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()
 
     def told(self) -> str:
-        """Returns what the command and its workers have said."""
+        """Return what the command and its workers have said."""
         logs = sorted(self.folder.glob("studies/*/workers/*/worker-*.log"))
         logs += sorted(self.folder.glob("studies/*/workers/*/.submitit/*/*.*[rt]"))
         return "\n".join(f"--- {file.name}\n{file.read_text(errors='replace')}" for file in [self.printed, *logs])
 
     def runs(self) -> list[Run]:
-        """Returns its runs of the tracking server."""
+        """Return its runs of the tracking server."""
         experiment = self._client.get_experiment_by_name(self._experiment)
         return list(self._client.search_runs([experiment.experiment_id], max_results=1000))
 
     def check_complete(self, n_trials: int) -> None:
-        """Checks that exactly so many trials have finished, and that each of them is tracked once and whole."""
+        """Check that exactly so many trials have finished, and that each of them is tracked once and whole."""
         trials, runs = self.trials(), self.runs()
         finished = [trial for trial in trials if trial.state == TrialState.COMPLETE]
         assert len(finished) == n_trials, self.told()
@@ -165,19 +165,19 @@ class StartedStudy:
                 assert float(run.data.params["agent.lr"]) == trial.params["agent.lr"]
 
     def check_secret(self) -> None:
-        """Checks that the password of the storage is in no file, and in no words of a process."""
+        """Check that the password of the storage is in no file, and in no words of a process."""
         words = [file for file in Path("/proc").glob("[0-9]*/cmdline") if PASSWORD.encode() in _contents(file)]
         assert words == []
         files = [file for file in self.folder.rglob("*") if file.is_file()]
         assert [file for file in files if PASSWORD.encode() in file.read_bytes()] == []
 
     def worker(self, number: int) -> dict[str, Any]:
-        """Returns what a worker has left word of."""
+        """Return what a worker has left word of."""
         return json.loads((self.workers_folder / f"worker-{number}.json").read_text())
 
 
 def parent_of(pid: int) -> int:
-    """Returns the process that has started another."""
+    """Return the process that has started another."""
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 

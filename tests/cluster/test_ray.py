@@ -12,7 +12,7 @@ from tests.support.requirements import unavailable
 
 @pytest.fixture(scope="module")
 def cluster():
-    """It is entered, too: all that follows is on its first machine."""
+    """Enter the cluster: all that follows is on its first machine."""
     if (reason := why_not_here()) is not None:
         unavailable(reason)
     with (

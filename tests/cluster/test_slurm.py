@@ -27,7 +27,7 @@ def cluster():
 
 
 def job_of(cluster, number):
-    """The job of a worker."""
+    """Return the job of a worker."""
     (job,) = [job for job in cluster.jobs() if job.endswith(f"_{number}")]
     return job
 

@@ -20,7 +20,7 @@ AGENTS = ("sac", "ppo", "regression", "optuna")
 
 @pytest.fixture
 def legacy(tmp_path, monkeypatch):
-    """The folder in which the earlier version was used; returns the address of its store."""
+    """Return the folder in which the earlier version was used; return the address of its store."""
     with tarfile.open(ARCHIVE) as archive:
         archive.extractall(tmp_path, filter="data")
     folder = tmp_path / "legacy"

@@ -1,4 +1,4 @@
-"""Where services are, and how their passwords come in."""
+"""Addresses and passwords of services."""
 
 import os
 
@@ -17,7 +17,7 @@ PASSWORDS = (credentials.STORAGE_PASSWORD, credentials.TRACKING_PASSWORD, creden
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """An empty folder, in which the user's configuration is, too, and an environment without services."""
+    """Return an empty folder, in which the user's configuration is, too, and an environment without services."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     for variable in (*VARIABLES, *PASSWORDS):

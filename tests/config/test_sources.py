@@ -15,7 +15,7 @@ MINE = "# @package _global_\n# One of my own.\ndefaults:\n  - /study/base\n  - _
 
 @pytest.fixture
 def working(tmp_path, monkeypatch):
-    """Writes files into an empty working folder."""
+    """Write files into an empty working folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PWD", str(tmp_path))
 

@@ -1,4 +1,4 @@
-"""What a stored configuration may execute."""
+"""Code that a stored configuration may execute."""
 
 import copy
 import functools

@@ -53,7 +53,7 @@ class Containers:
         self._pattern = re.compile("|".join(f"(?P<_{place}>{pattern})" for place, pattern in enumerate(self._replaced)))
 
     def _addresses(self) -> dict[str, str]:
-        """The addresses in the files, as patterns, and what they are here."""
+        """Return the addresses in the files, as patterns, and what they are here."""
         replaced = {r"\b0\.0\.0\.0\b": "127.0.0.1"}
         for name, service in self.services.items():
             for port in service.get("ports", []):
@@ -63,7 +63,7 @@ class Containers:
         return replaced
 
     def _paths(self) -> dict[str, str]:
-        """The paths in the files, as patterns, and what they are here."""
+        """Return the paths in the files, as patterns, and what they are here."""
         replaced = {rf"{SECRETS}\b": str(self.secret.parent)}
         replaced |= {re.escape(path): str(here) for path, here in self._image.copied.items()}
         for name in self.services:
@@ -71,7 +71,7 @@ class Containers:
         return replaced
 
     def volumes(self, name: str) -> list[tuple[Path, str, list[str]]]:
-        """The volumes of a service, each with its folder here, its place in the container and its options."""
+        """Return the volumes of a service, each with its folder here, its place in the container and its options."""
         split = [volume.split(":") for volume in self.services[name].get("volumes", [])]
         named = [(self.folder / source, target, options) for source, target, *options in split if source[0] != "."]
         for folder, _, _ in named:
@@ -79,11 +79,11 @@ class Containers:
         return named
 
     def here(self, text: str) -> str:
-        """Returns a text of the files as it has to be on this machine."""
+        """Return a text of the files as it has to be on this machine."""
         return self._pattern.sub(lambda found: list(self._replaced.values())[int(str(found.lastgroup)[1:])], text)
 
     def environment(self, name: str) -> dict[str, str]:
-        """The variables that a service's processes have, and no others."""
+        """Return the variables that a service's processes have, and no others."""
         path = [Path(sys.executable).parent, self.folder / "programs"]
         own = {"HOME": str(self.folder / "home"), "LANG": "C.UTF-8", "PYTHONPATH": str(REPOSITORY)}
         given = self._image.environment | self.services[name].get("environment", {})
@@ -93,7 +93,7 @@ class Containers:
         return {key: self.here(value) for key, value in given.items() if key != "PATH"} | own
 
     def is_healthy(self, name: str) -> bool:
-        """Whether a service's health check says so."""
+        """Return whether a service's health check passes."""
         test = self.services[name].get("healthcheck", {}).get("test", ["CMD", *self._image.healthcheck])
         assert test[0] == "CMD"
         with self._log_of(name).open("ab") as log:
@@ -101,7 +101,7 @@ class Containers:
             return subprocess.run(command, **self._surroundings(name, log), check=False).returncode == 0
 
     def start(self, name: str) -> subprocess.Popen[bytes]:
-        """Starts a service."""
+        """Start a service."""
         command = self._command(name, [*self._image.entrypoint, *shlex.split(self.services[name]["command"])])
         with self._log_of(name).open("ab") as log:
             # In a session of its own: a Ctrl-C is meant for who started it.
@@ -109,7 +109,7 @@ class Containers:
         return self._processes[name]
 
     def wait_until_healthy(self, name: str) -> None:
-        """Waits until the health check of a service says that it is there."""
+        """Wait until the health check of a service says that it is there."""
         wait_until(
             lambda: self.is_healthy(name),
             process=self._processes.get(name),
@@ -118,7 +118,7 @@ class Containers:
         )
 
     def stop(self, name: str) -> int:
-        """Stops a service as an engine does, which waits for as long as the file says; returns its exit code."""
+        """Stop a service as an engine does, which waits for as long as the file says; return its exit code."""
         process = self._processes.pop(name)
         self._terminate(process)
         grace = self.services[name].get("stop_grace_period", "10s")
@@ -128,7 +128,7 @@ class Containers:
             _end(process)
 
     def stop_all(self) -> None:
-        """Ends whatever is still there."""
+        """End whatever is still there."""
         for process in self._processes.values():
             self._terminate(process)
         for process in self._processes.values():
@@ -140,14 +140,14 @@ class Containers:
                 _end(process)
 
     def log(self, name: str) -> str:
-        """What a service has printed."""
+        """Return the output of a service."""
         return self._log_of(name).read_text()
 
     def _log_of(self, name: str) -> Path:
         return self.folder / f"{name}.log"
 
     def _command(self, name: str, words: Sequence[str]) -> list[str]:
-        """What runs a command of a service."""
+        """Return the command line of a service."""
         return [self.here(word) for word in words]
 
     def _terminate(self, process: subprocess.Popen[bytes]) -> None:
@@ -165,7 +165,7 @@ class Containers:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Ends what is left of the group of a process."""
+    """End what is left of the group of a process."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()

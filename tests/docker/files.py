@@ -19,7 +19,7 @@ VARIABLE = re.compile(r"\$\{(?P<name>\w+)(?P<kind>:?-)(?P<default>[^}$]*)\}")
 
 
 def read_compose(path: Path = COMPOSE, **given: str) -> dict[str, Any]:
-    """Reads a compose file.
+    """Read a compose file.
 
     Args:
         path: of the file.
@@ -29,7 +29,7 @@ def read_compose(path: Path = COMPOSE, **given: str) -> dict[str, Any]:
 
 
 def variables_of(path: Path) -> dict[str, str]:
-    """Returns the variables of a compose file with their defaults."""
+    """Return the variables of a compose file with their defaults."""
     return {found["name"]: found["default"] for found in VARIABLE.finditer(path.read_text())}
 
 
@@ -51,7 +51,7 @@ def _interpolated(value: Any, given: Mapping[str, str]) -> Any:
 
 @dataclass
 class Image:
-    """What the last setup of the Dockerfile makes.
+    """The image that the last stage of the Dockerfile makes.
 
     Args:
         environment: variables.
@@ -65,7 +65,7 @@ class Image:
 
     @property
     def entrypoint(self) -> list[str]:
-        """What every command is run by."""
+        """The program that runs every command."""
         return list(json.loads(self.words["ENTRYPOINT"]))
 
     @property
@@ -75,7 +75,7 @@ class Image:
 
 
 def instructions() -> list[tuple[str, str]]:
-    """Returns the Dockerfile's instructions, each with its words."""
+    """Return the Dockerfile's instructions, each with its words."""
     lines = (FOLDER / "Dockerfile").read_text().splitlines()
     text = "\n".join(line for line in lines if not line.startswith("#")).replace("\\\n", " ")
     split = (line.partition(" ") for line in text.splitlines() if line.strip())
@@ -83,7 +83,7 @@ def instructions() -> list[tuple[str, str]]:
 
 
 def read_image() -> Image:
-    """Reads the Dockerfile."""
+    """Read the Dockerfile."""
     image = Image()
     for name, words in instructions():
         if name == "FROM":

@@ -41,7 +41,7 @@ class Buildah:
         self.words += ["--storage-driver", "vfs"]
 
     def __call__(self, *words: object) -> str:
-        """Runs a command of buildah; returns what it prints."""
+        """Run a command of buildah; return what it prints."""
         ended = subprocess.run([*self.words, *map(str, words)], capture_output=True, text=True, check=False)
         assert ended.returncode == 0, f"{ended.stdout}\n{ended.stderr}"
         return ended.stdout
@@ -49,7 +49,7 @@ class Buildah:
 
 @contextlib.contextmanager
 def built_image() -> Iterator[Buildah]:
-    """Builds the image `armscan` from the Dockerfile; removes it at the end."""
+    """Build the image `armscan` from the Dockerfile; remove it at the end."""
     if missing := [program for program in PROGRAMS if shutil.which(program) is None]:
         unavailable(f"{' and '.join(missing)} not installed: apt-get install {' '.join(missing)}")
     if os.geteuid() != 0:
@@ -73,7 +73,7 @@ def built_image() -> Iterator[Buildah]:
 
 
 def pip_sources(config: Path) -> list[str]:
-    """Returns the words that let pip find packages in a container where it finds them on this machine.
+    """Return the words that let pip find packages in a container where it finds them on this machine.
 
     Args:
         config: the file to write pip's configuration to.
@@ -109,7 +109,7 @@ class ImageContainers(Containers):
         return {}
 
     def environment(self, name: str) -> dict[str, str]:
-        """The variables that a service has beside those of the image."""
+        """Return the variables that a service has beside those of the image."""
         return {key: self.here(value) for key, value in self.services[name].get("environment", {}).items()}
 
     def _command(self, name: str, words: Sequence[str]) -> list[str]:
@@ -131,6 +131,6 @@ class ImageContainers(Containers):
 
 
 def first_process(pid: int) -> psutil.Process:
-    """Returns the first process in the container of a `buildah run`."""
+    """Return the first process in the container of a `buildah run`."""
     below = psutil.Process(pid).children(recursive=True)
     return next(each for each in below if each.uids().real == USER_ID and "buildah" not in each.cmdline()[0])

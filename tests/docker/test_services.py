@@ -39,21 +39,21 @@ MOST_CONNECTIONS = 6
 
 @pytest.fixture
 def postgres_there(postgres_programs):
-    """A server of this test's own."""
+    """Yield a server of this test's own."""
     with postgres_server() as server:
         yield server
 
 
 @pytest.fixture(scope="module")
 def image():
-    """The built image."""
+    """Yield the built image."""
     with built_image() as buildah:
         yield buildah
 
 
 @pytest.fixture(params=["processes", pytest.param("image", marks=pytest.mark.slow)])
 def containers(request, postgres_programs, postgres_there, tmp_path):
-    """The services on this machine; of them PostgreSQL is there, as its image leaves it at its first start."""
+    """Yield the services on this machine; of them PostgreSQL is there, as its image leaves it at its first start."""
     given = (tmp_path, postgres_there.port, postgres_programs, PASSWORD)
     if request.param == "image":
         services = ImageContainers(request.getfixturevalue("image"), *given, ARMSCAN_WORDS=TRAININGS)
@@ -68,7 +68,7 @@ def containers(request, postgres_programs, postgres_there, tmp_path):
 
 
 def asked(url, **headers):
-    """Returns the status and the body of an answer."""
+    """Return the status and the body of an answer."""
     try:
         with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=HANG_S) as answer:
             return answer.status, answer.read()
@@ -77,7 +77,7 @@ def asked(url, **headers):
 
 
 def command_lines(marked):
-    """Returns the words of all processes that have this in their environment."""
+    """Return the words of all processes that have this in their environment."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -87,18 +87,18 @@ def command_lines(marked):
 
 
 def selected(server, query):
-    """Returns the first column of what the studies' database answers."""
+    """Return the first column of what the studies' database answers."""
     with psycopg.connect(server.uri("armscan")) as connection:
         return [row[0] for row in connection.execute(query)]
 
 
 def states(server):
-    """Returns how the trials stand."""
+    """Return how the trials stand."""
     return selected(server, "SELECT state::text FROM trials ORDER BY number")
 
 
 def n_connections(server):
-    """Returns how many clients the studies' database has, this one left out."""
+    """Return how many clients the studies' database has, this one left out."""
     (n_all,) = selected(server, "SELECT count(*) FROM pg_stat_activity WHERE datname = 'armscan'")
     return n_all - 1
 

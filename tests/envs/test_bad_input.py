@@ -54,7 +54,7 @@ WRAPPER_RULES = ["stack", "stack_exclude", "memory", "stack_memory"]
 
 
 def try_out(env):
-    """An environment that could be made works, or says in its own words why it cannot."""
+    """Check that an environment that could be made works, or says in its own words why it cannot."""
     if env is None:
         return
     with suppress(ArmscanError):

@@ -80,13 +80,13 @@ class Presented(gym.Env):
 
 @pytest.fixture(scope="module")
 def nothing_left_open():
-    """Collects what tests of other modules have left open, whose warnings would be raised in the middle of these."""
+    """Collect what tests of other modules have left open, whose warnings would be raised in the middle of these."""
     gc.collect()
 
 
 @pytest.fixture(autouse=True)
 def no_warnings(nothing_left_open):
-    """Turns every warning into an error, Gymnasium's own included."""
+    """Turn every warning into an error, Gymnasium's own included."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
@@ -147,7 +147,7 @@ def test_env_conforms_where_the_last_plane_is_judged(wrist, variant):
 
 
 def test_env_conforms_where_it_is_drawn(wrist, unseen_windows):
-    """What the checker wants of pictures; the one check that costs too much to run over every combination."""
+    """Check pictures as the checker does; this check costs too much to run over every combination."""
     check_env(Presented(make_mixed(wrist, "images", render_mode="rgb_array")))
     check_env(gym.make(armscan.ENV_ID, volumes=[wrist], render_mode="rgb_array").unwrapped)
 
@@ -242,7 +242,7 @@ def test_vector_env_conforms(wrist, env_id, variant):
 
 @pytest.fixture
 def learn():
-    """Trains with Stable-Baselines3 and says what its policy has learned."""
+    """Train with Stable-Baselines3 and say what its policy has learned."""
     with warnings.catch_warnings():
         # What it says of its own defaults, such as how large its convolutions want an image, is not ours.
         warnings.simplefilter("ignore")

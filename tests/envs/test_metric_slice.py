@@ -14,7 +14,7 @@ FULL = 255
 
 
 def observed(slice_xz, slice_pixel_mm, **arguments):
-    """Returns the image of a slice, and checks it against its space."""
+    """Return the image of a slice, and check it against its space."""
     slice_xz = np.asarray(slice_xz, dtype=np.uint8)
     geometry = SliceGeometry(slice_xz.shape, slice_pixel_mm)
     view = View(slice_xz, np.zeros((3, 4)), PIXEL_TISSUES, geometry, slice_xz.shape, action=np.zeros(1), reward=-1.0)
@@ -25,7 +25,7 @@ def observed(slice_xz, slice_pixel_mm, **arguments):
 
 
 def reference(slice_xz, pixel_mm, field_mm, image_pixel_mm):
-    """The slow way: the area that each pixel of the slice has in common with each pixel of the image."""
+    """Compute the image slowly: by the area that each pixel of the slice has in common with each pixel of the image."""
     shape = [round(field / pixel) for field, pixel in zip(field_mm, image_pixel_mm, strict=True)]
     weights = []
     for axis in (0, 1):

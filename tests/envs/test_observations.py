@@ -1,4 +1,4 @@
-"""What the agent gets to see."""
+"""Observations."""
 
 import gymnasium as gym
 import numpy as np
@@ -24,7 +24,7 @@ GEOMETRY = SliceGeometry((361, 81), (0.27, 0.55))
 
 
 def view_of(bones, tendons, artery, geometry=GEOMETRY):
-    """A view of clusters given as lists of (across, depth, pixels)."""
+    """Return a view of clusters given as lists of (across, depth, pixels)."""
 
     def summary(rows):
         table = np.array(rows, dtype=float).reshape(-1, 3)

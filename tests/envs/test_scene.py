@@ -1,4 +1,4 @@
-"""How volumes are moved at reset, and where their optimal planes go."""
+"""Random motions of volumes at reset, and their optimal planes."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def make_rules(volume, **changes):
 
 
 def draw(volume, rng, n_scenes=1, **changes):
-    """Draws scenes of a volume, one after another."""
+    """Draw scenes of a volume, one after another."""
     made = make_rules(volume, **changes)
     return [made.draw_scenes([volume.name], [rng])[0][0] for _ in range(n_scenes)]
 
@@ -208,5 +208,5 @@ class _OutOfView:
     """A random generator that always moves the hand out of the picture."""
 
     def random(self, _size):
-        """Draws that are shares of the way from the lowest to the highest."""
+        """Return draws as shares of the way from the lowest to the highest."""
         return np.array([0.5, 0.5, 20.5, -19.5])

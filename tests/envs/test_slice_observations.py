@@ -28,7 +28,7 @@ def view_of(slice_xz, smallest=None):
 
 
 def observed(kind, slice_xz, smallest=None, **arguments):
-    """Returns what is observed of a slice, and checks it against its space."""
+    """Return what is observed of a slice, and check it against its space."""
     view = view_of(slice_xz, smallest)
     observation = kind(**arguments)
     geometries = [view.geometry, SliceGeometry(view.smallest_shape, (0.3, 0.3))]
@@ -38,12 +38,12 @@ def observed(kind, slice_xz, smallest=None, **arguments):
 
 
 def pixels_of(pixel, n, wanted):
-    """Returns which of n pixels the given one of `wanted` stands for."""
+    """Return which of n pixels the given one of `wanted` stands for."""
     return [i for i in range(n) if i + 1 > pixel * n / wanted and i < (pixel + 1) * n / wanted]
 
 
 def reference(slice_xz, crop, shape):
-    """The slow way to what `SliceObservation` shows."""
+    """Compute slowly what `SliceObservation` shows."""
     first = [int(np.ceil((n - wanted) / 2)) for n, wanted in zip(slice_xz.shape, crop, strict=True)]
     cropped = slice_xz[first[0] :, first[1] :][: crop[0], : crop[1]]
     reduced = np.zeros(shape, dtype=int)
@@ -54,7 +54,7 @@ def reference(slice_xz, crop, shape):
 
 
 def channels_reference(slice_xz, crop, shape):
-    """The slow way to what `SliceChannelsObservation` shows: each tissue as if there were no other."""
+    """Compute slowly what `SliceChannelsObservation` shows: each tissue as if there were no other."""
     return np.stack([reference(np.where(slice_xz == tissue, 3, 0), crop, shape) // 3 for tissue in (1, 2, 3)])
 
 

@@ -220,7 +220,7 @@ class Pair(gym.Env):
 
 
 class Looks(Dataset):
-    """What two environments see first."""
+    """Return the first observations of two environments."""
 
     def __init__(self, volumes):
         self._volumes = volumes

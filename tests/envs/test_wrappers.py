@@ -109,13 +109,13 @@ def test_make_without_wrappers_gives_the_bare_environment(phantom):
 
 
 def image_env(wrist, **wrappers):
-    """An environment with a Dict observation: a small image, action and reward."""
+    """Return an environment with a Dict observation: a small image, action and reward."""
     observation = SliceObservation(shape=(24, 20))
     return make_armscan_env([wrist], observation=observation, projection="zy", max_steps=9, **wrappers)
 
 
 def steps(env, n_steps=4):
-    """Yields what is observed from a reset on, and `info`."""
+    """Yield what is observed from a reset on, and `info`."""
     env.action_space.seed(0)
     yield env.reset(seed=1)
     for _ in range(n_steps):

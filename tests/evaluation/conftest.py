@@ -12,12 +12,12 @@ from armscan.volumes.resampling import resample
 
 @pytest.fixture(autouse=True)
 def tracking_database(database):
-    """Spares each test the making of MLflow's tables."""
+    """Spare each test the making of MLflow's tables."""
 
 
 @pytest.fixture
 def answer(armscan, monkeypatch):
-    """Runs `armscan evaluate` in this process; returns its exit code and what it printed."""
+    """Run `armscan evaluate` in this process; return its exit code and what it printed."""
     monkeypatch.setenv("COLUMNS", "200")
     return partial(armscan, "evaluate")
 

@@ -1,4 +1,4 @@
-"""What an evaluation leaves: tables, a JSON file, and a run of its own in the store."""
+"""Files and runs of an evaluation: tables, a JSON file, and a run of its own in the store."""
 
 import pytest
 

@@ -19,7 +19,7 @@ PICTURES_A_FRAME, PICTURES_OF_THE_LAST = 6, 24
 
 @pytest.fixture
 def answer(armscan):
-    """Runs `armscan evaluate --video` in this process; returns its exit code and what it printed."""
+    """Run `armscan evaluate --video` in this process; return its exit code and what it printed."""
     return partial(armscan, "evaluate", "--video")
 
 

@@ -1,4 +1,4 @@
-"""What a configuration describes, built."""
+"""Objects built from a configuration."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from armscan.training import Split
 
 
 def split_of_sizes(volume):
-    """A split whose test volume is narrower than the others."""
+    """Return a split whose test volume is narrower than the others."""
     return Split(
         {"a": replace(volume, name="a")},
         {"b": replace(volume, name="b")},
@@ -28,7 +28,7 @@ class AsLargeAsTheSlice(SliceObservation):
 
 
 def config_of_sizes(phantom, monkeypatch, *overrides):
-    """The configuration with volumes of which that of the test is narrower."""
+    """Return the configuration with volumes of which that of the test is narrower."""
     monkeypatch.setattr("armscan.training.phantom_data", lambda **_: split_of_sizes(phantom))
     return compose(overrides)
 

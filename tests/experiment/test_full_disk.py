@@ -17,13 +17,13 @@ FULL = "No space left on device"
 
 @pytest.fixture
 def disk(tmp_path):
-    """A disk of 20 MB."""
+    """Yield a disk of 20 MB."""
     with small_disk(tmp_path / "disk", "20m") as disk:
         yield disk
 
 
 def run_until_full(disk, *words, cwd):
-    """Runs the command, fills the disk after its first epoch; returns its exit code and what it has printed."""
+    """Run the command, fill the disk after its first epoch; return its exit code and what it has printed."""
     printed, told = cwd / "printed", cwd / "told"
     with printed.open("w") as output, told.open("w") as errors:
         process = subprocess.Popen([sys.executable, *COMMAND, *words], cwd=cwd, stdout=output, stderr=errors)

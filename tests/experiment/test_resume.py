@@ -50,7 +50,7 @@ SLOWLY = ["-c", SLOWLY_WRITTEN]
 
 
 def killed(moment, *arguments, cwd, program=COMMAND):
-    """Starts the command and kills it as soon as `moment` has come, given what it has printed."""
+    """Start the command and kill it as soon as `moment` has come, given what it has printed."""
     with (cwd / "printed").open("w") as printed:
         process = subprocess.Popen(
             [sys.executable, *program, *arguments], cwd=cwd, stdout=printed, stderr=subprocess.STDOUT
@@ -84,13 +84,13 @@ def named_tensors(tree, name=""):
 
 
 def figures(client, run):
-    """The history of every figure but the times, which no two runs share."""
+    """Return the history of every figure but the times, which no two runs share."""
     names = [name for name in run.data.metrics if not name.startswith(TIMES)]
     return {name: [(p.step, p.value) for p in client.get_metric_history(run.info.run_id, name)] for name in names}
 
 
 def assert_ended_alike(cwd):
-    """Checks that the two runs of a store have the same figures, none twice, and the same weights bit for bit."""
+    """Check that the two runs of a store have the same figures, none twice, and the same weights bit for bit."""
     client, runs = runs_in(cwd)
     assert [run.info.status for run in runs] == ["FINISHED"] * 2
     first, second = (figures(client, run) for run in runs)
@@ -135,7 +135,7 @@ def test_run_killed_again_and_again_ends_as_if_it_had_not_been(tmp_path, argumen
     drawn = random.Random(7)
 
     def soon_after(begun):
-        """A moment up to half a second after something was printed."""
+        """Return a moment up to half a second after something was printed."""
         due_s = []
 
         def moment(printed):
@@ -263,7 +263,7 @@ def test_killed_job_of_a_multirun_is_resumed_by_its_own_id(tmp_path):
 
 @pytest.fixture
 def cut_off(tmp_path, database):
-    """A run that was cut off before anything was learned; returns its client, id and folder."""
+    """Return a run that was cut off before anything was learned; return its client, id and folder."""
     client, experiment_id = open_store(
         database, experiment="armscan", artifacts=str(tmp_path / "mlartifacts"), wait_s=60.0
     )

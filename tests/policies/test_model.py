@@ -60,7 +60,7 @@ def learner_of(algorithm, made_of, phantom):
 
 @pytest.fixture(scope="module")
 def made(phantom, tmp_path_factory):
-    """A model of every learner, observations, and how the learner acts on them, by what it is made of."""
+    """Return a model of every learner, observations, and how the learner acts on them, by what it is made of."""
     everything = {}
     for algorithm, made_of in VARIANTS:
         folder = tmp_path_factory.mktemp(f"{algorithm}-{made_of}")

@@ -37,7 +37,7 @@ class Runs:
         return [each.info.run_id for each in self.all if each.data.tags["choice.agent"] == agent]
 
     def made(self, name="made", parent=None, **tags):
-        """Makes a run of nothing but tags."""
+        """Make a run of nothing but tags."""
         made = self.client.create_run(
             "1", run_name=name, tags=tags | ({"mlflow.parentRunId": parent} if parent else {})
         )
@@ -62,14 +62,14 @@ def runs(tmp_path_factory):
 
 @pytest.fixture
 def answer(armscan, runs, monkeypatch):
-    """Runs `armscan report` in an empty folder; returns its exit code and what it printed."""
+    """Run `armscan report` in an empty folder; return its exit code and what it printed."""
     monkeypatch.setenv("MLFLOW_TRACKING_URI", runs.uri)
     return partial(armscan, "report")
 
 
 @pytest.fixture
 def make_training():
-    """Makes a training that nobody has run."""
+    """Make a training that nobody has run."""
 
     def make(seed=0, *, params=None, choices=None, steps=(100, 200), values=(0.0, 1.0), mean_steps=3, **changes):
         series = Series(np.array(steps, float), np.array(steps, float) / 50, np.array(values, float))

@@ -1,4 +1,4 @@
-"""What a comparison says of groups that nobody has trained: how many, of what, judged on which volumes."""
+"""Comparisons of made-up groups: numbers, settings and volumes."""
 
 import csv
 from dataclasses import replace
@@ -14,7 +14,7 @@ from tests.reports.conftest import make_episode
 
 @pytest.fixture
 def written(tmp_path):
-    """Writes the report of trainings; returns the page, and a file's rows by its name."""
+    """Write the report of trainings; return the page, and a file's rows by its name."""
 
     def write(*trainings):
         file = write_comparison(*group_trainings(trainings), "runs", tmp_path)

@@ -1,4 +1,4 @@
-"""Which trainings make up a group, and what it is called."""
+"""Groups of trainings, and their names."""
 
 import pytest
 

@@ -23,7 +23,7 @@ def page(folder):
 
 @pytest.fixture
 def parent(runs):
-    """The parent of all runs, as that of a multirun."""
+    """Yield the parent of all runs, as that of a multirun."""
     parent = runs.made("multirun agent=sac,ppo seed=0,1,2")
     for each in runs.all:
         runs.client.set_tag(each.info.run_id, "mlflow.parentRunId", parent)
@@ -35,7 +35,7 @@ def parent(runs):
 
 @pytest.fixture
 def artifacts(runs):
-    """The folder of a run's artifacts, which is put back afterwards."""
+    """Yield the folder of a run's artifacts, which is put back afterwards."""
     (run_id, *_) = runs.ids("sac")
     folder = runs.folder / "mlartifacts" / run_id / "artifacts"
     kept = runs.folder / "kept"

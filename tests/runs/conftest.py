@@ -28,7 +28,7 @@ def store(tmp_path, database):
 
 @pytest.fixture
 def make_run(store, tmp_path):
-    """Makes a run that has ended, as `armscan.run` leaves it; returns its id."""
+    """Make a run that has ended, as `armscan.run` leaves it; return its id."""
 
     def make(
         name="tiny",
@@ -70,7 +70,7 @@ def make_run(store, tmp_path):
 
 @pytest.fixture
 def locked():
-    """Has another process hold a lock until the test ends."""
+    """Have another process hold a lock until the test ends."""
     with contextlib.ExitStack() as stack:
 
         def lock(file):
@@ -85,14 +85,14 @@ def locked():
 
 @pytest.fixture
 def answer(armscan, monkeypatch):
-    """Runs `armscan runs` in this process, in the folder of the store; returns its exit code and what it printed."""
+    """Run `armscan runs` in this process, in the folder of the store; return its exit code and what it printed."""
     monkeypatch.setenv("COLUMNS", "80")
     return partial(armscan, "runs")
 
 
 @pytest.fixture
 def snapshot(tmp_path):
-    """Returns every file of the test's folder with its contents, but for the database's own."""
+    """Return every file of the test's folder with its contents, but for the database's own."""
 
     def look():
         files = (file for file in tmp_path.rglob("*") if not file.name.startswith("mlruns.db"))

@@ -16,7 +16,7 @@ DAY_S = 86400.0
 
 @pytest.fixture
 def aged(tmp_path):
-    """Has a run have been started days ago, and have taken seconds."""
+    """Date a run days back, and let it have taken seconds."""
 
     def change(run_id, *, days=0.0, took_s=60.0):
         start_ms = round((time.time() - days * DAY_S) * 1000)
@@ -30,7 +30,7 @@ def aged(tmp_path):
 
 @pytest.fixture
 def listed(answer):
-    """Returns the names of the runs that a list has, in its order."""
+    """Return the names of the runs that a list has, in its order."""
 
     def names(*words):
         code, printed, errors = answer("list", "--format=json", *words)
@@ -46,7 +46,7 @@ def judged(success_rate, mean_steps):
 
 @pytest.fixture
 def three(make_run, aged):
-    """Runs of other agents, ages and figures; the last was never judged."""
+    """Return runs of other agents, ages and figures; the last was never judged."""
     tags = [{"choice.agent": agent, "choice.obs": obs} for agent, obs in (("sac", "slice"), ("ppo", "cluster"))]
     return [
         aged(make_run("a", tags=tags[0], figures=judged(0.5, 9.0)), days=1, took_s=30),
@@ -90,7 +90,7 @@ def test_list_has_what_is_asked_for_in_its_order(three, listed):
 
 @pytest.fixture
 def family(store, make_run, aged):
-    """A multirun of two jobs, of which one was evaluated; and a run beside it."""
+    """Return a multirun of two jobs, of which one was evaluated; and a run beside it."""
     client, experiment_id = store
     parent_id = client.create_run(experiment_id, name="multirun", tags={}).info.run_id
     client.set_terminated(parent_id)

@@ -1,4 +1,4 @@
-"""What is told of a registered policy: the latest figures there are, or that a file with figures is damaged."""
+"""Descriptions of registered policies: the latest figures, or a note that a file is damaged."""
 
 import json
 
@@ -17,7 +17,7 @@ BY_COMMAND = EvaluationReport({"test volumes": evaluation_of(6)}, has_total=Fals
 
 @pytest.fixture
 def keep(tmp_path, database):
-    """Tracks a run with a file, of a run that it evaluates or of none; returns its id."""
+    """Track a run with a file, of a run that it evaluates or of none; return its id."""
     store, experiment_id = open_store(database, experiment="test", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
 
     def kept(name, text, of=None):

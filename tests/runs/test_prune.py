@@ -1,4 +1,4 @@
-"""What prune removes, and above all what it does not: each rule on a run that would be removed without it."""
+"""Rules of prune, each on a run that would be removed without it."""
 
 import errno
 import json
@@ -14,7 +14,7 @@ from armscan.utils.files import LOCK_FILE
 
 
 def ids_in(folder, stage="active"):
-    """The ids of the runs of a database, of those that are deleted with another stage."""
+    """Return the ids of the runs of a database, of those that are deleted with another stage."""
     with sqlite3.connect(folder / "mlruns.db") as database:
         found = database.execute("select run_uuid from runs where lifecycle_stage = ?", (stage,))
         return {run_id for (run_id,) in found}
@@ -57,12 +57,12 @@ def test_folders_leave_the_store(answer, make_run, tmp_path):
 
 
 def kept_files():
-    """The checkpoints and configurations below the folder that the command is in, with their contents."""
+    """Return the checkpoints and configurations below the folder that the command is in, with their contents."""
     return {file: file.read_bytes() for file in Path.cwd().rglob("*") if file.suffix in (".pt", ".yaml")}
 
 
 def assert_stays(answer, run_id, reason, what="folders"):
-    """Checks that a run is left with a reason, in the dry run and where it counts, and that this is no failure."""
+    """Check that a run is left with a reason, in the dry run and where it counts, and that this is no failure."""
     planned = answer("prune", what)[1]
     kept = kept_files()
     assert f"{run_id[:8]} stays: {reason}" in planned, planned

@@ -24,7 +24,7 @@ METRIC, STEP = "validation/mean_steps", 208
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory, data_folder):
-    """A folder with volumes, which the configuration names from there, and with a run that has finished."""
+    """Return a folder with volumes, which the configuration names from there, and with a run that has finished."""
     folder = tmp_path_factory.mktemp("made")
     shutil.copytree(data_folder, folder / "volumes")
     words = [word for word in SMALL if not word.startswith("data.")]
@@ -36,7 +36,7 @@ def made(tmp_path_factory, data_folder):
 
 @pytest.fixture
 def answer(made, tmp_path, monkeypatch, capsys):
-    """Runs the command in this process, elsewhere; returns its exit code and what it printed."""
+    """Run the command in this process, elsewhere; return its exit code and what it printed."""
     folder = made[0]
 
     def command(*words):
@@ -54,7 +54,7 @@ def answer(made, tmp_path, monkeypatch, capsys):
 
 @contextlib.contextmanager
 def written_otherwise(file, contents):
-    """A file says something else for a while."""
+    """Replace the text of a file within a block."""
     before = file.read_bytes()
     file.write_bytes(contents)
     try:
@@ -65,7 +65,7 @@ def written_otherwise(file, contents):
 
 @contextlib.contextmanager
 def tagged(client, run, name, value):
-    """A tag of a run is another for a while."""
+    """Replace a tag of a run within a block."""
     before = run.data.tags.get(name)
     client.set_tag(run.info.run_id, name, value)
     try:

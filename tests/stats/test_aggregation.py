@@ -1,4 +1,4 @@
-"""What seeds say together: against rliable, and what holds whatever the scores are."""
+"""Aggregation over seeds: against rliable, and properties for any scores."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_probability_of_improvement_is_that_of_rliable(groups):
 
 
 def stratified(scores, statistic, reps=300):
-    """The interval of rliable, which draws the seeds of each volume by itself."""
+    """Return the interval of rliable, which draws the seeds of each volume by itself."""
     _, ends = get_interval_estimates({"it": scores}, lambda *drawn: np.array([statistic(*drawn)]), reps=reps)
     return ends["it"][:, 0]
 

@@ -44,14 +44,14 @@ WIDER = """
 
 
 def programs() -> tuple[str, str] | None:
-    """Returns the paths of the browser and its driver; None where one is not installed."""
+    """Return the paths of the browser and its driver; None where one is not installed."""
     browser, driver = (shutil.which(name) for name in PROGRAMS)
     return (browser, driver) if browser and driver else None
 
 
 @contextmanager
 def chromium(profile: Path, *, width: int = 1400, height: int = 900) -> Iterator[Browser]:
-    """A browser as long as it lasts.
+    """Open a browser; close it at the end of the block.
 
     Args:
         profile: folder of its own.
@@ -94,20 +94,20 @@ class Browser:
         self._wait = WebDriverWait(driver, HANG_S, poll_frequency=0.1, ignored_exceptions=passing)
 
     def before_each_page(self, program: str) -> None:
-        """Runs JavaScript before those of a page."""
+        """Run JavaScript before those of a page."""
         self.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": program})
 
     def open(self, address: str) -> None:
-        """Goes to an address."""
+        """Go to an address."""
         self.driver.get(address)
 
     @property
     def address(self) -> str:
-        """Of the page."""
+        """The address of the page."""
         return self.driver.current_url
 
     def find(self, css: str, *, text: str | None = None) -> WebElement:
-        """Returns an element on the page, of several the innermost, as soon as it is there.
+        """Return an element on the page, of several the innermost, as soon as it is there.
 
         Args:
             css: what it is.
@@ -118,11 +118,11 @@ class Browser:
         return element
 
     def has(self, css: str, *, text: str) -> bool:
-        """Whether an element is on the page now; see `find`."""
+        """Return whether an element is on the page now; see `find`."""
         return self._seen(css, text) is not None
 
     def click(self, css: str, *, text: str | None = None) -> None:
-        """Clicks on an element, as soon as nothing is in its way."""
+        """Click on an element, as soon as nothing is in its way."""
 
         def clicked(_: Chrome) -> bool:
             element = self.find(css, text=text)
@@ -133,11 +133,11 @@ class Browser:
         self._wait.until(clicked)
 
     def type(self, css: str, text: str) -> None:
-        """Writes into an element."""
+        """Write into an element."""
         self.find(css).send_keys(text)
 
     def count(self, css: str, at_least: int) -> int:
-        """Waits until there are as many elements; returns how many there are."""
+        """Wait until there are as many elements; return how many there are."""
 
         def counted(driver: Chrome) -> int:
             n = len(driver.find_elements(By.CSS_SELECTOR, css))
@@ -146,7 +146,7 @@ class Browser:
         return int(self._wait.until(counted, f"fewer than {at_least} of {css}"))
 
     def picture(self, css: str) -> int:
-        """Waits until a picture has been read, scrolls to it, and returns its width in pixels."""
+        """Wait until a picture has been read, scroll to it, and return its width in pixels."""
 
         def read(driver: Chrome) -> int:
             image = driver.find_element(By.CSS_SELECTOR, css)
@@ -156,7 +156,7 @@ class Browser:
         return int(self._wait.until(read, f"no picture {css}"))
 
     def wider_than_page(self, width: int) -> list[str]:
-        """Returns what does not fit a page that is as wide as said, by its tag and class; charts may be scrolled."""
+        """Return what does not fit a page that is as wide as said, by its tag and class; charts may be scrolled."""
         size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         found = self.driver.execute_async_script(WIDER)
@@ -164,7 +164,7 @@ class Browser:
         return found
 
     def keep(self, file: Path) -> None:
-        """Keeps what is seen."""
+        """Keep what is seen."""
         file.parent.mkdir(parents=True, exist_ok=True)
         assert self.driver.save_screenshot(str(file))
 

@@ -38,7 +38,7 @@ class WallClock:
         }
 
     def set(self, hours: int) -> None:
-        """Sets it to so many hours after the time that it is."""
+        """Set it to so many hours after the time that it is."""
         written = self._file.with_suffix(".new")
         written.write_text(f"{hours:+d}h\n")
         written.replace(self._file)

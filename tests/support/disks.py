@@ -24,7 +24,7 @@ class Disk:
         self.folder = folder
 
     def fill(self) -> None:
-        """Takes all that is left of it, but for what is freed later."""
+        """Take all that is left of it, but for what is freed later."""
         with (self.folder / FILLER).open("ab", buffering=0) as file:
             for n_bytes in (2**16, 1):
                 try:
@@ -34,17 +34,17 @@ class Disk:
                     continue
 
     def empty(self) -> None:
-        """Gives back what `fill` has taken."""
+        """Give back what `fill` has taken."""
         (self.folder / FILLER).unlink()
 
     def enlarge(self, size: str) -> None:
-        """Makes it larger; `size` is as `mount` takes it, such as 16m."""
+        """Make it larger; `size` is as `mount` takes it, such as 16m."""
         subprocess.run(["mount", "-o", f"remount,size={size}", str(self.folder)], check=True)
 
 
 @contextmanager
 def small_disk(folder: Path, size: str) -> Iterator[Disk]:
-    """A disk as long as it lasts; the test is skipped where none can be mounted.
+    """Mount a disk for the block; skip the test if none can be mounted.
 
     Args:
         folder: where it is mounted; made where it is not there.

@@ -23,7 +23,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Moment:
-    """When a process kills itself.
+    """The moment at which a process kills itself.
 
     Args:
         place: a function or method, such as `torch.optim:Adam.step`.
@@ -37,7 +37,7 @@ class Moment:
     delay_s: float | None = None
 
     def wait(self) -> None:
-        """Has this process kill itself then."""
+        """Have this process kill itself then."""
         module, _, path = self.place.partition(":")
         *owners, name = path.split(".")
         owner: Any = functools.reduce(getattr, owners, importlib.import_module(module))
@@ -64,7 +64,7 @@ def _kill() -> None:
 
 
 class Commands:
-    """What runs commands.
+    """Runner of commands.
 
     Args:
         process: this module, as a program.
@@ -74,7 +74,7 @@ class Commands:
         self._process = process
 
     def run(self, words: Sequence[str], moment: Moment | None = None) -> int:
-        """Runs a command; returns its exit code, minus the signal that killed it."""
+        """Run a command; return its exit code, minus the signal that killed it."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         order = {"words": list(words), "moment": asdict(moment) if moment else None}
@@ -85,7 +85,7 @@ class Commands:
 
 @contextmanager
 def commands(folder: Path) -> Iterator[Commands]:
-    """Runs commands in a folder, as long as it lasts."""
+    """Yield a runner of commands in a folder; end its process at the end of the block."""
     program = [sys.executable, "-m", "tests.support.killed_at"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])}
     with subprocess.Popen(

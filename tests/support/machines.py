@@ -30,13 +30,13 @@ class Machine:
     address: str
 
     def command(self, *words: str) -> list[str]:
-        """Returns the words that have a command run there."""
+        """Return the words that have a command run there."""
         renamed = 'hostname "$0" && exec "$@"'
         return ["ip", "netns", "exec", self.name, "unshare", "--uts", "sh", "-c", renamed, self.name, *words]
 
     @contextmanager
     def entered(self) -> Iterator[None]:
-        """What reaches the network of the machine: this thread, and the processes that it starts."""
+        """Enter the network of the machine, with this thread and the processes that it starts."""
         with Path("/proc/thread-self/ns/net").open() as before, (NAMESPACES / self.name).open() as there:
             _enter(there.fileno())
             try:
@@ -45,17 +45,17 @@ class Machine:
                 _enter(before.fileno())
 
     def processes(self) -> list[int]:
-        """Returns the ids of the processes that are there, but for this one."""
+        """Return the ids of the processes that are there, but for this one."""
         told = subprocess.run(["ip", "netns", "pids", self.name], capture_output=True, text=True, check=True).stdout
         return [int(pid) for pid in told.split() if int(pid) != os.getpid()]
 
     def crash(self) -> None:
-        """Kills everything there at once."""
+        """Kill everything there at once."""
         kill(self.processes())
 
 
 def why_not() -> str | None:
-    """Returns why no machines can be made here, None where they can."""
+    """Return why no machines can be made here, None where they can."""
     for program, package in (("ip", "iproute2"), ("unshare", "util-linux"), ("hostname", "hostname")):
         if shutil.which(program) is None:
             return f"{program} is not installed: apt-get install {package}"
@@ -67,7 +67,7 @@ def why_not() -> str | None:
 
 @contextmanager
 def two_machines() -> Iterator[tuple[Machine, Machine]]:
-    """Two machines as long as it lasts; whatever still runs there is killed then."""
+    """Make two machines; kill what still runs there at the end of the block."""
     machines = tuple(Machine(f"armscan-{os.getpid()}-{number}", f"10.0.0.{number}") for number in (1, 2))
     with ExitStack() as undone:
         for machine in machines:

@@ -20,7 +20,7 @@ LOOPBACK, STOP_S = "127.0.0.1", 10.0
 
 @contextmanager
 def mlflow_server(folder: Path, backend: str, host: str = LOOPBACK) -> Iterator[MlflowServer]:
-    """A server as long as it lasts."""
+    """Start a server; stop it at the end of the block."""
     server = MlflowServer(folder, backend, host)
     server.start()
     try:
@@ -59,7 +59,7 @@ class MlflowServer:
         return f"http://{self._host}:{self.port}"
 
     def start(self) -> None:
-        """Starts it, and waits until it answers."""
+        """Start it, and wait until it answers."""
         self._folder.mkdir(parents=True, exist_ok=True)
         words = ["server", "--host", self._host, "--port", str(self.port), "--workers", "1"]
         words += ["--artifacts-destination", str(self.artifacts)]
@@ -77,7 +77,7 @@ class MlflowServer:
         wait_until(self._answers, process=self._process, log=self.log.read_text, poll_s=0.1)
 
     def stop(self) -> None:
-        """Stops it, and waits until its processes are gone."""
+        """Stop it, and wait until its processes are gone."""
         if self._process is None:
             return
         os.killpg(self._process.pid, signal.SIGTERM)

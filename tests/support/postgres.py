@@ -24,7 +24,7 @@ LOOPBACK = "127.0.0.1"
 
 
 def programs() -> Path | None:
-    """Returns the folder with PostgreSQL's programs, Debian's newest before those on the path; None where none are."""
+    """Return the folder with PostgreSQL's programs, Debian's newest before those on the path; None where none are."""
     of_debian = sorted(DEBIAN.glob("*/bin"), key=lambda folder: float(folder.parent.name), reverse=True)
     on_path = [Path(found).parent] if (found := shutil.which("initdb")) else []
     return next((each for each in (*of_debian, *on_path) if all((each / name).exists() for name in PROGRAMS)), None)
@@ -32,7 +32,7 @@ def programs() -> Path | None:
 
 @contextmanager
 def postgres_server(host: str = LOOPBACK, **settings: str) -> Iterator[PostgresServer]:
-    """A server as long as it lasts, with these settings of PostgreSQL beside its own.
+    """Start a server with these settings beside PostgreSQL's own; stop it at the end of the block.
 
     This process and those that it starts have the password from the file that PGPASSFILE names.
     """
@@ -88,7 +88,7 @@ class PostgresServer:
             allowed.write("host all all samenet scram-sha-256\n")
 
     def start(self) -> None:
-        """Starts it, and waits until it answers."""
+        """Start it, and wait until it answers."""
         # Without fsync: it is only the server that is killed here, and never the machine.
         own = {"port": self.port, "listen_addresses": self._host, "unix_socket_directories": "", "fsync": "off"}
         words = [word for key, value in (self._settings | own).items() for word in ("-c", f"{key}={value}")]
@@ -96,7 +96,7 @@ class PostgresServer:
         wait_until(self._answers, process=self._process, log=self._log.read_text)
 
     def stop(self, *, at_once: bool = False) -> None:
-        """Stops it, with all connections.
+        """Stop it, with all connections.
 
         Args:
             at_once: as if the power failed, which the next start has to mend.
@@ -107,19 +107,19 @@ class PostgresServer:
         self._process = None
 
     def restart(self, away_s: float = 0.0, *, at_once: bool = False) -> None:
-        """Stops it, and starts it again after a while."""
+        """Stop it, and start it again after a while."""
         self.stop(at_once=at_once)
         time.sleep(away_s)
         self.start()
 
     def make_database(self) -> str:
-        """Makes an empty database, and returns its address."""
+        """Make an empty database, and return its address."""
         name = f"study_{next(self._numbers)}"
         self.execute(f"CREATE DATABASE {name}")
         return self.uri(name)
 
     def execute(self, statement: str) -> list[tuple[Any, ...]]:
-        """Executes a statement in the database that is always there; returns its rows."""
+        """Execute a statement in the database that is always there; return its rows."""
         import psycopg
 
         with psycopg.connect(self.uri("postgres"), password=PASSWORD, autocommit=True) as connection:
@@ -127,7 +127,7 @@ class PostgresServer:
             return cursor.fetchall() if cursor.description else []
 
     def uri(self, database: str) -> str:
-        """Returns the address of a database, without the password."""
+        """Return the address of a database, without the password."""
         return f"postgresql://{USER}@{self._host}:{self.port}/{database}"
 
     def _answers(self) -> bool:
@@ -152,6 +152,6 @@ class PostgresServer:
 
 
 def _account() -> str:
-    """Returns who a server is run as where this process is root."""
+    """Return who a server is run as where this process is root."""
     known = {each.pw_name for each in pwd.getpwall()}
     return "postgres" if "postgres" in known else "nobody"

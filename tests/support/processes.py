@@ -1,4 +1,4 @@
-"""What runs on this machine, for tests of what must not be left running, and to end what they started by others."""
+"""Processes of this machine: find those that tests have left, and end them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.support.waiting import wait_until
 
 
 def processes_in(folder: Path) -> list[int]:
-    """The processes whose working folder this is."""
+    """Return the processes whose working folder this is."""
     listing = subprocess.run(["ps", "-eo", "pid="], capture_output=True, text=True, check=True).stdout.split()
     found = []
     for pid in listing:
@@ -25,7 +25,7 @@ def processes_in(folder: Path) -> list[int]:
 
 
 def with_variable(name: str, value: str) -> list[int]:
-    """Returns the ids of the processes that were started with a variable in their environment."""
+    """Return the ids of the processes that were started with a variable in their environment."""
     wanted, found = f"{name}={value}".encode(), []
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit() and int(folder.name) != os.getpid():
@@ -40,7 +40,7 @@ def with_variable(name: str, value: str) -> list[int]:
 
 
 def kill(pids: Iterable[int], how: signal.Signals = signal.SIGKILL) -> None:
-    """Sends a signal to those that are still there."""
+    """Send a signal to those that are still there."""
     for pid in pids:
         try:
             os.kill(pid, how)
@@ -49,7 +49,7 @@ def kill(pids: Iterable[int], how: signal.Signals = signal.SIGKILL) -> None:
 
 
 def end_all(found: Callable[[], list[int]]) -> None:
-    """Kills processes until none is found any more.
+    """Kill processes until none is found any more.
 
     Args:
         found: returns their ids.

@@ -27,7 +27,7 @@ HEALTH = {
 
 
 def why_not_here() -> str | None:
-    """Returns why there can be no cluster here, None where there can."""
+    """Return why there can be no cluster here, None where there can."""
     if importlib.util.find_spec("ray") is None:
         return "Ray is not installed: pip install 'armscan[ray]'"
     return why_not()
@@ -50,7 +50,7 @@ class RayCluster:
 
 @contextmanager
 def ray_cluster(environment: Mapping[str, str]) -> Iterator[RayCluster]:
-    """A cluster as long as it lasts.
+    """Start a cluster; stop it at the end of the block.
 
     Args:
         environment: of both machines, beside that of this process.

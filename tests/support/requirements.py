@@ -9,7 +9,7 @@ import pytest
 
 
 def unavailable(reason: str) -> NoReturn:
-    """Skips the test, or fails it where the environment variable CI is true.
+    """Skip the test, or fail it where the environment variable CI is true.
 
     Args:
         reason: what is missing, and how to install it.

@@ -54,14 +54,14 @@ PartitionName=all Nodes=node Default=YES MaxTime=INFINITE State=UP
 
 
 def missing_program() -> str | None:
-    """Returns a program of Slurm that is not installed, None where all are."""
+    """Return a program of Slurm that is not installed, None where all are."""
     # Where Debian has them, the path of a user has not.
     return next((each for each in PROGRAMS if _found(each) is None), None)
 
 
 @contextmanager
 def slurm() -> Iterator[Slurm]:
-    """A Slurm as long as it lasts."""
+    """Start a Slurm; stop it at the end of the block."""
     # Short, because the paths of sockets are limited.
     folder = Path(tempfile.mkdtemp(prefix="armscan-slurm-"))
     # Munge wants everybody to reach its socket.
@@ -88,7 +88,7 @@ class Slurm:
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def start(self) -> None:
-        """Starts its daemons, and waits until the node takes jobs."""
+        """Start its daemons, and wait until the node takes jobs."""
         folder = self._folder
         key = folder / "munge.key"
         key.write_bytes(secrets.token_bytes(1024))
@@ -107,7 +107,7 @@ class Slurm:
         self._wait(lambda: "idle" in self.told("sinfo", "--noheader", "--format=%T"))
 
     def stop(self) -> None:
-        """Ends everything that it has started."""
+        """End everything that it has started."""
         if len(self._processes) == len(("munged", "slurmctld", "slurmd")):
             subprocess.run(["scancel", "--user", getpass.getuser()], env=os.environ | self.environment, check=False)
         for process in reversed(self._processes):
@@ -122,17 +122,17 @@ class Slurm:
         end_all(lambda: with_variable(CONF, str(self._conf)))
 
     def told(self, *command: str) -> str:
-        """Returns what a command of Slurm prints."""
+        """Return what a command of Slurm prints."""
         environment = os.environ | self.environment
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
 
     def jobs(self) -> dict[str, str]:
-        """Returns the states of the jobs that are queued or running, by their ids."""
+        """Return the states of the jobs that are queued or running, by their ids."""
         lines = self.told("squeue", "--noheader", "--array", "--format=%i %T").splitlines()
         return dict(line.split() for line in lines)
 
     def log(self) -> str:
-        """Returns what its daemons have said."""
+        """Return what its daemons have said."""
         return "\n".join(file.read_text(errors="replace") for file in sorted(self._folder.glob("*.log")))
 
     def _started(self, program: str, *words: str) -> None:

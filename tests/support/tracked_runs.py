@@ -45,7 +45,7 @@ class GuesserOfAnything(Guesser):
 
 
 def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json", "best.pt"), has_tag=True, few=FEW):
-    """Tracks a run of an agent that has learned nothing, started in this folder; returns its id."""
+    """Track a run of an agent that has learned nothing, started in this folder; return its id."""
     config = compose([*few, *overrides])
     OmegaConf.resolve(config)
     if agent:
@@ -70,11 +70,11 @@ def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json",
 
 
 def store_of(folder):
-    """The store in a folder."""
+    """Return the store in a folder."""
     return MlflowClient(f"sqlite:///{folder}/mlruns.db")
 
 
 def written(folder, pattern="*"):
-    """Returns the contents of the only evaluation in a folder."""
+    """Return the contents of the only evaluation in a folder."""
     (file,) = (folder / "evaluations").glob(f"{pattern}.json")
     return json.loads(file.read_text())

@@ -17,7 +17,7 @@ def wait_until(
     log: Callable[[], object] = str,
     poll_s: float = 0.05,
 ) -> None:
-    """Waits until a condition is true.
+    """Wait until a condition is true.
 
     Args:
         is_seen: returns whether it is true now.

@@ -22,7 +22,7 @@ def storage_uri(request, tmp_path):
 
 @pytest.fixture
 def make_scheduler(storage_uri):
-    """Opens the same study again and again, as workers do."""
+    """Open the same study again and again, as workers do."""
 
     def make(**limits):
         storage = open_storage(storage_uri)
@@ -34,7 +34,7 @@ def make_scheduler(storage_uri):
 
 
 def fail(scheduler, trial, reason):
-    """Ends a trial as failed, as its worker does with its next claim."""
+    """End a trial as failed, as its worker does with its next claim."""
     outcome = TrialOutcome(trial, TrialState.FAIL, PendingWrites(), attributes={FAILURE: reason})
     scheduler.storage.exclusive(lambda: scheduler._tell(outcome, is_repeated=False))
     assert outcome.is_told

@@ -35,7 +35,7 @@ def uri(tmp_path, monkeypatch):
 
 @pytest.fixture
 def run_id(uri, tmp_path):
-    """Of a run in the folder `run` that was killed while it trained."""
+    """Return the ID of a run in the folder `run` that was killed while it trained."""
     command = [sys.executable, "-c", KILLED, uri, str(tmp_path)]
     run_id = subprocess.run(command, capture_output=True, text=True).stdout.strip()
     assert notes().keys() == {run_id}

@@ -1,4 +1,4 @@
-"""What a run was computed with."""
+"""Records of packages, code and machine of a run."""
 
 import json
 import platform

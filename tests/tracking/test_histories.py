@@ -13,7 +13,7 @@ from tests.support.mlflow_server import mlflow_server
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A store of five runs: its address, and the names of the metrics of each run."""
+    """Return a store of five runs: its address, and the names of the metrics of each run."""
     folder = tmp_path_factory.mktemp("histories")
     uri = f"sqlite:///{folder}/runs.db"
     client = MlflowClient(uri)

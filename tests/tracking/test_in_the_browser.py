@@ -1,4 +1,4 @@
-"""What MLflow's UI shows of runs without a hand: columns, best figures, pruned trials, datasets."""
+"""Runs in MLflow's UI: columns, best figures, pruned trials, datasets."""
 
 import json
 
@@ -26,7 +26,7 @@ def tracked(store, tmp_path):
 
 
 def run_of(tracked, store):
-    """Ends a run; returns it as the store has it."""
+    """End a run; return it as the store has it."""
     assert tracked.end("FINISHED")
     return store()[0].get_run(tracked.run_id)
 

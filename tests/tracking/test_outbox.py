@@ -1,4 +1,4 @@
-"""What is to be tracked of a run, in a file of its folder."""
+"""Outboxes: files in the folders of runs that hold what is to be tracked."""
 
 import json
 import multiprocessing

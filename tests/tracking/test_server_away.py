@@ -28,7 +28,7 @@ N_EPOCHS = 30
 
 @pytest.fixture(scope="module")
 def server(postgres, tmp_path_factory):
-    """A server that tests may stop; each starts it again."""
+    """Yield a server that tests may stop; each starts it again."""
     with mlflow_server(tmp_path_factory.mktemp("server"), postgres.make_database()) as server:
         yield server
 
@@ -225,7 +225,7 @@ def test_figures_are_kept_where_files_cannot_be_because_the_disk_is_full(tmp_pat
 
 @pytest.fixture
 def artifacts_disk(tmp_path):
-    """A disk for the server's artifacts, of 256 KiB."""
+    """Yield a disk for the server's artifacts, of 256 KiB."""
     with small_disk(tmp_path / "server" / "artifacts", "256k") as disk:
         yield disk
 

@@ -51,7 +51,7 @@ def store(tmp_path, database):
 
 
 def eventually(look, is_there):
-    """Returns what is seen as soon as it is what it must become."""
+    """Return what is seen as soon as it is what it must become."""
     wait_until(lambda: is_there(look()), log=look)
     return look()
 

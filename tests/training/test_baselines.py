@@ -15,7 +15,7 @@ def volumes():
 
 @pytest.fixture
 def played(monkeypatch, tmp_path):
-    """The agents whose episodes are played, and not taken from an empty cache."""
+    """Return the agents whose episodes are played, and not taken from an empty cache."""
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path))
     agents, play = [], baselines.evaluate
 

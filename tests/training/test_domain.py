@@ -1,4 +1,4 @@
-"""What an agent was trained on, and what is different elsewhere."""
+"""The record of an agent's training volumes, compared with other volumes."""
 
 import pytest
 

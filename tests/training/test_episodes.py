@@ -52,7 +52,7 @@ CASES = {
 
 
 def made(algorithm, env_factory, volumes, compute=None):
-    """Makes an agent, and lets it learn a little if it does."""
+    """Make an agent, and let it learn a little if it does."""
     setup = AgentSetup(
         make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
         observation_space=env_factory.make_env(volumes).observation_space,

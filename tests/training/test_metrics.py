@@ -1,4 +1,4 @@
-"""What episodes add up to, with intervals."""
+"""Metrics of episodes, with intervals."""
 
 import dataclasses
 

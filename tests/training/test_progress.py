@@ -9,7 +9,7 @@ from armscan.training.progress import ProgressBar
 
 @pytest.fixture
 def narrow(monkeypatch):
-    """A terminal of 80 columns, which keeps what is printed."""
+    """Return a terminal of 80 columns, which keeps what is printed."""
     console = Console(width=80, force_terminal=True, record=True)
     monkeypatch.setattr("rich._console", console)
     return console

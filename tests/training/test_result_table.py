@@ -36,7 +36,7 @@ def made_episodes(seed, n=24, n_volumes=4):
 
 
 def recomputed(episodes):
-    """The figures of episodes by numpy alone."""
+    """Return the figures of episodes by numpy alone."""
 
     def column(name):
         return np.array([getattr(episode, name) for episode in episodes], float)

@@ -1,4 +1,4 @@
-"""Which volumes are trained on, which choose the checkpoint, and which judge."""
+"""Training, validation and test volumes."""
 
 import json
 

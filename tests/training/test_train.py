@@ -168,7 +168,7 @@ class Killed(BaseException):
 
 
 def cut_off(folder, monkeypatch, n_writes):
-    """Trains until so many checkpoints were written, and is killed then."""
+    """Train until so many checkpoints were written, then kill the process."""
     save, written = checkpointing.save_checkpoint, []
 
     def save_or_die(*arguments):
@@ -186,7 +186,7 @@ def cut_off(folder, monkeypatch, n_writes):
 
 
 def gone_on(folder):
-    """Goes on with a training; returns its callback and its result."""
+    """Go on with a training; return its callback and its result."""
     learner, recorder = ScriptedLearner(), Recorder()
     earlier = resume_from_checkpoint(learner, folder, PROVENANCE)
     script = iter(SCRIPT[len(earlier) :])

@@ -19,7 +19,7 @@ PATHS = ["../{}", "..%2f{}", "%2e%2e/{}", "a/../../{}", "/{}", "..\\{}", "{}%00"
 
 @pytest.fixture(scope="module")
 def dashboard(tmp_path_factory):
-    """A dashboard, with a file beside its artifacts; returns its address, the storage and the folder."""
+    """Return a dashboard, with a file beside its artifacts; return its address, the storage and the folder."""
     folder = tmp_path_factory.mktemp("dashboard")
     storage = open_storage(str(folder / "optuna.journal"))
     study = optuna.create_study(study_name="theirs", storage=storage.optuna)
@@ -31,7 +31,7 @@ def dashboard(tmp_path_factory):
 
 
 def answer_to(address, method, path):
-    """Asks for a path as it is written, where other clients would remove the dots; returns status and body."""
+    """Ask for a path as it is written, where other clients would remove the dots; return status and body."""
     connection = http.client.HTTPConnection(HOST, urlsplit(address).port)
     connection.request(method, path, headers={"Content-Type": "application/json"})
     answer = connection.getresponse()

@@ -1,4 +1,4 @@
-"""What a person sees of armscan's trials in Optuna's dashboard."""
+"""The view of armscan's trials in Optuna's dashboard."""
 
 import json
 import urllib.request
@@ -30,7 +30,7 @@ class Store:
 
 @pytest.fixture
 def dashboard(tmp_path):
-    """Makes a study with such attributes; returns what the dashboard answers of it."""
+    """Make a study with such attributes; return what the dashboard answers of it."""
 
     def made(of_study, of_trial, *, is_running=False):
         storage = open_storage(str(tmp_path / "optuna.journal"))
@@ -95,7 +95,7 @@ def test_studies_of_others_are_shown_as_they_are(dashboard):
 
 
 def fail_trial(storage, tmp_path, trial):
-    """Presses the button that fails a trial; returns how the trial stands then."""
+    """Press the button that fails a trial; return how the trial stands then."""
     port, _ = free_ports()
     address = start_dashboard(storage, tmp_path, port)
     told = urllib.request.Request(

@@ -28,7 +28,7 @@ FOREIGN = [
 
 @pytest.fixture(scope="module")
 def dashboard(tmp_path_factory):
-    """A dashboard with one study; returns its address and the storage."""
+    """Return a dashboard with one study; return its address and the storage."""
     folder = tmp_path_factory.mktemp("dashboard")
     storage = open_storage(str(folder / "optuna.journal"))
     optuna.create_study(study_name="mine", storage=storage.optuna)
@@ -38,7 +38,7 @@ def dashboard(tmp_path_factory):
 
 
 def status_of(address, method, path, headers, body=None):
-    """Sends a request with exactly these headers; returns the status of the answer."""
+    """Send a request with exactly these headers; return the status of the answer."""
     place = urlsplit(address)
     connection = http.client.HTTPConnection(HOST, place.port)
     connection.putrequest(method, path, skip_host=True)

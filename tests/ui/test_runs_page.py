@@ -14,7 +14,7 @@ VIEW = {"key": VIEW_TAG, "value": "{}"}
 
 @pytest.fixture
 def server():
-    """Starts a server that answers searches of experiments and of runs; returns its address."""
+    """Start a server that answers searches of experiments and of runs; return its address."""
     started = []
 
     def start(experiments, runs, status=200):

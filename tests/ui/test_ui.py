@@ -127,7 +127,7 @@ def look():
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory):
-    """A folder with a study and an experiment in the usual places."""
+    """Return a folder with a study and an experiment in the usual places."""
     folder = tmp_path_factory.mktemp("both")
     make_study(str(folder / "optuna.journal"))
     make_experiment(f"sqlite:///{folder}/mlruns.db")
@@ -320,7 +320,7 @@ def test_ui_loads_nothing_that_trains_or_tracks_before_it_has_to():
 
 @pytest.fixture
 def small_study(tmp_path):
-    """A folder in which a person has run a study."""
+    """Return a folder in which a person has run a study."""
     words = [sys.executable, "-m", "armscan.run", *SMALL]
     ended = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr

@@ -35,7 +35,7 @@ values = st.recursive(
 
 
 def refuses(action):
-    """Runs an action; anything but success and the project's own exceptions, in one line, fails the test."""
+    """Run an action; anything but success and the project's own exceptions, in one line, fails the test."""
     try:
         return action()
     except ArmscanError as error:
@@ -45,7 +45,7 @@ def refuses(action):
 
 
 def check_sound(volume):
-    """What is not refused is a volume like any other: every landmark is there, and a plane can be looked at."""
+    """Check that what is not refused is a volume like any other: every landmark is there, and slices can be made."""
     if volume is not None:
         assert {1, 2, 3} <= set(np.unique(volume.labels)) <= {0, 1, 2, 3, 4}
         assert np.isfinite(volume.spacing).all()
@@ -69,7 +69,7 @@ def whole_files(tmp_path_factory):
 
 
 def laid_out(folder, contents, name, damaged):
-    """Writes a file, damaged, with the data file of a .mhd header beside it."""
+    """Write a file, damaged, with the data file of a .mhd header beside it."""
     (folder / "wrist.raw").write_bytes(contents["wrist.raw"])
     (folder / name).write_bytes(damaged)
     return folder / name

@@ -29,7 +29,7 @@ NRRD = (
 
 
 def nifti(n, begin=352.0, magic=b"n+1\0", place=0.0):
-    """Returns the header of a NIfTI file of n x n x n bytes."""
+    """Return the header of a NIfTI file of n x n x n bytes."""
     header = bytearray(352)
     struct.pack_into("<i", header, 0, 348)
     struct.pack_into("<8h", header, 40, 3, n, n, n, 1, 1, 1, 1)
@@ -53,7 +53,7 @@ def nrrd(n, voxels=b"", *, encoding="raw", more=""):
 
 @pytest.fixture
 def refusal(tmp_path, capfd):
-    """Returns the one line in which a file is refused, quickly, with little memory, and with nothing printed beside."""
+    """Return the one line in which a file is refused, quickly, with little memory, and with nothing printed beside."""
 
     def refused(name, contents, beside=()):
         for other, others in {**dict(beside), name: contents}.items():
@@ -150,7 +150,7 @@ def test_voxels_that_cannot_be_checked_are_refused(refusal, name, contents, mess
 
 
 def damaged_manifest(folder, name, text):
-    """Returns the line in which a manifest is refused, and how long that takes."""
+    """Return the line in which a manifest is refused, and how long that takes."""
     (folder / name).write_text(text)
     began = time.process_time()
     with pytest.raises(ManifestError) as caught:

@@ -1,4 +1,4 @@
-"""Which values of a file are which tissue."""
+"""Mapping from the values of a file to tissues."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ TINY_VALUES = {1: 10, 2: 20, 3: 30}
 
 
 def numbered(labels, values, dtype=np.int32):
-    """The labels 1, 2, 3 under other numbers."""
+    """Return the labels 1, 2, 3 under other numbers."""
     stored = np.zeros(labels.shape, dtype)
     for label, value in values.items():
         stored[labels == label] = value

@@ -64,7 +64,7 @@ keep_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixtur
 
 @st.composite
 def volumes(draw):
-    """The tiny volume anywhere in the world, its axes oblique, left- or right-handed."""
+    """Return the tiny volume anywhere in the world, its axes oblique, left- or right-handed."""
     about_z, about_x, about_z_again = draw(turns)
     turn = RigidTransform((about_z, about_x)).matrix @ RigidTransform((about_z_again, 0.0)).matrix
     return replace(TINY, origin=draw(places), direction=turn * draw(st.sampled_from([(1, 1, 1), (1, -1, 1)])))
@@ -72,7 +72,7 @@ def volumes(draw):
 
 @st.composite
 def actions(draw, within=anywhere):
-    """A plane whose origin lies in the tiny volume."""
+    """Return a plane whose origin lies in the tiny volume."""
     place = np.array(draw(st.tuples(within, within))) * TINY.size_mm[:2]
     return ManipulatorAction(draw(st.tuples(angles, angles)), tuple(place.tolist()))
 
@@ -84,7 +84,7 @@ def written(folder, volume=TINY, action=ACTION):
 
 
 def rewritten(folder, change, volume=TINY, action=ACTION):
-    """The file as another program or person may have left it: `change` works on its markup."""
+    """Return the file as another program or person may have left it: `change` works on its markup."""
     path, document = written(folder, volume, action)
     change(document["markups"][0])
     path.write_text(json.dumps(document))
@@ -97,7 +97,7 @@ def assert_same_plane(action, other):
 
 
 def in_ras(markup):
-    """What Slicer writes where it is told to use RAS: the first two coordinates change their sign."""
+    """Return a markup as Slicer writes it in RAS: the first two coordinates change their sign."""
     flip = np.array([-1, -1, 1])
     markup["coordinateSystem"] = "RAS"
     for key in ("center", "normal"):

@@ -51,7 +51,7 @@ def stored(tmp_path_factory):
 
 
 def read_with(folder, name, damaged_name, damaged):
-    """Reads a file of a folder while one of its files has other contents; None where it is refused, in one line."""
+    """Read a file of a folder while one of its files has other contents; None where it is refused, in one line."""
     whole = (folder / damaged_name).read_bytes()
     (folder / damaged_name).write_bytes(damaged)
     try:

@@ -29,7 +29,7 @@ def labels_of(numbers):
 
 
 def world(volume):
-    """The positions of the volume's voxels, shape (n, 3), with their labels."""
+    """Return the positions of the volume's voxels, shape (n, 3), with their labels."""
     indices = np.argwhere(np.ones(volume.shape, bool))
     positions = np.array(volume.origin) + indices * np.array(volume.spacing) @ volume.direction.T
     return positions, volume.labels[tuple(indices.T)]

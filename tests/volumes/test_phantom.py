@@ -28,7 +28,7 @@ def version(request):
 
 
 def ends_of_rows(draw, seed):
-    """Where the distal row ends and the next bone begins, in mm along the arm from the labelled plane."""
+    """Return the end of the distal row and the begin of the next bone, in mm along the arm from the labelled plane."""
     bones = [tube for tube in draw(np.random.default_rng(seed)) if tube.label == 1]
     spans = [(tube.nodes[0, Y], tube.nodes[-1, Y]) for tube in bones]
     return max(high for low, high in spans if low < 0 < high), min(low for low, _ in spans if low > 0)

@@ -13,7 +13,7 @@ PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
 
 @pytest.fixture
 def n_read(monkeypatch, tmp_path):
-    """Counts files that are read, with a cache of its own."""
+    """Count files that are read, with a cache of its own."""
     read, counted = reading.read_stored, []
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(reading, "read_stored", lambda *a, **k: counted.append(a) or read(*a, **k))

@@ -18,7 +18,7 @@ DIRECTIONS = np.array([[0.0, 0.5, 0.0], [0.0, 0.0, -0.7], [0.9, 0.0, 0.0]])
 
 
 def write_segmentation(path, layers, segments, *, without=(), directions=DIRECTIONS, **fields):
-    """Writes voxels over (i, j, k) or (layer, i, j, k) with segments (name, layer, value) as 3D Slicer does."""
+    """Write voxels over (i, j, k) or (layer, i, j, k) with segments (name, layer, value) as 3D Slicer does."""
     is_layered = layers.ndim == 4
     header = {
         "space": "left-posterior-superior",
@@ -38,14 +38,14 @@ def write_segmentation(path, layers, segments, *, without=(), directions=DIRECTI
 
 @pytest.fixture
 def stored(tmp_path, tiny_volume):
-    """The small block as three segments of one layer."""
+    """Return the small block as three segments of one layer."""
     segments = [(name, 0, label) for label, name in enumerate(NAMES, 1)]
     return write_segmentation(tmp_path / "wrist.seg.nrrd", tiny_volume.labels, segments)
 
 
 @pytest.fixture
 def layered(tmp_path, tiny_volume):
-    """The small block with two bones that overlap, one segment a layer, and a muscle around a tendon."""
+    """Return the small block with two bones that overlap, one segment a layer, and a muscle around a tendon."""
     labels = tiny_volume.labels
     first, second, muscle = labels == 1, labels == 1, labels == 2
     first[8:], second[:7] = False, False

@@ -21,7 +21,7 @@ def test_slice_reproduces_every_golden_slice(dataset, golden):
 
 
 def resampled_slice(volume, matrix, offset_mm, shape):
-    """The slice as SimpleITK resamples it, and which pixels are far enough from a tie between two voxels."""
+    """Return the slice as SimpleITK resamples it, and which pixels are far enough from a tie between two voxels."""
     image = SimpleITK.GetImageFromArray(np.ascontiguousarray(volume.labels.transpose(2, 1, 0)))
     image.SetSpacing(volume.spacing)
     plane = SimpleITK.Image([shape[0], 1, shape[1]], SimpleITK.sitkUInt8)
@@ -74,7 +74,7 @@ def test_slice_of_moved_volume_equals_resampling_through_both_maps(volume, rotat
 
 
 def plainly_sliced(volume, action, shape):
-    """The slice by its definition, all pixels at once."""
+    """Return the slice by its definition, all pixels at once."""
     across, depth = np.meshgrid(*(np.arange(n, dtype=float) for n in shape), indexing="ij")
     places, is_inside = [], np.ones(shape, dtype=bool)
     for axis, (n_voxels, spacing) in enumerate(zip(volume.shape, volume.spacing, strict=True)):

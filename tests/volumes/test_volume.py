@@ -1,4 +1,4 @@
-"""What a labelmap volume accepts."""
+"""Arguments of labelmap volumes."""
 
 import numpy as np
 import pytest

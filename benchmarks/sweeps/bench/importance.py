@@ -1,4 +1,4 @@
-"""Which keys of a space matter, and how much: importances and effects, with intervals that draw configurations."""
+"""Compute importances and effects of the keys of a space, with intervals that draw configurations."""
 
 from __future__ import annotations
 

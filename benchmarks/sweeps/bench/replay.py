@@ -25,7 +25,7 @@ MOST_TRIALS_A_TRAINING = 5
 
 @dataclass(frozen=True)
 class Rule:
-    """How a study searches.
+    """Sampler, pruner and budget of a simulated study.
 
     Args:
         sampler: Name of a group `study/sampler`, such as `tpe`.

@@ -1,4 +1,4 @@
-"""How many seeds a comparison of two settings needs, by how much they truly differ."""
+"""Compute how many seeds a comparison of two settings needs, by their true difference."""
 
 from __future__ import annotations
 

@@ -20,12 +20,12 @@ from tests.sweeps.study.test_final_eval import run as run_final
 
 @pytest.fixture
 def answer(armscan):
-    """Runs `armscan report` in a folder of its own; returns its exit code and what it printed."""
+    """Run `armscan report` in a folder of its own; return its exit code and what it printed."""
     return partial(armscan, "report")
 
 
 def searched(folder, objectives, n_trials=6):
-    """Makes a study of trials that have finished, been pruned and failed."""
+    """Make a study of trials that have finished, been pruned and failed."""
     storage = open_storage(str(folder / "optuna.journal"))
     directions = ["minimize"] * len(objectives)
     study = optuna.create_study(study_name="a", storage=storage.optuna, directions=directions)
@@ -114,7 +114,7 @@ def test_report_of_several_objectives_or_of_nothing_yet_can_be_made(answer, tmp_
 
 
 def chart_below(page, heading):
-    """Returns the lines of the chart below a heading, as Plotly is given them."""
+    """Return the lines of the chart below a heading, as Plotly is given them."""
     drawn = page.partition(f"<h2>{heading}")[2]
     lines = drawn.partition("Plotly.newPlot(")[2].partition("[")[2]
     return json.JSONDecoder().raw_decode(f"[{lines}")[0]

@@ -1,4 +1,4 @@
-"""What the trainings that judge say of a configuration."""
+"""Summaries of a configuration by its final trainings."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Which member trains next, from which checkpoint, and with which values: whole studies, simulated without training."""
+"""Order, checkpoints and values of the members of a population: whole studies, simulated without training."""
 
 import random
 from itertools import pairwise
@@ -63,7 +63,7 @@ class Simulation:
         self.scheduler.storage.exclusive(lambda: self.scheduler._tell(outcome, is_repeated=False))
 
     def run(self, n_workers, drawn, p_death=0.0, p_failure=0.0, seen=lambda: None):
-        """Runs the whole study with workers that end in any order, die, and fail."""
+        """Run the whole study with workers that end in any order, die, and fail."""
         held = {}
         while True:
             for worker in range(n_workers):

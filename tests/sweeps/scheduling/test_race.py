@@ -15,7 +15,7 @@ tables = st.dictionaries(st.integers(-1, 50), st.lists(score, min_size=6, max_si
 
 
 def run(table, min_seeds, order, seeds=SEEDS):
-    """Runs a race to its end; returns it, and the trainings in the order in which they finished."""
+    """Run a race to its end; return it, and the trainings in the order in which they finished."""
     scores, done = {each: {} for each in table}, []
     while missing := race(scores, seeds, min_seeds=min_seeds).missing:
         configuration, seed = order(missing)

@@ -27,7 +27,7 @@ ODD = [None, True, -1, 1.5, 10**400, "x", "\0", "\x1b[31m", [], ["x"], {}, {"a":
 
 
 def is_refused(check):
-    """Whether a check raises, which must be one short line."""
+    """Return whether a check raises; its message must be one short line."""
     line = ""
     try:
         check()
@@ -48,7 +48,7 @@ def study_with(trial_attributes=(), study_attributes=(), state=TrialState.RUNNIN
 
 
 def work_with(study, folder):
-    """Does what workers, the monitor and the report do with trials of others; returns the report."""
+    """Do what workers, the monitor and the report do with trials of others; return the report."""
     scheduler = TrialScheduler(study, None, Limits(n_trials=1, max_failures=0, max_retries=0))
     state = scheduler.state()
     assert state.env_steps >= 0

@@ -28,7 +28,7 @@ FULL = ("No space left on device", "database or disk is full")
 
 @pytest.fixture
 def disk(tmp_path):
-    """A disk of 20 MB."""
+    """Yield a disk of 20 MB."""
     with small_disk(tmp_path / "disk", "20m") as disk:
         yield disk
 

@@ -31,7 +31,7 @@ def seen_in(file):
 
 @pytest.fixture
 def journal(tmp_path):
-    """Of two workers, each of which has read some of it before the other went on."""
+    """Return the journal of two workers, each of which has read a part of it before the other continued."""
     file = tmp_path / "a.journal"
     first, second = open_storage(str(file)).optuna, open_storage(str(file)).optuna
     for storage in (first, second, first):

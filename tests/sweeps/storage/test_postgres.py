@@ -36,7 +36,7 @@ TRACKING_PASSWORD = "not-for-anybody"
 
 
 def processes_with(texts):
-    """Returns the words of all processes of this machine in which one of the texts stands."""
+    """Return the words of all processes of this machine in which one of the texts stands."""
     found = []
     for words in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
@@ -47,7 +47,7 @@ def processes_with(texts):
 
 @contextlib.contextmanager
 def watched(look):
-    """Looks again and again while something lasts; gives the list of what was seen."""
+    """Look again and again while something lasts; give the list of what was seen."""
     seen, is_over = [], threading.Event()
 
     def watch():

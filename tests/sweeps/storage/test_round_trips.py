@@ -1,4 +1,4 @@
-"""How often a worker goes to its storage: it is what many workers share."""
+"""Round trips of a worker to its storage, which many workers share."""
 
 import threading
 

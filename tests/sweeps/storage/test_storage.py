@@ -1,4 +1,4 @@
-"""Where studies are kept: opened, locked, mended."""
+"""Storages of studies: opened, locked, mended."""
 
 import json
 import multiprocessing

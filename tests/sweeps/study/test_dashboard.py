@@ -1,4 +1,4 @@
-"""What is kept of a trial for those who look at Optuna's dashboard."""
+"""Attributes and pictures of trials for Optuna's dashboard."""
 
 import math
 

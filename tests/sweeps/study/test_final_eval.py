@@ -45,7 +45,7 @@ def storage_uri(tmp_path):
 
 
 def searched(uri, objectives=("mean_steps",), defaults=(), **changes):
-    """Makes a study whose search has ended; returns its storage, settings and study."""
+    """Make a study whose search has ended; return its storage, settings and study."""
     asked = settings(
         storage=uri,
         objectives=dict.fromkeys(objectives, "minimize"),
@@ -73,13 +73,13 @@ def opened(uri, **changes):
 
 
 def steps_of(number, seed, true, rng_of=0):
-    """Steps of a training on each of three volumes; the same for the same training."""
+    """Return the steps of a training on each of three volumes; the same for the same training."""
     rng = np.random.default_rng((number + 1, seed, rng_of))
     return true[number] + 0.3 * rng.standard_normal() + 0.2 * rng.standard_normal(3)
 
 
 def end(scheduler, trial, true):
-    """Ends a final training as its worker does."""
+    """End a final training as its worker does."""
     number, seed = training_of(trial)
     steps = steps_of(number, seed, true)
     metrics = {"mean_steps": steps.mean(), "test/mean_steps": steps.mean(), "test/success_rate": 1.0}
@@ -90,7 +90,7 @@ def end(scheduler, trial, true):
 
 
 def run(uri, true=TRUE, chance=None, **changes):
-    """Runs a final evaluation with workers that come and go; returns it."""
+    """Run a final evaluation with workers that come and go; return it."""
     chance = chance or random.Random(0)
     final, schedulers = opened(uri, **changes)
     for scheduler in schedulers:
@@ -113,7 +113,7 @@ def run(uri, true=TRUE, chance=None, **changes):
 
 
 def trained(study):
-    """The trainings that have finished."""
+    """Return the trainings that have finished."""
     return [training_of(trial) for trial in study.trials if trial.state == TrialState.COMPLETE]
 
 

@@ -20,7 +20,7 @@ TASK = SimpleNamespace(run=None, validate=None, evaluate=None, final_metric="tes
 
 @pytest.fixture
 def opened(tmp_path, empty_database, monkeypatch):
-    """Opens a study of a name in a storage of its own; all are tracked in one store."""
+    """Open a study of a name in a storage of its own; all are tracked in one store."""
     monkeypatch.chdir(tmp_path)
     shutil.copy(empty_database, tmp_path / "runs.db")
     tracking = {"uri": "sqlite:///runs.db", "experiment": "a", "artifacts": "artifacts", "wait_s": 60.0}

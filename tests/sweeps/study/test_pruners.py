@@ -64,7 +64,7 @@ def test_crowding_of_three_trials_in_a_row():
 
 @pytest.fixture
 def report(storage_uri):
-    """Reports values of a trial at steps, as an attempt does; returns the step at which it is pruned."""
+    """Report values of a trial at steps, as an attempt does; return the step at which it is pruned."""
     storage = open_storage(storage_uri)
     study = optuna.create_study(
         study_name="a", storage=storage.optuna, directions=["maximize", "minimize"], pruner=ParetoPruner(100, 2)

@@ -58,7 +58,7 @@ def test_stagnation_follows_the_direction_and_says_so():
 
 
 def noisy(n_trials, noise, seed=0):
-    """Returns a study of a bowl, with two seeds of each trial."""
+    """Return a study of a bowl, with two seeds of each trial."""
     rng, study = np.random.default_rng(seed), optuna.create_study()
     for x in rng.random(n_trials):
         seeds = {str(each): {"mean_steps": float((x - 0.5) ** 2 + noise * rng.normal())} for each in (0, 1)}
@@ -88,7 +88,7 @@ def test_study_goes_on_where_seeds_hardly_differ():
 
 @pytest.fixture
 def make(storage_uri):
-    """Opens the same study again and again, as workers do; it ends after so many finished trials."""
+    """Open the same study again and again, as workers do; it ends after so many finished trials."""
 
     def opened(asked="a", last=2):
         storage = open_storage(storage_uri)

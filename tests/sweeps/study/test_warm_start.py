@@ -1,4 +1,4 @@
-"""What a study begins with: trials of others whose configuration is the same, else their best settings; and presets."""
+"""Warm starts: trials of others whose configuration is the same, else their best settings; and presets."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ ZY = FIXED | {"projection": "zy"}
 
 @pytest.fixture
 def study_in(tmp_path):
-    """Makes a study of a space in the storage, with a finished trial of each of some values."""
+    """Make a study of a space in the storage, with a finished trial of each of some values."""
 
     def make(name, space, fixed=FIXED, rows=(), **changes):
         asked = settings(name=name, storage=str(tmp_path / "a.journal"), space=Space.read(space), **changes)
@@ -47,7 +47,7 @@ def study_in(tmp_path):
 
 
 def begin(made, fixed=FIXED):
-    """Lets a study begin; returns what is told."""
+    """Let a study begin; return what is told."""
     asked, storage, study = made
     begins = beginnings(asked, [], fixed, study)
     for each in begins:

@@ -11,7 +11,7 @@ FEW = ["data.n_training=2", "data.n_validation=1", "data.n_test=1"]
 
 
 class Trial:
-    """Of an attempt, what this task asks for."""
+    """The part of an attempt that this task uses."""
 
     seeds = (0,)
 

@@ -38,7 +38,7 @@ work(make_scheduler, 20)
 
 @pytest.fixture
 def unshare():
-    """Starts Python in PID namespaces of their own, in which each process has the number 1."""
+    """Start Python in PID namespaces of their own, in which each process has the number 1."""
     if shutil.which("unshare") is None or subprocess.run([*IN_A_NAMESPACE, "true"], capture_output=True).returncode:
         unavailable("no PID namespace can be made here: it needs util-linux and root")
     started = []
@@ -55,7 +55,7 @@ def unshare():
 
 
 def is_dead(lease, *, monkeypatch):
-    """Returns what a worker says of another at the first look, and after 50 s without a heartbeat."""
+    """Return what a worker says of another at the first look, and after 50 s without a heartbeat."""
     now_s, liveness = [100.0], LivenessCheck()
     monkeypatch.setattr(heartbeat.time, "monotonic", lambda: now_s[0])
     trial, said = SimpleNamespace(number=0, user_attrs={LEASE: lease}), []

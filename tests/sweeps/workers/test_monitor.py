@@ -20,13 +20,13 @@ ELSEWHERE = {"worker": "0", "host": "elsewhere", "pid": 1, "started": "1"}
 
 @pytest.fixture
 def storage_uri(tmp_path):
-    """It is the same in every storage."""
+    """Return one storage: monitoring is the same in every one."""
     return str(tmp_path / "a.journal")
 
 
 @pytest.fixture
 def watch(make_scheduler, storage_uri, monkeypatch):
-    """Watches a study of two trials, in which one is running; returns the monitor, the schedulers and that trial."""
+    """Watch a study of two trials, in which one is running; return the monitor, the schedulers and that trial."""
     for name, value in (("LOOK_S", 0.05), ("OVER_S", 0.2), ("LIFELESS_S", 60.0)):
         monkeypatch.setattr(module, name, value)
 

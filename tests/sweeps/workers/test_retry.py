@@ -41,7 +41,7 @@ def open_scheduler(postgres):
 
 @pytest.fixture(params=[True, False], ids=["done", "undone"])
 def lose_commit(request, monkeypatch):
-    """Loses the connection while the next transaction that changes anything is committed, once it is done or before."""
+    """Lose the connection while the next transaction that changes anything is committed, once it is done or before."""
 
     def lose(scheduler, meanwhile=lambda: None):
         import psycopg
@@ -65,7 +65,7 @@ def lose_commit(request, monkeypatch):
 
 
 def complete(trial, value):
-    """The outcome of a trial, which its worker tells with its next claim."""
+    """Return the outcome of a trial, which its worker tells with its next claim."""
     return TrialOutcome(trial, TrialState.COMPLETE, PendingWrites(), values=[value])
 
 

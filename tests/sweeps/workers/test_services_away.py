@@ -33,7 +33,7 @@ TRAINING = [
 
 @pytest.fixture
 def services(postgres_programs, tmp_path):
-    """A PostgreSQL server, and an MLflow server that keeps its runs in another."""
+    """Yield a PostgreSQL server, and an MLflow server that keeps its runs in another."""
     with (
         postgres_server() as postgres,
         postgres_server() as of_runs,
@@ -44,7 +44,7 @@ def services(postgres_programs, tmp_path):
 
 @contextlib.contextmanager
 def study(folder, storage_uri, tracking_uri, *words):
-    """A study as a person starts it, ended in any case."""
+    """Yield a study as a person starts it, ended in any case."""
     environment = {"ARMSCAN_STORAGE": storage_uri, "MLFLOW_TRACKING_URI": tracking_uri, "PYTHONPATH": str(REPOSITORY)}
     folder.mkdir()
     with (folder / "printed").open("wb") as printed:

@@ -1,4 +1,4 @@
-"""What is above a worker: on machines that do not share what they must."""
+"""Supervisors of workers, on machines that do not share what they must."""
 
 import json
 

@@ -37,7 +37,7 @@ def far_from_a_thousandth(attempt):
 
 @pytest.fixture
 def work(tmp_path, empty_database):
-    """Lets one worker run a study in a folder of its own; returns the study."""
+    """Let one worker run a study in a folder of its own; return the study."""
 
     def run_study(folder, run=far_from_a_thousandth, *, sampler=RANDOM, seed=0, objectives=("mean_steps",), **limits):
         folder = tmp_path / folder
@@ -228,7 +228,7 @@ def test_worker_needs_of_a_report_only_what_is_pruned_by(work):
 
 
 def report_until_told_otherwise(attempt):
-    """Reports as a long training does."""
+    """Report as a long training does."""
     until_s = time.monotonic() + HANG_S
     while time.monotonic() < until_s:
         attempt.report({"mean_return": -1.0}, seed=0, n_env_steps=100, grid=100, total=1000)
