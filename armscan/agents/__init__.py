@@ -9,6 +9,7 @@ from armscan.agents.plane_finder import PlaneFinder
 from armscan.agents.ppo import PPO
 from armscan.agents.protocols import Agent, AgentSetup, Algorithm, Learner, VectorEnvFactory
 from armscan.agents.regression import Regression
+from armscan.agents.residual_sac import ResidualSAC
 from armscan.agents.sac import SAC
 from armscan.agents.schedule import Segment, scheduled_algorithms
 from armscan.agents.scheduled_learner import ScheduledLearner
@@ -31,6 +32,7 @@ __all__ = [
     "PlaneFinder",
     "Random",
     "Regression",
+    "ResidualSAC",
     "ScheduledLearner",
     "Segment",
     "VectorEnvFactory",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain, pairwise
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +21,32 @@ PLACES, MOST_PLACE = (0.2, 0.2, 10.0, 20.0), 6.0
 LEAST_DOUBT = 0.01
 # Kernel of each convolution; all have stride 2.
 KERNELS = (5, 3, 3)
+
+
+class Estimate(NamedTuple):
+    """What a plane finder makes of the latest looks of n episodes.
+
+    Attributes:
+        plane: Plane of the latest look, shape (n, 4), in degrees and mm.
+        place: Place of the wanted plane in the frame of the latest look, shape (n, 4).
+        expected: Expected errors of that place, in mm and degrees, shape (n, 2).
+        step: Number of the latest look, one-hot, shape (n, n_looks).
+        hidden: Features that the place was computed from, shape (n, n_hidden).
+    """
+
+    plane: Tensor
+    place: Tensor
+    expected: Tensor
+    step: Tensor
+    hidden: Tensor
+
+    def moved(self, offsets: Tensor) -> Estimate:
+        """Return the estimate with the place of the wanted plane moved, in the frame of the latest look."""
+        return self._replace(place=self.place + offsets)
+
+    def features(self) -> Tensor:
+        """Return all but the plane as one row of numbers for each episode, shape (n, n_features)."""
+        return torch.cat([self.hidden, self.place, self.expected, self.step], dim=1)
 
 
 class LookNetwork(nn.Module):
@@ -67,14 +94,19 @@ class LookNetwork(nn.Module):
         self.register_buffer("units", torch.tensor(UNITS))
         self.register_buffer("places", torch.tensor(PLACES))
 
-    def forward(self, images: Tensor, actions: Tensor, step: Tensor, geometry: PlaneGeometry) -> tuple[Tensor, Tensor]:
-        """Return the place of the wanted plane, shape (n, 4), and the expected errors, shape (n, 2), both above 0.
+    def forward(
+        self, images: Tensor, actions: Tensor, step: Tensor, geometry: PlaneGeometry
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the place of the wanted plane, the expected errors, both above 0, and the features of both.
 
         Args:
             images: Looks of an episode from the oldest on, bytes of shape (n, n_looks, tissues, across, depth).
             actions: Planes of the looks, normalised, shape (n, n_looks, 4).
             step: Number of the latest look, one-hot, shape (n, n_looks).
             geometry: Free components and bounds of the planes, in degrees and mm.
+
+        Returns:
+            Tensors of shape (n, 4), (n, 2) and (n, hidden_sizes[-1]).
         """
         looks = images[:, -self._n_seen :].flatten(1, 2).float() / 255.0
         planes = geometry.planes(actions)
@@ -83,7 +115,8 @@ class LookNetwork(nn.Module):
             place = geometry.seen_from(planes[:, -1], planes[:, -i]) / self.places
             features.append(place.clamp(-MOST_PLACE, MOST_PLACE))
         hidden = self.linear(torch.cat(features, dim=1))
-        return self.place(hidden) * self.units, nn.functional.softplus(self.doubt(hidden.detach())) + LEAST_DOUBT
+        doubt = nn.functional.softplus(self.doubt(hidden.detach())) + LEAST_DOUBT
+        return self.place(hidden) * self.units, doubt, hidden
 
 
 class FinderModule(nn.Module):
@@ -120,8 +153,13 @@ class FinderModule(nn.Module):
         self.register_buffer("sure", torch.tensor(sure or (0.0, 0.0), dtype=torch.float32), persistent=False)
         self.register_buffer("calibration", torch.ones(2))
 
-    def estimate(self, observations: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the latest plane, the wanted one's place in its frame, the expected errors, and the one-hot step."""
+    @property
+    def n_features(self) -> int:
+        """Number of the features of an estimate."""
+        return self.network.place.in_features + 4 + 2 + len(self.offsets)
+
+    def estimate(self, observations: dict[str, Tensor]) -> Estimate:
+        """Return what the network makes of observations, whose parts have the shape (n, n_looks, ...)."""
         actions = observations[ACTION][:, :, :4]
         n_looks = actions.shape[1]
         is_first = (actions == actions[:, :1]).all(2).float()
@@ -131,19 +169,28 @@ class FinderModule(nn.Module):
             n_first = n_first + running
         latest = torch.arange(n_looks, device=actions.device)
         step = ((n_looks - n_first)[:, None] == latest).float()
-        place, expected = self.network(observations[IMAGE], actions, step, self.geometry)
-        return self.geometry.planes(actions[:, -1]), place, expected * self.calibration, step
+        place, expected, hidden = self.network(observations[IMAGE], actions, step, self.geometry)
+        return Estimate(self.geometry.planes(actions[:, -1]), place, expected * self.calibration, step, hidden)
 
-    def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
-        """Return the next actions, shape (n, n_action), and the expected errors of the planes found so far, (n, 2)."""
-        plane, place, expected, step = self.estimate(observations)
-        beside_mm = step @ self.offsets
-        is_last = step[:, -1] > 0.0
+    def actions(self, estimate: Estimate) -> Tensor:
+        """Return the next actions, shape (n, n_action)."""
+        beside_mm = estimate.step @ self.offsets
+        is_last = estimate.step[:, -1] > 0.0
         if self._is_ever_sure:
-            is_last = is_last | (expected <= self.sure).all(1)
+            is_last = is_last | (estimate.expected <= self.sure).all(1)
         beside_mm = torch.where(is_last, torch.zeros_like(beside_mm), beside_mm)
-        actions = self.geometry.actions(self.geometry.from_frame(plane, place, beside_mm))
+        actions = self.geometry.actions(self.geometry.from_frame(estimate.plane, estimate.place, beside_mm))
         if self._has_stop:
             stop = torch.where(is_last, torch.ones_like(beside_mm), -torch.ones_like(beside_mm))
             actions = torch.cat([actions, stop[:, None]], dim=1)
-        return (actions, expected), None
+        return actions
+
+    def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
+        """Return the next actions, shape (n, n_action), and the expected errors of the planes found so far, (n, 2)."""
+        estimate = self.estimate(observations)
+        return (self.actions(estimate), estimate.expected), None
+
+
+def looks_of(observations: Any, device: torch.device | str) -> dict[str, Tensor]:
+    """Return the parts of observations that a plane finder takes, as tensors."""
+    return {name: torch.as_tensor(observations[name], device=device) for name in (IMAGE, ACTION)}

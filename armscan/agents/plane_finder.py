@@ -39,6 +39,13 @@ class PlaneFinder(FinderParameters):
         Raises:
             InvalidValueError: If the environment does not show or allow what it needs, or the training is too short.
         """
+        self.check(setup)
+        from armscan.agents.plane_finder_learner import PlaneFinderLearner
+
+        return PlaneFinderLearner(self, setup)
+
+    def check(self, setup: AgentSetup) -> None:
+        """Raise `InvalidValueError` if the environment or the budget of the training does not fit."""
         if setup.action_names[: len(COMPONENTS)] != COMPONENTS:
             raise InvalidValueError(
                 f"agent is plane_finder, which moves all of {', '.join(COMPONENTS)}, but projection leaves "
@@ -52,9 +59,6 @@ class PlaneFinder(FinderParameters):
                 f"agent.num_envs is {self.num_envs}, which look {n_at_once} times before the first gradient step, but "
                 f"training.env_steps is {setup.total_env_steps}"
             )
-        from armscan.agents.plane_finder_learner import PlaneFinderLearner
-
-        return PlaneFinderLearner(self, setup)
 
 
 def check_observed(space: spaces.Space[Any], n_looks: int) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from armscan.agents.base_learner import SupervisedLearner, diverged, teacher_of
 from armscan.agents.finder_parameters import FinderParameters
-from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork
+from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork, looks_of
 from armscan.agents.plane_geometry import common_geometry
 from armscan.agents.policy import Policy, batch_of, clip_action
 from armscan.agents.protocols import AgentSetup
@@ -58,7 +58,7 @@ class PlaneFinderLearner(SupervisedLearner):
         )
         sure = None if finder.sure_mm is None or finder.sure_deg is None else (finder.sure_mm, finder.sure_deg)
         geometry = common_geometry(teacher_of(envs).rules, finder.n_looks)
-        self._module = FinderModule(network, geometry, finder.offsets_mm, sure, has_stop=self._has_stop)
+        self._module: Any = FinderModule(network, geometry, finder.offsets_mm, sure, has_stop=self._has_stop)
         super().__init__(self._module, finder.lr, envs, setup)
         self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
         self.expected_error: tuple[float, float] | None = None
@@ -75,18 +75,18 @@ class PlaneFinderLearner(SupervisedLearner):
         """See `SupervisedLearner._learn_until`."""
         losses: list[Tensor] = []
         while self._n_env_steps < n_env_steps:
-            observations, _ = reset_each(self._envs, None if losses else seeds, self._volumes(rng))
+            observations, _ = reset_each(self._envs, None if losses else seeds, self._volumes(rng, self._envs.num_envs))
             losses.append(self._teach(observations, rng))
             self._n_env_steps += self.env_steps_at_once
         return losses
 
-    def _volumes(self, rng: np.random.Generator) -> dict[str, Any] | None:
+    def _volumes(self, rng: np.random.Generator, n_episodes: int) -> dict[str, Any] | None:
         """Draw the volume of each episode where phantoms have a share of them; None leaves that to the environments."""
         phantom_share, names = self._finder.phantom_share, self._teacher.rules.names
         groups = [[name for name in names if name.startswith(PHANTOM) == of_phantoms] for of_phantoms in (True, False)]
         if phantom_share is None or not all(groups):
             return None
-        chosen = (rng.random(self._envs.num_envs) >= phantom_share).astype(int)
+        chosen = (rng.random(n_episodes) >= phantom_share).astype(int)
         return {"volume": [groups[each][int(rng.integers(len(groups[each])))] for each in chosen]}
 
     def _teach(self, observations: Observed, rng: np.random.Generator) -> Tensor:
@@ -97,7 +97,7 @@ class PlaneFinderLearner(SupervisedLearner):
             observations = self._envs.step(self._next_looks(seen[-1], offset_mm, rng))[0]
             seen.append(self._tensors(observations))
         looks = {name: torch.cat([each[name] for each in seen]) for name in (IMAGE, ACTION)}
-        planes, place, expected, step = self._module.estimate(looks)
+        planes, place, expected, step, _ = self._module.estimate(looks)
         wanted = self._module.geometry.seen_from(planes, optima.repeat(len(seen), 1))
         finder = self._finder
         tilt = math.radians(finder.loss_deg)
@@ -123,7 +123,7 @@ class PlaneFinderLearner(SupervisedLearner):
         is_astray = rng.random(n) < self._finder.astray_share
         astray_deg, astray_mm = torch.as_tensor(spreads * is_astray, dtype=torch.float32, device=self._device)
         with torch.no_grad():
-            plane, place, _, _ = self._module.estimate(seen)
+            plane, place, *_ = self._module.estimate(seen)
             tilt = torch.deg2rad(astray_deg)[:, None] * draws[:, :2]
             place = torch.cat([place[:, :2] + tilt, place[:, 2:]], dim=1)
             beside_mm = offset_mm + astray_mm * draws[:, 2]
@@ -149,7 +149,7 @@ class PlaneFinderLearner(SupervisedLearner):
                     actions[:, 4] = -1.0
                 observations = envs.step(actions.cpu().numpy())[0]
             errors = self._module.geometry.errors(self._module.geometry.planes(actions[:, :4]), optima)
-            self._module.calibration *= errors.mean(0) / expected.mean(0).clamp(min=1e-6)
+            self._module.calibration.mul_(errors.mean(0) / expected.mean(0).clamp(min=1e-6))
         metrics = {}
         for i, unit in enumerate(("mm", "deg")):
             order = expected[:, i].argsort()
@@ -163,10 +163,11 @@ class PlaneFinderLearner(SupervisedLearner):
     def _optima(self, envs: Any) -> Tensor:
         """Return the labelled planes of the current episodes, shape (num_envs, 4)."""
         optima = torch.as_tensor(teacher_of(envs).optimal_actions[:, :4], dtype=torch.float32, device=self._device)
-        return self._module.geometry.planes(optima)
+        planes: Tensor = self._module.geometry.planes(optima)
+        return planes
 
     def _tensors(self, observations: Any) -> dict[str, Tensor]:
-        return {name: torch.as_tensor(observations[name], device=self._device) for name in (IMAGE, ACTION)}
+        return looks_of(observations, self._device)
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
         """Learn that an episode begins, in which nothing is drawn.

@@ -85,6 +85,12 @@ class TianshouLearner(BaseLearner):
         return int(self._collector.collect_step)
 
     @property
+    def actor(self) -> torch.nn.Module:
+        """Actor, from observations to mean and spread of actions."""
+        actor: torch.nn.Module = self._algorithm.policy.actor
+        return actor
+
+    @property
     def env_steps_at_once(self) -> int:
         """Those of one collection."""
         return int(self._trainer.params.collection_step_num_env_steps or 0)

@@ -111,7 +111,7 @@ def test_each_look_knows_its_place_in_the_episode(phantom):
     module = learner._module
     assert isinstance(module, FinderModule)
     for place in (0, 1, 2):
-        step = module.estimate(learner._tensors(batch_of([observation])))[3]
+        step = module.estimate(learner._tensors(batch_of([observation]))).step
         assert step[0].tolist() == [float(i == place) for i in range(3)]
         observation = env.step(learner.act(observation, 0.0))[0]
 
@@ -156,7 +156,7 @@ def test_phantoms_have_their_share_beside_other_volumes(phantom, share):
     envs = partial(EnvFactory(**RULES).make_vector_env, volumes=[phantom, wrist], autoreset_mode="Disabled")
     setup = setup_for(EnvFactory(**RULES), phantom, action_names=NAMES, total_env_steps=480, make_envs=envs)
     learner = PlaneFinder(**SMALL | {"num_envs": 40}, phantom_share=share).agent(setup)
-    drawn = learner._volumes(np.random.default_rng(0))
+    drawn = learner._volumes(np.random.default_rng(0), 40)
     if share is None:
         assert drawn is None
     else:

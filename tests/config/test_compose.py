@@ -31,10 +31,13 @@ def test_conf_composes_every_observation_and_reward(phantom, obs, reward):
 WHOLE = [f"agent={agent}" for agent in choices("agent")] + [f"experiment={name}" for name in choices("experiment")]
 
 
+ONE_FOLD = [f"data.path={DATA / 'volumes'}", "data.fold=0"]
 # What an agent needs of the environment, and says so without it; and an experiment of its user.
 BESIDE = {
     "agent=plane_finder": ["experiment=plane_finder"],
-    "experiment=few_wrists": [f"data.path={DATA / 'volumes'}", "data.fold=0"],
+    "agent=residual_sac": ["experiment=few_wrists_sac", *ONE_FOLD],
+    "experiment=few_wrists": ONE_FOLD,
+    "experiment=few_wrists_sac": ONE_FOLD,
 }
 
 

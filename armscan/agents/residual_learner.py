@@ -1,0 +1,132 @@
+"""The learner of a taught plane finder whose planes SAC corrects."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from armscan.agents.finder_parameters import FinderParameters
+from armscan.agents.look_network import Estimate, FinderModule
+from armscan.agents.plane_finder_learner import PlaneFinderLearner
+from armscan.agents.plane_geometry import PlaneGeometry
+from armscan.agents.protocols import AgentSetup
+from armscan.agents.residual_envs import ResidualVectorEnv, feature_space
+from armscan.agents.sac import SAC
+from armscan.envs.actions import COMPONENTS
+
+
+class ResidualModule(nn.Module):
+    """A plane finder, and the actor that corrects its planes.
+
+    Args:
+        finder: Plane finder.
+        actor: Actor, from features of the plane finder to mean and spread of corrections, shape (n, 4).
+        limits: Largest corrections in the frame of a look, shape (4,): sines of two tilts, mm along the normal and
+            across.
+    """
+
+    limits: Tensor
+    is_corrected: Tensor
+
+    def __init__(self, finder: FinderModule, actor: nn.Module, limits: Tensor) -> None:
+        super().__init__()
+        self.finder, self.actor = finder, actor
+        self.register_buffer("limits", limits, persistent=False)
+        # 1 from the first update of SAC on; until then the answers are exactly those of the plane finder.
+        self.register_buffer("is_corrected", torch.zeros_like(limits[0]))
+
+    @property
+    def geometry(self) -> PlaneGeometry:
+        """Geometry of the planes."""
+        return self.finder.geometry
+
+    @property
+    def calibration(self) -> Tensor:
+        """Factors of the expected errors, in mm and degrees."""
+        return self.finder.calibration
+
+    def estimate(self, observations: dict[str, Tensor]) -> Estimate:
+        """Return what the plane finder makes of observations."""
+        return self.finder.estimate(observations)
+
+    def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
+        """Return the next actions, shape (n, n_action), and the expected errors of the plane finder, shape (n, 2)."""
+        estimate = self.estimate(observations)
+        (means, _), _ = self.actor(estimate.features())
+        corrections = self.is_corrected * torch.tanh(means) * self.limits
+        return (self.finder.actions(estimate.moved(corrections)), estimate.expected), None
+
+
+class ResidualLearner(PlaneFinderLearner):
+    """Teaches a plane finder, then lets SAC learn to correct its planes.
+
+    Args:
+        parameters: Parameters of the plane finder.
+        setup: Environments, spaces, budget and seed of the agent.
+        sac: Hyperparameters of SAC.
+        taught_env_steps: Number of environment steps of the teaching; the rest of the budget is for SAC.
+        correction_mm: Largest correction along the normal of the plane, and across, in mm.
+        correction_deg: Largest correction of each of the two tilts of the plane, in degrees.
+    """
+
+    def __init__(
+        self,
+        parameters: FinderParameters,
+        setup: AgentSetup,
+        sac: SAC,
+        *,
+        taught_env_steps: int,
+        correction_mm: float,
+        correction_deg: float,
+    ) -> None:
+        self._taught_env_steps = taught_env_steps
+        super().__init__(parameters, replace(setup, total_env_steps=taught_env_steps))
+        finder, tilt = self._module, math.sin(math.radians(correction_deg))
+        limits = torch.tensor([tilt, tilt, correction_mm, correction_mm], device=self._device)
+        self._sac = sac.agent(
+            replace(
+                setup,
+                make_envs=lambda n: ResidualVectorEnv(setup.make_envs(n), finder, limits, self._volumes),
+                observation_space=feature_space(finder),
+                action_names=COMPONENTS,
+                total_env_steps=setup.total_env_steps - taught_env_steps,
+            )
+        )
+        self._network = self._module = ResidualModule(finder, self._sac.actor, limits)
+
+    @property
+    def n_env_steps(self) -> int:
+        """Environment steps taken so far, those of the teaching included."""
+        return super().n_env_steps + self._sac.n_env_steps
+
+    @property
+    def env_steps_at_once(self) -> int:
+        """The more of those that teaching and SAC take."""
+        return max(super().env_steps_at_once, self._sac.env_steps_at_once)
+
+    @property
+    def update_note(self) -> str:
+        """Return how the gradient steps of SAC are computed."""
+        return f"{self._sac.update_note}, after the teaching"
+
+    def learn(self, n_env_steps: int) -> dict[str, float]:
+        """Learn for an epoch, which ends with the teaching if it is of that; see `Learner.learn`."""
+        if (n_left := self._taught_env_steps - super().n_env_steps) > 0:
+            return super().learn(min(n_env_steps, n_left))
+        if not self._module.is_corrected:
+            self._sac.warm_up()
+            self._module.is_corrected.fill_(1.0)
+        return self._sac.learn(n_env_steps)
+
+    def state(self) -> dict[str, Any]:
+        """Return the states of the teaching and of SAC."""
+        return {**super().state(), "sac": self._sac.state()}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what `state` returned; see `Learner.load_state`."""
+        super().load_state(state)
+        self._sac.load_state(state["sac"])

@@ -1,0 +1,70 @@
+"""A taught plane finder whose planes SAC corrects: its configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from armscan.agents.hyperparameters import number
+from armscan.agents.plane_finder import PlaneFinder
+from armscan.agents.protocols import AgentSetup
+from armscan.agents.sac import SAC
+from armscan.errors import InvalidValueError
+from armscan.utils.validation import check_int
+
+if TYPE_CHECKING:
+    from armscan.agents.residual_learner import ResidualLearner
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResidualSAC(PlaneFinder):
+    """A plane finder that is taught first; SAC then fine-tunes its planes on the reward, while its network is kept.
+
+    Residual policy learning (Silver et al. 2018, arXiv:1812.06298): the action of SAC is a correction of the plane that
+    the taught network finds, and SAC observes what that network has computed from the looks. At the beginning of the
+    fine-tuning, the policy is the taught one. The keys of the plane finder stand beside these.
+
+    Raises:
+        InvalidValueError: If a value is impossible.
+    """
+
+    sac: SAC
+    """Hyperparameters of SAC; its environment steps with random actions are random corrections."""
+
+    taught_env_steps: int
+    """Number of environment steps of the teaching; the rest of `training.env_steps` is for SAC."""
+
+    correction_mm: float = number(2.0, above=0.0, at_most=50.0)
+    """Largest correction along the normal of the plane, and across, in mm."""
+
+    correction_deg: float = number(3.0, above=0.0, at_most=45.0)
+    """Largest correction of each of the two tilts of the plane, in degrees."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.sac, SAC):
+            raise InvalidValueError(f"agent.sac is {self.sac!r}, but it must be hyperparameters of SAC")
+        check_int("agent.taught_env_steps", self.taught_env_steps, at_least=1)
+
+    def agent(self, setup: AgentSetup) -> ResidualLearner:
+        """Make an agent that has learned nothing yet.
+
+        Raises:
+            InvalidValueError: If the environment does not show or allow what it needs, or the training is too short.
+        """
+        if self.taught_env_steps >= setup.total_env_steps:
+            raise InvalidValueError(
+                f"agent.taught_env_steps is {self.taught_env_steps}, but it must be below training.env_steps = "
+                f"{setup.total_env_steps}, which leaves the rest to SAC"
+            )
+        self.check(replace(setup, total_env_steps=self.taught_env_steps))
+        from armscan.agents.residual_learner import ResidualLearner
+
+        return ResidualLearner(
+            self,
+            setup,
+            self.sac,
+            taught_env_steps=self.taught_env_steps,
+            correction_mm=self.correction_mm,
+            correction_deg=self.correction_deg,
+        )

@@ -1,0 +1,127 @@
+"""The plane finder whose planes SAC corrects."""
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch
+
+from armscan.agents import MLP, SAC, Learner, ResidualSAC
+from armscan.agents.policy import batch_of
+from armscan.agents.torch_export import export_program
+from armscan.envs import EnvFactory
+from armscan.errors import InvalidValueError
+from tests.agents.conftest import SMALL_SAC, setup_for
+from tests.agents.test_plane_finder import NAMES, RULES, SMALL, played
+
+N_TAUGHT = 24
+
+
+def made(phantom, total_env_steps=200, rules=None, **changes):
+    env_factory = EnvFactory(**RULES | (rules or {}))
+    names = (*NAMES, "stop") if (rules or {}).get("ends") == "on_stop" else NAMES
+    setup = setup_for(env_factory, phantom, action_names=names, total_env_steps=total_env_steps)
+    sac = SAC(network=MLP((8,)), **SMALL_SAC)
+    learner = ResidualSAC(**SMALL | {"sac": sac, "taught_env_steps": N_TAUGHT} | changes).agent(setup)
+    return learner, env_factory.make_env([phantom])
+
+
+@pytest.fixture
+def corrected(phantom):
+    """A learner that SAC has changed, and its environment."""
+    learner, env = made(phantom)
+    for _ in range(3):
+        learner.learn(40)
+    return learner, env
+
+
+def finder_weights(learner):
+    return {name: w.clone() for name, w in learner.weights().items() if name.startswith("finder.")}
+
+
+def test_teaching_ends_with_its_steps_and_the_rest_is_for_sac(phantom):
+    learner, _ = made(phantom)
+    assert isinstance(learner, Learner)
+    learner.warm_up()
+    assert "update/loss" in learner.learn(100)
+    assert learner.n_env_steps == N_TAUGHT
+    assert "update/critic_loss" in learner.learn(40)
+    assert learner.n_env_steps == N_TAUGHT + SMALL_SAC["learning_starts"] + 40
+
+
+def test_corrections_begin_after_the_teaching_and_leave_the_plane_finder_as_it_is(phantom):
+    learner, env = made(phantom)
+    learner.learn(N_TAUGHT)
+    observation, _ = env.reset(seed=0)
+    looks = learner._tensors(batch_of([observation]))
+    found = learner._module.finder(looks)[0][0]
+    assert torch.equal(learner._module(looks)[0][0], found)
+    taught = finder_weights(learner)
+    learner.learn(40)
+    assert all(torch.equal(w, taught[name]) for name, w in finder_weights(learner).items())
+    assert not torch.equal(learner._module(looks)[0][0], found)
+
+
+def test_corrections_stay_within_their_limits(corrected):
+    learner, env = corrected
+    with torch.no_grad():
+        learner._module.actor.mu.model[0].bias.fill_(100.0)
+    looks = learner._tensors(batch_of([env.reset(seed=0)[0]]))
+    geometry, (actions, _) = learner._module.geometry, learner._module(looks)[0]
+    place = learner._module.estimate(looks).moved(learner._module.limits * torch.tensor([1.0, 1.0, 1.0, 1.0])).place
+    estimate = learner._module.estimate(looks)
+    wanted = geometry.from_frame(estimate.plane, place, torch.tensor([9.0]))
+    torch.testing.assert_close(geometry.planes(actions), wanted, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("n_before", [1, 2])
+def test_learner_goes_on_from_its_state_to_the_bit(phantom, n_before):
+    """Also from the end of the teaching."""
+    one, other = made(phantom)[0], made(phantom)[0]
+    for _ in range(n_before):
+        one.learn(40)
+    other.load_state(deepcopy(one.state()))
+    for learner in (one, other):
+        learner.learn(40)
+    assert one.n_env_steps == other.n_env_steps
+    for name, weights in one.weights().items():
+        assert torch.equal(weights, other.weights()[name])
+
+
+def test_policy_answers_as_the_learner_does_also_exported(corrected):
+    learner, env = corrected
+    observations = []
+    for seed in range(3):
+        observation, _ = env.reset(seed=seed)
+        for _ in range(3):
+            observations.append(observation)
+            observation = env.step(learner.act(observation, 0.0))[0]
+    batch = batch_of(observations)
+    actions = np.array([learner.act(observation, 0.0) for observation in observations])
+    policy = learner.policy()
+    np.testing.assert_allclose(policy(batch), actions, atol=1e-6)
+    np.testing.assert_allclose(export_program(policy, batch).module()(batch), actions, atol=1e-6)
+
+
+def test_learner_stops_where_its_plane_finder_does(phantom):
+    learner, env = made(phantom, rules={"ends": "on_stop", "max_steps": 10})
+    for _ in range(2):
+        learner.learn(40)
+    actions, terminated = played(learner, env)
+    assert terminated
+    assert (actions[1:, 4] > 0).tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"taught_env_steps": 200}, "agent.taught_env_steps is 200, but it must be below training.env_steps = 200"),
+        ({"taught_env_steps": 0}, "agent.taught_env_steps is 0"),
+        ({"taught_env_steps": 3}, "look 12 times before the first gradient step"),
+        ({"correction_mm": 0.0}, "agent.correction_mm is 0"),
+        ({"sac": None}, "agent.sac is None"),
+    ],
+)
+def test_impossible_parameters_are_refused(phantom, changes, message):
+    with pytest.raises(InvalidValueError, match=message):
+        made(phantom, **changes)
