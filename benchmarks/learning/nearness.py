@@ -5,7 +5,7 @@
 
 Medians and 90th percentiles of the distance and the angle, how often both are within 1.5 mm and 4 degrees, over all
 volumes and for each; and, for an agent that says how far off it expects to be (`agent=plane_finder`), the errors by
-quintile of that. Volumes: a folder, or 12 phantoms that no run trains on; default: the run's own test volumes. Of a
+decile of that. Volumes: a folder, or 12 phantoms that no run trains on; default: the run's own test volumes. Of a
 grid (`data.folds`) all runs, each on its own test volumes. `--rx` turns volumes by up to as many degrees about the axis
 across, as `env.transform.rx_deg` does.
 """
@@ -24,7 +24,7 @@ from armscan.tracking import find_run, open_existing_store
 from armscan.training import TEST, evaluate
 from armscan.training.episode_results import EpisodeResult
 
-N_PHANTOMS, N_QUINTILES = 12, 5
+N_PHANTOMS, N_GROUPS = 12, 10
 NEAR_MM, NEAR_DEG = 1.5, 4.0
 
 
@@ -65,8 +65,8 @@ def print_doubt(episodes: Sequence[EpisodeResult]) -> None:
             return
         errors = np.array([getattr(each, f"distance_{unit}") for each in episodes])
         print(f"correlation of expected and real error, {unit}: {np.corrcoef(expected, errors)[0, 1]:.2f}")
-        for k, chosen in enumerate(np.array_split(expected.argsort(), N_QUINTILES)):
-            name = f"quintile {k + 1} of expected {unit}, {expected[chosen].mean():.2f}"
+        for k, chosen in enumerate(np.array_split(expected.argsort(), N_GROUPS)):
+            name = f"decile {k + 1} of expected {unit}, {expected[chosen].mean():.2f}"
             print_row(name, [episodes[index] for index in chosen])
 
 
