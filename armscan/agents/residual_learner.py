@@ -120,6 +120,7 @@ class ResidualLearner(PlaneFinderLearner):
         if not self._module.is_corrected:
             self._sac.warm_up()
             self._module.is_corrected.fill_(1.0)
+            n_env_steps = max(1, n_env_steps - self._sac.n_env_steps)
         return self._sac.learn(n_env_steps)
 
     def state(self) -> dict[str, Any]:
