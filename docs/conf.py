@@ -3,9 +3,11 @@
 import sys
 from pathlib import Path
 
-import armscan
+DOCS = Path(__file__).resolve().parent
+# Documents this checkout, even if another one is installed.
+sys.path[:0] = [str(DOCS.parent), str(DOCS / "_ext")]
 
-sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+import armscan
 
 project = "armscan"
 author = "The armscan authors"
@@ -28,7 +30,7 @@ exclude_patterns = ["_build", "_ext"]
 
 # Markdown
 myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
-myst_heading_anchors = 3
+myst_heading_anchors = 4
 # Notebooks are run by tests/test_docs.py and kept with their outputs.
 nb_execution_mode = "off"
 nb_merge_streams = True
