@@ -1,4 +1,4 @@
-"""What the README and the pages say to type, works: code blocks run, commands are good words, journeys are made."""
+"""The README and the pages: code blocks run, commands compose, and journeys succeed with small budgets."""
 
 import os
 import re
@@ -45,13 +45,13 @@ OWN_VOLUMES = ("data=nifti", "data=mixed")
 
 
 def blocks(page, language):
-    """The code blocks of a page in a language, without the indentation of a list."""
+    """Return the code blocks of a page in a language, without the indentation of a list."""
     found = re.findall(rf"^( *)```{language}\n(.*?)^ *```", page.read_text(), re.DOTALL | re.MULTILINE)
     return [re.sub(rf"^{indent}", "", block, flags=re.MULTILINE) for indent, block in found]
 
 
 def commands(page):
-    """The words of each armscan command in a page's shell blocks."""
+    """Yield the words of each armscan command in a page's shell blocks."""
     for line in "\n".join(blocks(page, "sh")).splitlines():
         words = shlex.split(line, comments=True)
         if words[:3] in (["python", "-m", "armscan.run"], [".venv/bin/python", "-m", "armscan.run"]):
@@ -67,7 +67,7 @@ def filled_in(word):
 
 
 def of_each_sweep(words):
-    """The overrides of a command with the first choice of each key that has several."""
+    """Yield the overrides of a command with the first choice of each key that has several."""
     for override in OverridesParser.create().parse_overrides(words):
         first = next(override.sweep_string_iterator()) if override.is_sweep_override() else None
         yield override.input_line if first is None else f"{override.get_key_element()}={first}"
@@ -83,7 +83,7 @@ COMMANDS = [
 
 @pytest.fixture
 def in_a_folder(tmp_path, monkeypatch):
-    """A folder with what commands of pages expect to be there."""
+    """Return a folder with what commands of pages expect to be there."""
     for folder in ("outputs", "studies/sac_y"):
         (tmp_path / folder).mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
@@ -134,14 +134,14 @@ def test_tutorial_runs_as_it_stands(data_folder, tmp_path, monkeypatch, capsys):
 
 
 def small(words):
-    """What is added to a command so that it takes seconds, where it says nothing else."""
-    added = [*SMALL]
+    """Return a command with small budgets in the place of its own."""
+    budgets = [*SMALL]
     if not set(words) & set(OWN_VOLUMES):
-        added += OF_PHANTOMS
+        budgets += OF_PHANTOMS
     if any(word.startswith("sweep=") for word in words):
-        added += OF_STUDIES
-    given = {word.partition("=")[0] for word in words}
-    return [word for word in added if word.partition("=")[0] not in given]
+        budgets += OF_STUDIES
+    keys = {word.partition("=")[0] for word in budgets}
+    return [*(word for word in words if word.partition("=")[0] not in keys), *budgets]
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_journeys_of_pages_are_made_with_small_budgets(page, tmp_path, data_fold
         if "ui" in line or "label" in line or any("resume=" in word or word == "ID" for word in line):
             continue
         if line[0] == "run" and "--help" not in line:
-            line += small(line)
+            line = small(line)
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         command = [sys.executable, "-P", "-m", "armscan", *line]
         ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
