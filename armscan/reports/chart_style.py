@@ -10,6 +10,8 @@ from plotly.graph_objs.layout import Template
 
 # One hue for what a chart shows, another for what stands out, grey for the rest; Matplotlib's pictures have them, too.
 BLUE, ORANGE, RED, GREY = "#1f77b4", "#ff7f0e", "#d62728", "#9a9a9a"
+# No rate is below 0 % or above 100 %.
+RATE_AXIS = {"tickformat": ".0%", "autorangeoptions": {"minallowed": -0.03, "maxallowed": 1.03}}
 # Curves of more points are lines without markers.
 MOST_MARKERS = 60
 

@@ -12,7 +12,7 @@ from plotly.colors import hex_to_rgb, qualitative
 from plotly.graph_objects import Figure
 from plotly.subplots import make_subplots
 
-from armscan.reports.chart_style import mode
+from armscan.reports.chart_style import RATE_AXIS, mode
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
 from armscan.training import MetricEstimates
@@ -26,8 +26,6 @@ MANY = 6
 ROW_PX, LEGEND_ROW_PX, GROUP_PX, AROUND_PX, SWITCHES_PX = 250, 22, 34, 110, 84
 # Of the legend, all of it and one letter; and the line beside a name.
 LEGEND_PX, LETTER_PX, SAMPLE_PX = 950, 7, 50
-# No success rate is above 100 %.
-RATE_AXIS = {"tickformat": ".0%", "autorangeoptions": {"maxallowed": 1.03}}
 BANDS, SEEDS = "band", "seed"
 # What is shown beside the thick lines, by the button.
 SHOWN = {"bands and seeds": (BANDS, SEEDS), "bands": (BANDS,), "neither": ()}

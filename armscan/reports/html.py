@@ -30,8 +30,11 @@ td, th {{ border-bottom: 1px solid #ddd; padding: .25rem .6rem; text-align: left
 th {{ border-bottom: 2px solid #999; vertical-align: bottom; overflow-wrap: normal; }}
 td.number {{ text-align: right; white-space: nowrap; }}
 small {{ color: #555; }}
-.results td, .results th {{ padding: .2rem .1rem; font-size: 12px; text-align: right; }}
-.results td {{ white-space: nowrap; }}
+.results td, .results th {{ text-align: right; min-width: 7.5rem; }}
+.results br {{ display: none; }}
+.lines td, .lines th {{ padding: .2rem .1rem; font-size: 12px; min-width: 0; }}
+.lines td {{ white-space: nowrap; }}
+.lines br {{ display: inline; }}
 .results td small {{ white-space: normal; }}
 .results td:first-child {{ text-align: left; white-space: normal; min-width: 8rem; overflow-wrap: break-word; }}
 summary {{ cursor: pointer; font-weight: bold; margin: 1rem 0; }}
@@ -57,6 +60,8 @@ summary {{ cursor: pointer; font-weight: bold; margin: 1rem 0; }}
   }}
   .rows td::before {{ content: attr(data-label); color: #555; text-align: left; flex: none; max-width: 60%; }}
   .rows td:first-child {{ font-weight: bold; }}
+  .rows tr td[data-label=""], .results .rows td[data-label=""] {{ display: block; text-align: left; }}
+  .rows td[data-label=""]::before {{ display: none; }}
   .rows td:empty, .rows br, .modebar {{ display: none; }}
 }}
 </style><script>{script}</script></head><body><h1>{title}</h1>

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from armscan.tracking.client import TrackingStore
+from armscan.tracking.histories import metric_histories
 from armscan.tracking.system_metrics import PREFIX
 
 # Metrics of the clock and the machine, which are never the same twice, begin so.
@@ -94,7 +95,12 @@ class Comparison:
 
 def compare_runs(store: TrackingStore, first_id: str, second_id: str) -> Comparison:
     """Compare the metrics of two runs of a store, the earlier one first, but for those of time and machine."""
-    first, second = (_histories(store, run_id) for run_id in (first_id, second_id))
+    names = {
+        run_id: [name for name in store.get_run(run_id).data.metrics if not name.startswith(TIMES)]
+        for run_id in (first_id, second_id)
+    }
+    histories = metric_histories(store, names)
+    first, second = histories[first_id], histories[second_id]
     return Comparison(tuple(difference(name, then, second.get(name, {})) for name, then in sorted(first.items())))
 
 
@@ -108,9 +114,3 @@ def difference(metric: str, then: Mapping[int, float], now: Mapping[int, float])
     sizes = {step: 0.0 if then[step] == now[step] else abs(then[step] - now[step]) for step in common}
     at = max(common, key=lambda step: sizes[step])
     return Difference(metric, len(common), n_missing, n_new, sizes[at], at, then[at], now[at])
-
-
-def _histories(store: TrackingStore, run_id: str) -> dict[str, dict[int, float]]:
-    metrics = store.get_run(run_id).data.metrics
-    names = [name for name in metrics if not name.startswith(TIMES)]
-    return {name: {point.step: point.value for point in store.get_metric_history(run_id, name)} for name in names}

@@ -116,21 +116,25 @@ class ResultTable:
         return self.lines(width)
 
     def html(self) -> str:
-        """Return the table as HTML, a line for each result."""
-        headings = ["", *self.facts, *(column.title for column in self.quantities), *COUNTS]
-        head = "".join(f"<th>{html.escape(heading)}</th>" for heading in headings)
-        lines = []
-        for number, (name, result) in enumerate(self.results.items()):
-            facts = [html.escape(values[number]) for values in self.facts.values()]
-            cells = [_html_cell(result, column) for column in self.quantities]
-            counts = [_count(result, count) for count in COUNTS.values()]
-            labelled = zip(headings, (html.escape(name), *facts, *cells, *counts), strict=True)
-            lines.append(
-                "".join(f'<td data-label="{html.escape(label)}"><div>{cell}</div></td>' for label, cell in labelled)
-            )
-        body = "".join(f"<tr>{line}</tr>" for line in lines)
+        """Return the table as HTML: a column for each of a few results, a line for each of many."""
+        results, is_few = self.results.values(), len(self.results) <= MOST_ABREAST
+        names = [*map(html.escape, self.results)]
+        facts = [[html.escape(heading), *map(html.escape, values)] for heading, values in self.facts.items()]
+        if facts and not is_few:
+            told = [", ".join(filter(None, each)) for each in zip(*(values for _, *values in facts), strict=True)]
+            names = [f"{name}<br> <small>{each}</small>" for name, each in zip(names, told, strict=True)]
+        columns = [
+            ["", *names],
+            *(facts if is_few else ()),
+            *([html.escape(each.title), *(_html_cell(result, each) for result in results)] for each in self.quantities),
+            *([title, *(_count(result, name) for result in results)] for title, name in COUNTS.items()),
+        ]
+        labels, *lines = columns if is_few else zip(*columns, strict=True)
+        head = "".join(f"<th>{label}</th>" for label in labels)
+        body = "".join(f"<tr>{''.join(map(_labelled, labels, line))}</tr>" for line in lines)
         drawn = f'<table class="rows"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
-        return f'<div class="results"><div class="table">{drawn}</div><p><small>{HOW}</small></p></div>'
+        kind = "results" if is_few else "results lines"
+        return f'<div class="{kind}"><div class="table">{drawn}</div><p><small>{HOW}</small></p></div>'
 
     def markdown(self) -> str:
         """Return the table in Markdown, a column for each result."""
@@ -237,6 +241,10 @@ def _count(result: MetricEstimates, name: str) -> str:
 def _html_cell(result: MetricEstimates, column: Quantity) -> str:
     value, interval = _cell(result, column)
     return f"{value}<br> <small>{interval}</small>"
+
+
+def _labelled(label: str, cell: str) -> str:
+    return f'<td data-label="{label}"><div>{cell}</div></td>'
 
 
 def _width(column: Column) -> int:

@@ -22,6 +22,7 @@ TITLES = {
 # What a few lines have place for, beside the on-plane rates.
 LEADING = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
 COSTS = ("env_steps", "training_s")
+FORMS = {each.metric: each.form for each in QUANTITIES} | {"mean_return": "{:.2f}", "training_s": "{:.1f}"}
 
 
 def leading_among(metrics: Iterable[str]) -> list[str]:
@@ -42,5 +43,6 @@ def is_rate(metric: str) -> bool:
 
 
 def value_text(metric: str, value: float) -> str:
-    """Return a value of a metric as people read it: a share in percent, other numbers with four digits."""
-    return f"{value:.1%}" if is_rate(metric) else f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    """Return a value of a metric as tables show it: a share in percent, distances with one digit after the point."""
+    form = "{:.1%}" if is_rate(metric) else "{:,.0f}" if abs(value) >= 1000 else FORMS.get(metric, "{:.4g}")
+    return form.format(value)

@@ -125,7 +125,7 @@ def test_curves_have_markers_and_videos_come_after_charts(written, make_training
 def test_long_tables_are_folded_and_name_their_cells_for_a_phone(written, make_training):
     page, _ = written(*(make_training(seed) for seed in range(30)))
     assert "<summary>All 30 runs</summary>" in page
-    assert '<td data-label="on plane, 5 mm 10°">' in page
+    assert '<td data-label="1. ' in page
     assert '<td data-label="status"><div>finished</div></td>' in page
 
 

@@ -134,6 +134,17 @@ def test_many_results_are_lines_and_what_does_not_fit_is_named():
     assert "artery" in wide
 
 
+def test_page_has_a_column_for_each_of_a_few_results_and_a_line_for_each_of_many():
+    figures = MetricEstimates.of(Evaluation(made_episodes(3)))
+    few, many = (ResultTable({str(number): figures for number in range(n)}).html() for n in (2, 9))
+    assert '<tr><td data-label=""><div>steps, mean</div></td><td data-label="0"><div>' in few
+    assert '<td data-label="steps, mean"><div>' in many
+    assert few.count("<tr>") == 1 + few.count('data-label=""') == 1 + few.count('data-label="1"')
+    assert many.count("<tr>") == 1 + 9
+    of_jobs = ResultTable({str(number): figures for number in range(9)}, {"run": ["4f2a"] * 9, "outcome": ["done"] * 9})
+    assert of_jobs.html().count("<small>4f2a, done</small>") == 9
+
+
 def test_names_are_no_markup():
     figures = MetricEstimates.of(evaluation_of(2))
     table = ResultTable({"projection=[rz,ty]": figures}, {"overrides": ["<b>[red]"]})

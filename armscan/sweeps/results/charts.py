@@ -14,7 +14,7 @@ from optuna.trial import FrozenTrial, TrialState
 from optuna.visualization import plot_parallel_coordinate, plot_pareto_front
 from plotly.graph_objects import Figure, Scatter
 
-from armscan.reports.chart_style import BLUE, GREY, ORANGE, RED, mode
+from armscan.reports.chart_style import BLUE, GREY, ORANGE, RATE_AXIS, RED, mode
 from armscan.reports.html import chart
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible
@@ -23,7 +23,7 @@ from armscan.sweeps.storage.reports import reports_of
 from armscan.training.titles import is_rate, title_of
 
 HEIGHT_PX, SMALL_PX, BAR_PX = 360, 260, 34
-PERCENT = {"tickformat": ".0%"}
+MOST_TICKS = 20
 
 
 def charts_of(
@@ -74,7 +74,7 @@ def _value(number: int) -> Callable[[FrozenTrial], float]:
 
 def _axis(metric: str) -> dict[str, Any]:
     """Return how the axis of a metric is drawn."""
-    return {"title": title_of(metric)} | (PERCENT if is_rate(metric) else {})
+    return {"title": title_of(metric)} | (RATE_AXIS if is_rate(metric) else {})
 
 
 def _said(trial: FrozenTrial) -> str:
@@ -92,13 +92,14 @@ def _history(trials: Sequence[FrozenTrial], number: int, objective: str, directi
         numbers, values = [trial.number for trial in drawn], list(map(_value(number), drawn))
         if drawn:
             figure.add_scatter(x=numbers, y=values, name=name, **points, **hover)
+    axis = {"title": "trial", "tick0": 0, "dtick": 1 + trials[-1].number // MOST_TICKS}
     feasible = list(filter(is_feasible, trials))
     numbers, values = [trial.number for trial in feasible], list(map(_value(number), feasible))
     best = list(accumulate(values, max if direction == StudyDirection.MAXIMIZE else min))
     line = {"color": ORANGE, "width": 2, "shape": "hv"}
     figure.add_scatter(x=numbers, y=best, mode=mode(len(best)), line=line, marker={"size": 4}, name="best so far")
     legend = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0}
-    return figure.update_layout(height=HEIGHT_PX, xaxis_title="trial", yaxis=_axis(objective), legend=legend)
+    return figure.update_layout(height=HEIGHT_PX, xaxis=axis, yaxis=_axis(objective), legend=legend)
 
 
 def _is_infeasible(trial: FrozenTrial) -> bool:
@@ -110,7 +111,7 @@ def _importance(rows: Sequence[Mapping[str, Any]]) -> Figure:
     figure = Figure()
     bar = {"orientation": "h", "marker": {"color": BLUE}, "texttemplate": "%{x:.0%}", "textposition": "auto"}
     figure.add_bar(x=[row["importance"] for row in rows], y=[row["key"] for row in rows], **bar)
-    figure.update_yaxes(autorange="reversed").update_xaxes(rangemode="tozero", **PERCENT)
+    figure.update_yaxes(autorange="reversed").update_xaxes(rangemode="tozero", tickformat=".0%")
     return figure.update_layout(height=90 + BAR_PX * len(rows))
 
 

@@ -19,7 +19,7 @@ from armscan.sweeps.scheduling.state import CONTROL, METRICS
 from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, training_of
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, best_trials
 from armscan.training.metrics import ENDS
-from armscan.training.titles import is_rate, leading_among, title_of
+from armscan.training.titles import is_rate, leading_among, title_of, value_text
 
 MAXIMIZE = "maximize"
 HOW = (
@@ -52,8 +52,9 @@ class Difference(NamedTuple):
 
     def row(self) -> dict[str, str]:
         """Return what a table shows of it, by column."""
-        unit, factor = (" points", 100.0) if is_rate(self.metric) else ("", 1.0)
-        value, low, high = (f"{factor * each:+.3g}" for each in self.paired)
+        unit = " points" if is_rate(self.metric) else ""
+        sizes = (value_text(self.metric, abs(each)).removesuffix("%") for each in self.paired)
+        value, low, high = (f"{'-' if each < 0 else '+'}{size}" for each, size in zip(self.paired, sizes, strict=True))
         interval = f"{low} to {high}" if math.isfinite(self.paired.low) else ""
         if self.paired.low == self.paired.high:
             interval = "none: all differences are alike"

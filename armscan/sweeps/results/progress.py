@@ -40,7 +40,7 @@ from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, n
 from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import trial_folder
-from armscan.training.titles import title_of
+from armscan.training.titles import title_of, value_text
 from armscan.utils.console import WHOLE_CHARS, wide_console
 from armscan.utils.files import RUN_FILE
 from armscan.utils.retry import no_retry
@@ -197,11 +197,12 @@ def print_result(opened: OpenedStudy) -> int:
         print(printable(f"the study has ended by itself: {ended}; study.n_trials or study.terminator change that"))
     if settings.constraints and state.finished and not best_trials(scheduler.study, 1):
         print(f"no trial keeps all constraints: {', '.join(map(str, settings.constraints))}")
-    table = Table("trial", *settings.objectives, "values", title="best while searching", title_justify="left")
+    titles = map(title_of, settings.objectives)
+    table = Table("trial", *titles, "values", title="best while searching", title_justify="left")
     for trial in best_trials(scheduler.study, max(1, settings.final_eval.top_k)):
         table.add_row(
             str(trial.number),
-            *(f"{value:.4g}" for value in trial.values),
+            *map(value_text, settings.objectives, trial.values),
             " ".join(overrides_of(searched_values(trial))),
         )
     wide_console(WHOLE_CHARS).print(table)

@@ -3,37 +3,23 @@
 from __future__ import annotations
 
 import html
-import json
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
-from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.reports.html import folded, table, video_address, write_page
 from armscan.sweeps.results.charts import charts_of
+from armscan.sweeps.results.csv_tables import all_numbers, cause_of
 from armscan.sweeps.results.judgement import HOW, Judgement, judge
 from armscan.sweeps.results.population_charts import population_charts
-from armscan.sweeps.results.selection import candidates_of, decided, score_rows
+from armscan.sweeps.results.selection import candidates_of, decided
 from armscan.sweeps.results.summary import ConfigResult, final_results, final_table
-from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import (
-    ENV_STEPS,
-    FAILURE,
     FINALIST,
-    GENERATION,
     LEASE,
-    MEMBER,
-    METRICS,
-    PARENT,
-    RETRIED,
-    RETRY_OF,
-    SCHEDULE,
-    STOP,
     TAKEN_FROM,
     StudyState,
     env_steps_of,
@@ -41,13 +27,11 @@ from armscan.sweeps.scheduling.state import (
 )
 from armscan.sweeps.scheduling.termination import REASON, TERMINATED
 from armscan.sweeps.space.parameter import overrides_of
-from armscan.sweeps.storage.reports import reports_of
-from armscan.sweeps.study.final_eval import FinalEvaluation, key_of, name_of, settings_of
+from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, settings_of
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import FOLDER, RUN
 from armscan.training.titles import title_of, value_text
 
-MIN_TRIALS_FOR_IMPORTANCE = 4
 ID_CHARS = 8
 # How people say the states of trials.
 STATES = {"complete": "finished", "fail": "failed"}
@@ -82,26 +66,7 @@ def write_report(
     candidates = candidates_of(final) if final is not None else []
     # Of an earlier version: its best configurations, without a control.
     found = final_results(final_trials) if final is None else judgement.results if judgement is not None else ()
-    shares = _importances(study, objectives)
-    tables = {
-        "trials": [_trial_row(trial, objectives) for trial in trials],
-        "reports": [
-            {"trial": trial.number, "step": step, "objective": name, "value": value}
-            for trial in trials
-            for step, values in reports_of(trial).items()
-            for name, value in zip(objectives, values, strict=True)
-        ],
-        "endings": _endings(trials),
-        "failures": [
-            {"trial": trial.number, "cause": _cause(trial), "values": " ".join(overrides_of(searched_values(trial)))}
-            for trial in trials
-            if trial.state == TrialState.FAIL
-        ],
-        "result": list(_result_rows(found)),
-        "importances": shares,
-        "selection": [*score_rows(candidates)],
-        "differences": [*_difference_rows(judgement)] if judgement is not None else [],
-    }
+    tables = all_numbers(study, trials, found, candidates, judgement)
     parts = [
         _summary(study, trials, objectives),
         "<h2>Result</h2>",
@@ -110,12 +75,12 @@ def write_report(
         decided(final, judgement, candidates, StudyState.of(trials)) if final is not None else "",
         _running(trials),
         *population_charts(trials, objectives[0], *best_trials(study, 1) or (None,)),
-        *charts_of(study, trials, objectives, shares),
+        *charts_of(study, trials, objectives, tables["importances"]),
         _videos(final_trials),
         "<h2>Trials</h2>",
         _trials(trials, objectives) if trials else "<p>No trial has been begun.</p>",
         "<h2>How trials have ended</h2>",
-        table([row | {"ending": _said(row["ending"])} for row in tables["endings"]]),
+        table([{**row, "ending": _said(row["ending"])} for row in tables["endings"]]),
         "<h2>Failures</h2>",
         _failures(trials),
     ]
@@ -129,10 +94,12 @@ def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Seq
     taken = f"; {len(state.taken)} were taken from other studies" if state.taken else ""
     violating = f", {n_infeasible} infeasible" if n_infeasible else ""
     ended = study.user_attrs.get(TERMINATED, {}).get(REASON)
+    hours = state.busy_hours
     text = (
         f"{len(state.finished)} trials finished, {n_pruned} of them pruned{violating}; {len(state.running)} running, "
         f"{len(state.failed)} failed, {len(state.retried)} retried after their worker died{taken}. "
-        f"{state.env_steps:,} environment steps, {state.busy_hours:.2g} hours."
+        f"{state.env_steps:,} environment steps in "
+        f"{f'{hours:.1f} hours' if hours >= 1 else f'{60 * hours:.1f} minutes'}."
     )
     if ended:
         text += f" The study has ended by itself: {html.escape(ended)}."
@@ -197,7 +164,7 @@ def _ended(trial: FrozenTrial) -> str:
 
 def _failures(trials: Sequence[FrozenTrial]) -> str:
     failed = [trial for trial in trials if trial.state == TrialState.FAIL]
-    rows = [{"trial": trial.number, "cause": _cause(trial), **_settings(trial)} for trial in failed]
+    rows = [{"trial": trial.number, "cause": cause_of(trial), **_settings(trial)} for trial in failed]
     return table(rows, what="failures") if rows else "<p>No trial has failed.</p>"
 
 
@@ -222,49 +189,6 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
     return f'<h2>Episodes on a test volume</h2><div class="videos">{"".join(videos.values())}</div>'
 
 
-def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> dict[str, Any]:
-    values = dict(zip(objectives, trial.values or (), strict=False)) if trial.state == TrialState.COMPLETE else {}
-    seconds = trial.duration.total_seconds() if trial.duration is not None else None
-    metrics = {f"figure/{name}": value for name, value in trial.user_attrs.get(METRICS, {}).items()}
-    return {
-        "trial": trial.number,
-        "state": trial.state.name.lower(),
-        **values,
-        **({"feasible": is_feasible(trial)} if trial.constraints else {}),
-        "seconds": seconds,
-        "env_steps": trial.user_attrs.get(ENV_STEPS),
-        "retry_of": trial.user_attrs.get(RETRY_OF),
-        **({"taken_from": trial.user_attrs[TAKEN_FROM]} if TAKEN_FROM in trial.user_attrs else {}),
-        **{name: trial.user_attrs[name] for name in (MEMBER, GENERATION, PARENT) if name in trial.user_attrs},
-        **({SCHEDULE: json.dumps(trial.user_attrs[SCHEDULE])} if SCHEDULE in trial.user_attrs else {}),
-        "mlflow_run": trial.user_attrs.get(RUN),
-        **trial.params,
-        **metrics,
-    }
-
-
-def _endings(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
-    """Return how many trials have ended in each way, and for which cause."""
-    of_ending: dict[tuple[str, str], list[int]] = {}
-    for trial in trials:
-        cause = ""
-        if trial.state == TrialState.FAIL:
-            cause = _cause(trial) + (", retried" if RETRIED in trial.user_attrs else "")
-        elif trial.state == TrialState.PRUNED:
-            cause = f"behind the others at environment step {max(reports_of(trial), default='unknown')}"
-            if STOP in trial.user_attrs:
-                cause = f"stopped: {trial.user_attrs[STOP]}"
-        of_ending.setdefault((trial.state.name.lower(), cause), []).append(trial.number)
-    return [
-        {"ending": ending, "cause": cause, "trials": len(numbers), "which": " ".join(map(str, numbers))}
-        for (ending, cause), numbers in sorted(of_ending.items())
-    ]
-
-
-def _cause(trial: FrozenTrial) -> str:
-    return str(trial.user_attrs.get(FAILURE, "not known"))
-
-
 def _judgement(judgement: Judgement) -> str:
     """Return the result in a sentence, and the differences to the control."""
     notes = "".join(f"<p>Note: {html.escape(note)}.</p>" for note in judgement.notes)
@@ -273,17 +197,6 @@ def _judgement(judgement: Judgement) -> str:
         return said
     seeds = f"Both were trained with the same {judgement.n_seeds} seeds, which nothing before has used."
     return f"{said}{table([each.row() for each in judgement.differences])}<p>{HOW} {seeds}</p>"
-
-
-def _difference_rows(judgement: Judgement) -> Iterator[Row]:
-    for each in judgement.differences:
-        yield {
-            "chosen": key_of(judgement.chosen),
-            "figure": f"test/{each.metric}",
-            "seeds": judgement.n_seeds,
-            **dict(zip(("difference", "low", "high"), each.paired, strict=True)),
-            **dict(zip(("probability", "probability_low", "probability_high"), each.probability, strict=True)),
-        }
 
 
 def _result(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> str:
@@ -295,34 +208,3 @@ def _result(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> str
     typed = folded("As words of the command line, with all digits", f"<ul>{items}</ul>") if items else ""
     shown = f"<h3>Their settings</h3>{table(rows)}{typed}" if items else ""
     return f"{final_table(found).html()}{shown}"
-
-
-def _result_rows(found: Sequence[ConfigResult]) -> Iterator[dict[str, Any]]:
-    """Yield every figure of the result, also those of the baselines."""
-    for result in found:
-        for of, figures in {"agent": result.figures, **result.baselines}.items():
-            for name, (value, low, high) in figures.estimates.items():
-                row = {"trial": key_of(result.number), "of": of, "seeds": figures.n_seeds, "figure": f"test/{name}"}
-                yield row | {"value": value, "low": low, "high": high}
-
-
-def _importances(study: optuna.Study, objectives: Sequence[str]) -> list[dict[str, Any]]:
-    """Return which share of the differences between trials each key explains; none where too few have finished."""
-    # PED-ANOVA: Watanabe et al. 2023, arXiv:2304.10255.
-    rows: list[dict[str, Any]] = []
-    if len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) < MIN_TRIALS_FOR_IMPORTANCE:
-        return rows
-    for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):
-        # Low is good for the evaluator.
-        sign = -1.0 if direction == StudyDirection.MAXIMIZE else 1.0
-        target = _value(number, sign) if len(objectives) > 1 else None
-        with warnings.catch_warnings():
-            # That low is good.
-            warnings.simplefilter("ignore")
-            shares = get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), target=target)
-        rows += [{"objective": objective, "key": key, "importance": share} for key, share in shares.items()]
-    return rows
-
-
-def _value(number: int, sign: float) -> Callable[[FrozenTrial], float]:
-    return lambda trial: sign * float(trial.values[number])

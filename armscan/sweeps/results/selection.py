@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 from optuna.trial import TrialState
 from plotly.graph_objects import Figure
 
-from armscan.reports.chart_style import BLUE, GREY, ORANGE
+from armscan.reports.chart_style import BLUE, GREY, ORANGE, RATE_AXIS
 from armscan.reports.html import chart, table
 from armscan.stats.bootstrap import Estimate
-from armscan.sweeps.results.charts import PERCENT
 from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.scheduling.race import DROP_LEVEL, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
@@ -124,7 +123,7 @@ def selection_chart(candidates: Sequence[Candidate], objective: str) -> Figure:
             showlegend=False,
         )
     axis: dict[str, Any] = {"title": f"{title_of(objective)}, validation volumes"}
-    figure.update_xaxes(**axis, **(PERCENT if is_rate(objective) else {}))
+    figure.update_xaxes(**axis, **(RATE_AXIS if is_rate(objective) else {}))
     figure.update_yaxes(autorange="reversed", automargin=True, categoryorder="array", categoryarray=labels)
     return figure.update_layout(height=AROUND_PX + ROW_PX * len(candidates))
 

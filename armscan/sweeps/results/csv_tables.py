@@ -1,0 +1,162 @@
+"""Every number of a study's report, as rows of CSV files."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+
+import optuna
+from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, TrialState
+
+from armscan.reports.html import Row
+from armscan.sweeps.results.judgement import Judgement
+from armscan.sweeps.results.selection import Candidate, score_rows
+from armscan.sweeps.results.summary import ConfigResult
+from armscan.sweeps.scheduling.population import searched_values
+from armscan.sweeps.scheduling.state import (
+    ENV_STEPS,
+    FAILURE,
+    GENERATION,
+    MEMBER,
+    METRICS,
+    PARENT,
+    RETRIED,
+    RETRY_OF,
+    SCHEDULE,
+    STOP,
+    TAKEN_FROM,
+    is_feasible,
+)
+from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.reports import reports_of
+from armscan.sweeps.study.final_eval import key_of
+from armscan.sweeps.tasks.attempt import RUN
+
+MIN_TRIALS_FOR_IMPORTANCE = 4
+
+
+def all_numbers(
+    study: optuna.Study,
+    trials: Sequence[FrozenTrial],
+    found: Sequence[ConfigResult],
+    candidates: Sequence[Candidate],
+    judgement: Judgement | None,
+) -> dict[str, list[Row]]:
+    """Return the tables by the names of their files.
+
+    Args:
+        study: Study in its storage.
+        trials: Its trials.
+        found: Results on the test volumes; empty without a final evaluation.
+        candidates: Candidates of the selection; empty without one.
+        judgement: Judgement of the chosen configuration; None before one was chosen.
+    """
+    objectives = list(study.user_attrs["objectives"])
+    return {
+        "trials": [_trial_row(trial, objectives) for trial in trials],
+        "reports": [
+            {"trial": trial.number, "step": step, "objective": name, "value": value}
+            for trial in trials
+            for step, values in reports_of(trial).items()
+            for name, value in zip(objectives, values, strict=True)
+        ],
+        "endings": _ending_rows(trials),
+        "failures": [
+            {"trial": trial.number, "cause": cause_of(trial), "values": " ".join(overrides_of(searched_values(trial)))}
+            for trial in trials
+            if trial.state == TrialState.FAIL
+        ],
+        "result": list(_result_rows(found)),
+        "importances": _importance_rows(study, objectives),
+        "selection": [*score_rows(candidates)],
+        "differences": [*_difference_rows(judgement)] if judgement is not None else [],
+    }
+
+
+def cause_of(trial: FrozenTrial) -> str:
+    """Return why a trial has failed."""
+    return str(trial.user_attrs.get(FAILURE, "not known"))
+
+
+def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> Row:
+    values = dict(zip(objectives, trial.values or (), strict=False)) if trial.state == TrialState.COMPLETE else {}
+    seconds = trial.duration.total_seconds() if trial.duration is not None else None
+    metrics = {f"figure/{name}": value for name, value in trial.user_attrs.get(METRICS, {}).items()}
+    return {
+        "trial": trial.number,
+        "state": trial.state.name.lower(),
+        **values,
+        **({"feasible": is_feasible(trial)} if trial.constraints else {}),
+        "seconds": seconds,
+        "env_steps": trial.user_attrs.get(ENV_STEPS),
+        "retry_of": trial.user_attrs.get(RETRY_OF),
+        **({"taken_from": trial.user_attrs[TAKEN_FROM]} if TAKEN_FROM in trial.user_attrs else {}),
+        **{name: trial.user_attrs[name] for name in (MEMBER, GENERATION, PARENT) if name in trial.user_attrs},
+        **({SCHEDULE: json.dumps(trial.user_attrs[SCHEDULE])} if SCHEDULE in trial.user_attrs else {}),
+        "mlflow_run": trial.user_attrs.get(RUN),
+        **trial.params,
+        **metrics,
+    }
+
+
+def _ending_rows(trials: Sequence[FrozenTrial]) -> list[Row]:
+    """Return how many trials have ended in each way, and for which cause."""
+    of_ending: dict[tuple[str, str], list[int]] = {}
+    for trial in trials:
+        cause = ""
+        if trial.state == TrialState.FAIL:
+            cause = cause_of(trial) + (", retried" if RETRIED in trial.user_attrs else "")
+        elif trial.state == TrialState.PRUNED:
+            cause = f"behind the others at environment step {max(reports_of(trial), default='unknown')}"
+            if STOP in trial.user_attrs:
+                cause = f"stopped: {trial.user_attrs[STOP]}"
+        of_ending.setdefault((trial.state.name.lower(), cause), []).append(trial.number)
+    return [
+        {"ending": ending, "cause": cause, "trials": len(numbers), "which": " ".join(map(str, numbers))}
+        for (ending, cause), numbers in sorted(of_ending.items())
+    ]
+
+
+def _difference_rows(judgement: Judgement) -> Iterator[Row]:
+    for each in judgement.differences:
+        yield {
+            "chosen": key_of(judgement.chosen),
+            "figure": f"test/{each.metric}",
+            "seeds": judgement.n_seeds,
+            **dict(zip(("difference", "low", "high"), each.paired, strict=True)),
+            **dict(zip(("probability", "probability_low", "probability_high"), each.probability, strict=True)),
+        }
+
+
+def _result_rows(found: Sequence[ConfigResult]) -> Iterator[Row]:
+    """Yield every figure of the result, also those of the baselines."""
+    for result in found:
+        for of, figures in {"agent": result.figures, **result.baselines}.items():
+            for name, (value, low, high) in figures.estimates.items():
+                row = {"trial": key_of(result.number), "of": of, "seeds": figures.n_seeds, "figure": f"test/{name}"}
+                yield row | {"value": value, "low": low, "high": high}
+
+
+def _importance_rows(study: optuna.Study, objectives: Sequence[str]) -> list[Row]:
+    """Return which share of the differences between trials each key explains; none where too few have finished."""
+    # PED-ANOVA: Watanabe et al. 2023, arXiv:2304.10255.
+    rows: list[Row] = []
+    if len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) < MIN_TRIALS_FOR_IMPORTANCE:
+        return rows
+    for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):
+        # Low is good for the evaluator.
+        sign = -1.0 if direction == StudyDirection.MAXIMIZE else 1.0
+        target = _value(number, sign) if len(objectives) > 1 else None
+        with warnings.catch_warnings():
+            # That low is good.
+            warnings.simplefilter("ignore")
+            shares = get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), target=target)
+        rows += [{"objective": objective, "key": key, "importance": share} for key, share in shares.items()]
+    return rows
+
+
+def _value(number: int, sign: float) -> Callable[[FrozenTrial], float]:
+    return lambda trial: sign * float(trial.values[number])
