@@ -52,7 +52,7 @@ def blocks(page, language):
 
 def commands(page):
     """Yield the words of each armscan command in a page's shell blocks."""
-    for line in "\n".join(blocks(page, "sh")).splitlines():
+    for line in "\n".join(blocks(page, "sh")).replace("\\\n", " ").splitlines():
         words = shlex.split(line, comments=True)
         if words[:3] in (["python", "-m", "armscan.run"], [".venv/bin/python", "-m", "armscan.run"]):
             yield ["run", *words[3:]]
