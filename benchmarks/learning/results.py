@@ -122,8 +122,8 @@ def table() -> str:
     """Return all that is kept as two Markdown tables: the figures of each seed, and the goals."""
     kept = json.loads(FIGURES.read_text())
     lines = [
-        "| | success, % | mean steps | not started solved | median distance | training, s |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| | success, % | mean steps | success\\*, % | mean steps\\* | median, mm | median, ° | training, s |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     goals = ["| | success | mean steps | training | reached by |", "| --- | --- | --- | --- | --- |"]
     for name, row in ROWS.items():
@@ -133,13 +133,10 @@ def table() -> str:
                 f"{row.title} (`{name}`)",
                 _joined(of_seeds, "success", "{:.1f}", 100),
                 _joined(of_seeds, "mean_steps", "{:.2f}"),
-                _joined(of_seeds, "success_not_started_solved", "{:.1f}", 100)
-                + " %; "
-                + _joined(of_seeds, "mean_steps_not_started_solved", "{:.2f}"),
-                _joined(of_seeds, "median_distance_mm", "{:.1f}")
-                + " mm; "
-                + _joined(of_seeds, "median_distance_deg", "{:.1f}")
-                + "°",
+                _joined(of_seeds, "success_not_started_solved", "{:.1f}", 100),
+                _joined(of_seeds, "mean_steps_not_started_solved", "{:.2f}"),
+                _joined(of_seeds, "median_distance_mm", "{:.1f}"),
+                _joined(of_seeds, "median_distance_deg", "{:.1f}"),
                 _joined(of_seeds, "training_s", "{:.0f}"),
             ]
             lines.append("| " + " | ".join(cells) + " |")
