@@ -60,7 +60,7 @@ class BaseLearner(ABC):
 class SupervisedLearner(BaseLearner):
     """A learner of one network that the environments teach the optimal planes of their episodes.
 
-    Every epoch begins with new episodes and draws everything from `seed` and its own number, so that it goes on from
+    Every epoch begins with new episodes and draws everything from `seed` and its own number, so that it continues from
     its state bit for bit.
 
     Args:

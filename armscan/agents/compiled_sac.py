@@ -40,7 +40,7 @@ class UpdateStats(sac.SACTrainingStats):
 class CompiledSAC(sac.SAC[Any]):
     """Tianshou's SAC with compiled gradient steps, each of which replaces some 9,500 Python calls.
 
-    Batches and noise are drawn as Tianshou draws them, so that both updates agree but for rounding, and each can go on
+    Batches and noise are drawn as Tianshou draws them, so that both updates agree but for rounding, and each can resume
     from the other's state. Policy, buffer, collector, trainer and the format of the state are Tianshou's.
 
     Args:

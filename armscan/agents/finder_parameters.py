@@ -112,5 +112,5 @@ class FinderParameters:
 
     @property
     def n_looks(self) -> int:
-        """Slices that an episode takes, the start among them; the plane that it answers is not looked at."""
+        """Slices that an episode takes, the start included; the plane that it returns is not looked at."""
         return len(self.offsets_mm)

@@ -20,7 +20,7 @@ Seen = list[tuple[bytes, int]]
 
 
 def replay_for(observation_space: spaces.Space[Any], size: int, n_envs: int) -> Replay:
-    """Return the replay buffer that suits the observations: a plain one where there are no images among them."""
+    """Return the replay buffer that suits the observations: a plain one if there are no images among them."""
     images = images_of(observation_space)
     return ImageReplay(size, n_envs, images) if images else Replay(size, n_envs)
 
@@ -48,7 +48,7 @@ class ImageReplay(Replay):
         self._last: dict[tuple[str, str], tuple[NDArray[np.int32], Pixels]] = {}
 
     def add(self, batch: Any, buffer_ids: Any = None) -> Added:
-        """Add a transition of each of these environments, which are all where none are named."""
+        """Add a transition of each of these environments, which are all if none are named."""
         envs = range(self.buffer_num) if buffer_ids is None else [int(i) for i in buffer_ids]
         slots = [self._offset[i] + self.buffers[i]._insertion_idx for i in envs]
         self._last.clear()

@@ -13,7 +13,7 @@ class EvenUpdatesTrainer(OffPolicyTrainer):
     """Tianshou's trainer, which would round the gradient steps of every collection by itself, and refuse to have none.
 
     What is due is counted from the first collection on, so that it follows from the environment steps alone: a
-    training that goes on later takes the same gradient steps as one that was never cut off. No progress bar is shown.
+    training that continues later takes the same gradient steps as one that was never cut off. No progress bar is shown.
 
     Args:
         algorithm: Algorithm to train.

@@ -57,7 +57,7 @@ class OptunaSearch:
 
 
 class OptunaAgent:
-    """Asks a study for planes and tells it their rewards; `names` are those of the action's components."""
+    """Agent that asks a study for planes and tells it their rewards; `names` are those of the action's components."""
 
     def __init__(self, names: Sequence[str], search: OptunaSearch) -> None:
         self._names = tuple(names)

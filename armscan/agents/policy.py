@@ -18,7 +18,7 @@ Batch = torch.Tensor | dict[str, torch.Tensor]
 
 
 class Policy(nn.Module):
-    """A copy of a learner's actor, in 32 bits on the CPU, with the mean of its actions as its answer.
+    """A copy of a learner's actor, in 32 bits on the CPU, that returns the mean of its actions.
 
     Args:
         actor: Actor that returns mean and spread of the actions.

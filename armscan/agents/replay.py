@@ -32,7 +32,7 @@ class Replay(VectorReplayBuffer):
         return False
 
     def add(self, batch: Any, buffer_ids: Any = None) -> Added:
-        """Add a transition of each of these environments, which are all where none are named.
+        """Add a transition of each of these environments, which are all if none are named.
 
         Args:
             batch: Parts of the transitions by name, a `Batch` or a dict, each of shape (n, ...).
@@ -84,7 +84,7 @@ class Replay(VectorReplayBuffer):
             ring._ep_return, ring._ep_len, ring._ep_start_idx = 0.0, 0, ring._insertion_idx
 
     def state(self) -> Tree:
-        """Return all transitions and where each ring goes on, for after `cut_off`."""
+        """Return all transitions and where each ring continues, for after `cut_off`."""
         rings = [(ring._insertion_idx, len(ring), int(ring.last_index[0])) for ring in self.buffers]
         return {"transitions": _tensors(self._meta) if len(self) else {}, "rings": rings}
 

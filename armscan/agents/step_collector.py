@@ -121,8 +121,8 @@ class StepCollector(Collector[CollectStats]):
             sent: The same actions in the form that the environments take.
 
         Returns:
-            The observations to go on from, those of new episodes included; and the returns and lengths of the episodes
-            that have ended, shape (2, n_ended).
+            The next observations, those of new episodes included; and the returns and lengths of the episodes that have
+            ended, shape (2, n_ended).
         """
         observations_next, rewards, terminated, truncated = self._envs.advance(sent)
         done = terminated | truncated

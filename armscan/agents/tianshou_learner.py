@@ -42,7 +42,7 @@ class TianshouLearner(BaseLearner):
     for every agent, and belong to training.
 
     Every epoch begins with new episodes, and draws everything from `seed` and its own number. So nothing of an
-    episode has to be kept for a training to go on later exactly as it would have gone on at once.
+    episode has to be kept for a training to continue later exactly as it would have continued at once.
 
     Args:
         trainer: Trainer of Tianshou, with `training_parameters`.
@@ -182,7 +182,7 @@ class TianshouLearner(BaseLearner):
         return self._inference.actions(observations, episodes)
 
     def policy(self) -> Policy:
-        """Return a copy of the actor that `act` asks, with the mode of its actions as its answer."""
+        """Return a copy of the actor that `act` uses; it returns the mode of its actions."""
         policy = self._algorithm.policy
         return Policy(policy.actor, self._bounded, self._compute, is_sampling=not policy.deterministic_eval)
 

@@ -43,7 +43,7 @@ class Clusters:
 
     @property
     def mean_centre(self) -> NDArray[np.float64]:
-        """Mean of the clusters' centres, (across, depth) in pixels; zeros where there is no cluster."""
+        """Mean of the clusters' centres, (across, depth) in pixels; zeros if there is no cluster."""
         return self.centres.mean(axis=0) if len(self) else np.zeros(2)
 
 
@@ -95,7 +95,7 @@ def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) ->
     """Return the Dice coefficient of each landmark tissue in two slices of one shape, by its name.
 
     It is twice the pixels that both have of the tissue, over the pixels that either has: 1 if they are the same, 0
-    where none is shared. Where neither slice shows the tissue, they agree: 1.
+    if none is shared. Where neither slice shows the tissue, they agree: 1.
 
     Args:
         slice_xz: Labels of the slice, indexed [across, depth].

@@ -68,7 +68,7 @@ class OwnFolders(SearchPathPlugin):
     """Add armscan's studies, and put the folders of the working folder before armscan's own."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Add the folders, where it is armscan that is configured."""
+        """Add the folders, if it is armscan that is configured."""
         if any(each.path == str(config_folder()) for each in search_path.get_path()):
             search_path.append(SWEEPS, f"{SWEEPS}://{sweeps_folder()}")
             for name, folder in own_folders().items():

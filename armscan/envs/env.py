@@ -184,7 +184,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         return _drawn(episode) if self._window is None else None
 
     def close(self) -> None:
-        """Close the window, where there is one."""
+        """Close the window, if there is one."""
         if self._window is not None:
             self._window.close()
 

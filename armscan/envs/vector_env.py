@@ -232,7 +232,7 @@ def reset_each(
     seeds: int | Sequence[int | None] | None = None,
     options: dict[str, Any] | None = None,
 ) -> tuple[Observed, dict[str, Any]]:
-    """Reset vector environments, with a seed for each where there is a list of them."""
+    """Reset vector environments, with a seed for each if there is a list of them."""
     # Gymnasium's types leave out such lists, which its own vector environments take.
     return envs.reset(seed=seeds, options=options)  # type: ignore[arg-type]
 

@@ -55,7 +55,7 @@ class Window:
             self._shown_s = time.monotonic()
 
     def close(self) -> None:
-        """Close the window; nothing happens where none is open."""
+        """Close the window; nothing happens if none is open."""
         if self._figure is not None:
             from matplotlib import pyplot
 

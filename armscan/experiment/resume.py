@@ -141,7 +141,7 @@ def _read(words: Sequence[str]) -> tuple[str, str]:
 
 
 def _folder_of(run: Run) -> Path:
-    """Return the folder of a run that this version can go on with."""
+    """Return the folder of a run that this version can continue with."""
     run_id, tags = run.info.run_id, run.data.tags
     if "folder" not in tags:
         raise ResumeError(
@@ -199,7 +199,7 @@ def _check_last_checkpoint(run: Run, folder: Path) -> None:
 
 
 def _check_volumes(run: Run, folder: Path, now: Fingerprints) -> None:
-    """Raise `ChangedVolumesError` if a run would go on with other volumes, whether it has a checkpoint or not."""
+    """Raise `ChangedVolumesError` if a run would continue with other volumes, whether it has a checkpoint or not."""
     # Of runs that were started before it was kept, the checkpoint says so.
     if SHA256_TAGS[VOLUMES_FILE] in run.data.tags:
         record = folder / VOLUMES_FILE

@@ -17,7 +17,7 @@ MAY_SET_FOLDS = (f"{FOLDS}=", f"+{FOLDS}=", "experiment=", "+experiment=")
 
 
 def with_folds(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line, as those of a grid over the folds where they ask for folds.
+    """Return the words of a command line; if they ask for folds, as a grid over the folds.
 
     What else a grid varies, such as `seed=0,1,2`, stays.
 

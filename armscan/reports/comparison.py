@@ -206,7 +206,7 @@ def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
 
 
 def _cell(probability: Estimate | None, *, is_few: bool, is_sure: bool) -> Markup:
-    """Return a cell of the matrix, in bold where there are seeds enough and the interval leaves out 0.5."""
+    """Return a cell of the matrix, in bold if there are seeds enough and the interval leaves out 0.5."""
     if probability is None:
         return Markup("<div><small>other volumes</small></div>")
     value, low, high = probability

@@ -44,9 +44,8 @@ NOTHING = Curve(np.empty(0), Band(*[np.empty(0)] * 3), 0, {})
 def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
     """Return the curve of a group over one of `AXES`; None if none of its trainings has measured the figure.
 
-    Between two validations a seed's line is straight. A training that has run to its end is carried on with its last
-    value for as long as others of its group go on; where one has not, the curve ends with it. It begins where all are
-    known.
+    Between two validations a seed's line is straight. A training that has ended keeps its last value while others of
+    its group continue. If one was cut off, the curve ends there. It begins at the first step that all have measured.
     """
     trainings = [training for training in group.trainings if figure in training.series]
     lines = [_line(training.series[figure], axis) for training in trainings]

@@ -99,7 +99,7 @@ class TrackedTraining:
 
     @property
     def fold(self) -> str | None:
-        """Fold of a cross-validation that it was tested on; None where it is of none."""
+        """Fold of a cross-validation that it was tested on; None if it is of none."""
         return self.params.get(FOLD) if self.params.get(FOLDS, UNSET) != UNSET else None
 
     @property

@@ -11,7 +11,7 @@ from armscan.stats.aggregation import FEWEST_SEEDS
 
 
 def notes_on(groups: Sequence[Group], left_out: Sequence[TrackedTraining], *, has_other_volumes: bool) -> str:
-    """Return the notes as a list, nothing where there are none; `left_out` are trainings that repeat another one."""
+    """Return the notes as a list, nothing if there are none; `left_out` are trainings that repeat another one."""
     notes = [
         *_on_folds(groups),
         *_on_seeds(groups),

@@ -42,7 +42,7 @@ def videos(groups: Sequence[Group]) -> str:
 
 
 def _median(group: Group) -> TrackedTraining | None:
-    """Return the training in the middle of those with a video; one that was not judged only where none was."""
+    """Return the training in the middle of those with a video; one that was not judged only if none was."""
     recorded = [training for training in group.trainings if training.video is not None]
     ranked = sorted((each for each in recorded if each.evaluation), key=_mean_steps) or recorded
     return ranked[(len(ranked) - 1) // 2] if ranked else None

@@ -80,7 +80,7 @@ def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
 
 
 def _folder(run: Run, runs: Mapping[str, Run], sharing: Collection[str] = ()) -> OwnFolder:
-    """Return the folder of a run alone; raise if others share it, or if the run or its parent, in `runs`, may go on."""
+    """Return the folder of a run alone; raise if others share it, or the run or its parent, in `runs`, may continue."""
     check_version(run)
     if run.info.status not in ENDED:
         raise RunSkippedError(f"it is {run.info.status}, and could be resumed from there")

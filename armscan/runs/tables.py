@@ -39,7 +39,7 @@ def format_duration(seconds: float | None) -> str:
 
 
 def format_start(run: Run) -> str:
-    """Return when a run was started: the day, or the time where it was today."""
+    """Return when a run was started: the day, or the time if it was today."""
     moment = datetime.fromtimestamp(run.info.start_time / 1000).astimezone()
     is_today = moment.date() == datetime.now().astimezone().date()
     return f"{moment:%H:%M}" if is_today else f"{moment:%Y-%m-%d}"

@@ -52,7 +52,7 @@ def over_seeds(scores: FloatArray, mean: Mean, *, seed: int = 0) -> Estimate:
         seed: Seed of the resamples. Default: 0.
 
     Returns:
-        The estimate, without an interval where there is one seed or a score is NaN.
+        The estimate, without an interval if there is one seed or a score is NaN.
     """
     value = float(mean(scores))
     if len(scores) < 2 or np.isnan(scores).any():
@@ -68,7 +68,7 @@ def band_over_seeds(scores: FloatArray) -> Band:
         scores: Scores, shape (seeds, points), all finite.
 
     Returns:
-        The band, without an interval where there is one seed.
+        The band, without an interval if there is one seed.
     """
     values = scores.mean(axis=0)
     if len(scores) < 2 or not scores.size:

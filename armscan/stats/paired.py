@@ -25,7 +25,7 @@ def paired_difference(ours: FloatArray, theirs: FloatArray) -> Estimate:
         theirs: Their scores of the same seeds and volumes.
 
     Returns:
-        The estimate; without an interval where there are one seed and one volume.
+        The estimate; without an interval if there are one seed and one volume.
 
     Raises:
         InvalidValueError: If the shapes differ.
@@ -43,7 +43,7 @@ def crossed_mean(values: FloatArray) -> tuple[Any, Any]:
         values: Values, shape (..., seeds, volumes).
 
     Returns:
-        Two arrays of shape (...); the second is NaN where there are one seed and one volume.
+        Two arrays of shape (...); the second is NaN if there are one seed and one volume.
     """
     from scipy.special import stdtrit
 

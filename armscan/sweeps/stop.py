@@ -82,7 +82,7 @@ def stop_running_trial(storage: Storage, trial_id: int) -> bool:
 
 
 def _storage_with(uri: str, name: str) -> Storage:
-    """Open a storage that has a study, to write; nothing is made where there is none."""
+    """Open a storage that has a study, to write; nothing is made if there is none."""
     there = existing_storage(uri, where="--storage")
     if there is None or name not in optuna.get_all_study_names(there.optuna):
         raise StudyError(f"the study is {name!r}, but it is not in {uri!r}: give --storage URI")

@@ -30,7 +30,7 @@ MADE_TAG = "made"
 
 
 class TrackingStore:
-    """An open store, asked as one asks `MlflowClient`, but where it is away, it is waited for.
+    """An open store with the methods of `MlflowClient`, which wait while the store is unreachable.
 
     Args:
         connect: Function that opens the store.

@@ -60,7 +60,7 @@ def _points(client: MlflowClient, run_ids: Sequence[str], name: str) -> Iterator
 
 
 def _bulk(client: MlflowClient, run_ids: Sequence[str], name: str) -> list[Point] | None:
-    """Return at most `MOST_POINTS` points of a metric; None where the store does not answer such a request."""
+    """Return at most `MOST_POINTS` points of a metric; None if the store does not answer such a request."""
     store: Any = client._tracking_client.store
     if hasattr(store, "get_metric_history_bulk"):
         points = store.get_metric_history_bulk(run_ids, name, MOST_POINTS)

@@ -210,7 +210,7 @@ class TrackedRun:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the run: FINISHED, KILLED where it was interrupted, FAILED after any other error."""
+        """Close the run: FINISHED, KILLED if it was interrupted, FAILED after any other error."""
         if error is None:
             self.end("FINISHED")
             return

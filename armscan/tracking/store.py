@@ -51,7 +51,7 @@ def open_store(
     policy: bool = True,
     retry_s: float | None = None,
 ) -> tuple[TrackingStore, str]:
-    """Open a tracking store and make the experiment where it does not exist yet.
+    """Open a tracking store and make the experiment if it does not exist yet.
 
     Args:
         uri: MLflow tracking URI, such as `sqlite:///mlruns.db` or the address of an MLflow server.
@@ -202,7 +202,7 @@ def store_errors(uri: str) -> Iterator[None]:
 
 
 def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> str:
-    """Return the id of an experiment, which is made where there is none."""
+    """Return the id of an experiment, which is made if there is none."""
     from mlflow.exceptions import MlflowException
 
     location = Path(artifacts).absolute().as_uri() if artifacts else None

@@ -32,7 +32,7 @@ RANDOM = "random"
 def evaluate_baselines(
     env: Env, *, n_episodes: int, seed: int, on_plane: tuple[OnPlane, ...] = ON_PLANE
 ) -> dict[str, Evaluation]:
-    """Return the episodes of the baselines, by their names: `random` and, where one component is free, a sweep.
+    """Return the episodes of the baselines, by their names: `random` and, if one component is free, a sweep.
 
     Args:
         env: Environment of the volumes.
@@ -61,7 +61,7 @@ def evaluate_baselines(
 
 
 def _rules_of(rules: Rules) -> str | None:
-    """Return all that episodes depend on beside the agent; None where classes of others have a part in it."""
+    """Return all that episodes depend on beside the agent; None if classes of others have a part in it."""
     parts = (rules.reward, *rules.tissues, *([rules.transform] if rules.transform else []))
     if not all(type(part).__module__.startswith("armscan.") for part in parts):
         return None

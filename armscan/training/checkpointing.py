@@ -68,7 +68,7 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
         provenance: Provenance of this training.
 
     Returns:
-        The reports of the epochs so far, for `train`; none where there is no checkpoint yet.
+        The reports of the epochs so far, for `train`; none if there is no checkpoint yet.
 
     Raises:
         CheckpointError: If a checkpoint is damaged or another run's, or the best one is missing.

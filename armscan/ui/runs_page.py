@@ -22,7 +22,7 @@ def runs_page(address: str) -> str:
         address: Address of an MLflow server that answers.
 
     Returns:
-        The page; that of all experiments where there is no run, or the server does not say.
+        The page; that of all experiments if there is no run, or the server does not say.
     """
     try:
         experiments = _asked(address, "experiments", {"max_results": MOST_EXPERIMENTS}).get("experiments", [])

@@ -25,7 +25,7 @@ def wide_console(log_chars: int = LOG_CHARS) -> Console:
 
 
 def print_table(heading: str, names: Sequence[str], columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table with a name for each row: in a column where it fits, else in a line above its row.
+    """Print a table with a name for each row: in a column if it fits, else in a line above its row.
 
     Args:
         heading: Heading of the column of names.

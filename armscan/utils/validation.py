@@ -77,7 +77,7 @@ def check_numbers(name: str, value: Any, length: int, meaning: str) -> tuple[flo
 
 
 def check_ints(name: str, value: Any, length: int | None, meaning: str, **bounds: int) -> tuple[int, ...]:
-    """Return `value` as a tuple of `length` whole numbers, of any number of them where it is None.
+    """Return `value` as a tuple of `length` whole numbers, of any number of them if it is None.
 
     Args:
         name: Name of the argument, for errors.

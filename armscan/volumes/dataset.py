@@ -44,7 +44,7 @@ class Dataset:
     excluded: dict[str, str] = field(default_factory=dict)
 
     def volumes_of(self, split: str) -> dict[str, LabelVolume]:
-        """Return the volumes of `train`, `validation` or `test` by file name; none where there are no splits."""
+        """Return the volumes of `train`, `validation` or `test` by file name; none if there are no splits."""
         check_choice("split", split, SPLITS)
         return {name: volume for name, volume in self.volumes.items() if self.splits and self.splits[name] == split}
 

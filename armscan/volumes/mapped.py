@@ -41,7 +41,7 @@ Made = tuple[LabelVolume, Any]
 
 
 def mapped_volume(path: Path, make: Callable[[], Made]) -> Made:
-    """Return a volume from its file, made and kept there where there is no sound one.
+    """Return a volume from its file, made and kept there if there is no sound one.
 
     Args:
         path: Place of the file; its name must hold everything that the volume depends on.

@@ -1,4 +1,4 @@
-"""3D Slicer's segmentations (.seg.nrrd): segments by name, in one layer or, where they overlap, in several."""
+"""3D Slicer's segmentations (.seg.nrrd): segments by name, in one layer or, if they overlap, in several."""
 
 from __future__ import annotations
 

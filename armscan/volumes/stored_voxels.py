@@ -76,7 +76,7 @@ def check_stored(path: Path, stored: StoredVoxels) -> None:
 
 
 def pieces(path: Path, file: BinaryIO, compression: int | None) -> Iterator[bytes]:
-    """Yield the rest of a file piece by piece, inflated where it is compressed.
+    """Yield the rest of a file piece by piece, inflated if it is compressed.
 
     Raises:
         VolumeError: Naming the image `path`, where what is compressed is damaged or ends too early.

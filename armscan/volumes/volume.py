@@ -25,7 +25,7 @@ RIGHT_ANGLE_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LabelVolume:
-    """An integer labelmap of an arm with its spacing and, where one is known, the plane to find.
+    """An integer labelmap of an arm with its spacing and, if one is known, the plane to find.
 
     It may be one voxel thick along an axis; a plane beside it shows background, as beside any volume.
 
@@ -127,7 +127,7 @@ class LabelVolume:
 
     @cached_property
     def slice_shape(self) -> tuple[int, int]:
-        """Shape of a slice where none is asked for: (nx, nz)."""
+        """Shape of a slice if none is asked for: (nx, nz)."""
         return self.shape[0], self.shape[2]
 
     @cached_property

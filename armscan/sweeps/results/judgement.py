@@ -82,7 +82,7 @@ class Judgement:
         differences: Differences of the objectives and of the leading metrics; none where the control was chosen.
         n_seeds: Number of seeds that both have been trained with.
         n_planned: Number of seeds that they are to be trained with.
-        others: Other trials that the test volumes have been opened for, because the study went on after its end.
+        others: Other trials that the test volumes have been opened for, because the study continued after its end.
     """
 
     chosen: int

@@ -111,7 +111,7 @@ def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Seq
 
 
 def _running(trials: Sequence[FrozenTrial]) -> str:
-    """Return a table of the trials that run, nothing where none does."""
+    """Return a table of the trials that run, nothing if none does."""
     rows = [
         {
             "trial": trial.number,

@@ -2,7 +2,7 @@
 
 A few seeds first, for all; then one seed more at a time, for those that may still be the best, as irace
 (López-Ibáñez et al. 2016) and SMAC's intensification do. Everything here is a function of the scores alone: workers
-that see the same storage decide the same, and a race that was interrupted goes on where it was.
+that see the same storage decide the same, and a race that was interrupted continues where it was.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Standing:
 
     @property
     def lower_end(self) -> float:
-        """Lower end of the interval; the score itself where one seed gives no interval."""
+        """Lower end of the interval; the score itself if one seed gives no interval."""
         return self.estimate.value if math.isnan(self.estimate.low) else self.estimate.low
 
 
@@ -53,8 +53,8 @@ class Race:
     Args:
         missing: Trainings of this round without a score, the running ones included, as pairs of a configuration and a
             seed. Empty if the race is over.
-        chosen: Configuration that was chosen; None while the race goes on, or if all configurations have failed in the
-            first round.
+        chosen: Configuration that was chosen; None while the race continues, or if all configurations have failed in
+            the first round.
         standings: Standing of each configuration.
     """
 

@@ -20,8 +20,8 @@ class Termination:
     Args:
         study: The study in its storage.
         storage: The storage.
-        find_reason: Returns why a study ends that stands so, None where it goes on. It may take seconds.
-        asked: What is asked of the study, as a text: where it is another than when the study ended, it goes on.
+        find_reason: Function that returns why a study ends, None if it continues. It may take seconds.
+        asked: Trials and terminator asked for, as a text; an ended study continues if it has changed.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class Termination:
 
     @property
     def reason(self) -> str | None:
-        """Reason why the study has ended; None while it goes on."""
+        """Reason why the study has ended; None while it continues."""
         return ended_because(self._study, self._asked)
 
     def look(self, state: StudyState) -> None:
@@ -53,7 +53,7 @@ class Termination:
 
 
 def ended_because(study: optuna.Study, asked: str) -> str | None:
-    """Return why a study has ended before its last trial, None where it has not.
+    """Return why a study has ended before its last trial, None if it has not.
 
     Args:
         study: The study in its storage.

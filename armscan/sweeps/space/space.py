@@ -91,7 +91,7 @@ class Space:
         return complete
 
     def _with_needs(self, name: str, value: Value) -> dict[str, Value] | None:
-        """Return a value with the choices that it needs before it, None where these exclude each other."""
+        """Return a value with the choices that it needs before it, None if these exclude each other."""
         allowed: dict[str, tuple[Value, ...]] = {name: (value,)}
         for parameter in reversed(self.parameters):
             for needed, values in parameter.when.items() if parameter.name in allowed else ():

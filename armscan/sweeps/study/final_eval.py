@@ -99,7 +99,7 @@ class FinalEvaluation:
 
     @classmethod
     def stored(cls, storage: Storage, search: optuna.Study) -> Self | None:
-        """Return that of a study in its storage; None where none was begun, or an earlier version made it."""
+        """Return the final evaluation of a stored study; None if none was begun, or an earlier version made it."""
         names = [search.study_name + suffix for suffix in (SELECTION_SUFFIX, JUDGEMENT_SUFFIX)]
         if not set(names) <= set(optuna.get_all_study_names(storage.optuna)):
             return None
@@ -130,7 +130,7 @@ class FinalEvaluation:
         return -1.0 if self.search.directions[0] == StudyDirection.MINIMIZE else 1.0
 
     def candidates(self) -> list[int]:
-        """Return the control and the numbers of the best trials; nothing where no trial has finished."""
+        """Return the control and the numbers of the best trials; nothing if no trial has finished."""
         best = best_trials(self.search, self.settings.top_k + 1)
         # A trial with the settings of the control is the control.
         others = [trial.number for trial in best if trial.user_attrs.get(ENQUEUED_FROM) != FROM_DEFAULT]

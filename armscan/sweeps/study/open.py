@@ -154,7 +154,7 @@ class OpenedStudy:
 def open_for_work(
     settings: StudySettings, task: Task, config: DictConfig, words: Sequence[str], *, retry: bool = False
 ) -> OpenedStudy:
-    """Open a study, as `read_settings` has read it from these words, and make it where there is none.
+    """Open a study, as `read_settings` has read it from these words, and make it if there is none.
 
     Raises:
         StudyError: If the storage cannot be used, or the study that exists is another.

@@ -19,7 +19,7 @@ WITH = "population-based training (study/sampler=pbt) requires"
 
 
 def population_of(settings: StudySettings, config: DictConfig) -> Population | None:
-    """Return the population of a study; None where its trials are independent.
+    """Return the population of a study; None if its trials are independent.
 
     Args:
         settings: Settings of the study.

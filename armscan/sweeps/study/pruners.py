@@ -20,9 +20,9 @@ class ParetoPruner(BasePruner):
 
     The rungs are `min_resource` steps and each `reduction_factor` times as many as the one before. A trial that reaches
     a rung is compared with all trials that have reached it, and with those that ended before it by their final values.
-    It goes on unless so many are better as may go on. Better is a lower Pareto front, and within one the larger
+    It continues unless so many are better as may continue. Better is a lower Pareto front, and within one the larger
     crowding distance (Schmucker et al. 2021, arXiv:2106.12639; Deb et al. 2002, doi:10.1109/4235.996017). The first
-    front always goes on, however many it has.
+    front always continues, however many it has.
 
     Args:
         min_resource: Environment steps of the first rung, 1 or more.

@@ -186,7 +186,7 @@ class StudySettings(Limits):
 
     @property
     def asked(self) -> str:
-        """Return the trials asked for and the terminator as JSON; an ended study goes on if they change."""
+        """Return the trials asked for and the terminator as JSON; an ended study continues if they change."""
         terminator = dict(self.terminator) if self.terminator is not None else None
         return json.dumps({"n_trials": self.n_trials, "terminator": terminator}, sort_keys=True)
 

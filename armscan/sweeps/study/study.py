@@ -67,7 +67,7 @@ def name_objectives(study: optuna.Study, names: Sequence[str]) -> None:
 
 
 def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study | None:
-    """Return the study that these settings would go on with, to look at; None if they would begin one."""
+    """Return the study that these settings would continue with, to look at; None if they would begin one."""
     storage = existing_storage(settings.storage)
     if storage is None or settings.name not in optuna.get_all_study_names(storage.optuna):
         return None

@@ -25,10 +25,10 @@ class Terminator(Protocol):
     """Says when a study ends."""
 
     def check(self, n_objectives: int, n_seeds: int) -> None:
-        """Raise `InvalidValueError` where it cannot work for so many objectives and seeds of a trial."""
+        """Raise `InvalidValueError` if it cannot work for so many objectives and seeds of a trial."""
 
     def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
-        """Return why the study ends; None while it goes on."""
+        """Return why the study ends; None while it continues."""
 
 
 class BelowSeedNoise:
@@ -118,7 +118,7 @@ def seed_noise(trials: Sequence[FrozenTrial], objective: str, direction: StudyDi
         direction: Its direction.
 
     Returns:
-        The standard deviation; None where no trial has two seeds.
+        The standard deviation; None if no trial has two seeds.
     """
     ranked = sorted(trials, key=lambda trial: trial.values[0], reverse=direction == StudyDirection.MAXIMIZE)
     better = ranked[: max(1, round(BETTER_PART * len(ranked)))]

@@ -91,13 +91,13 @@ class Attempt:
 
     @property
     def parent_folder(self) -> Path | None:
-        """Folder of the trial whose checkpoints it begins from; None where it begins untrained."""
+        """Folder of the trial whose checkpoints it begins from; None if it begins untrained."""
         number = self.trial.user_attrs.get(PARENT)
         return None if number is None else trial_folder(self.study_folder, number)
 
     @property
     def interval(self) -> tuple[int, int] | None:
-        """Environment steps at which its part of a training begins and ends; None where it trains the whole."""
+        """Environment steps at which its part of a training begins and ends; None if it trains the whole."""
         interval = self.trial.user_attrs.get(INTERVAL)
         return None if interval is None else (int(interval[0]), int(interval[1]))
 

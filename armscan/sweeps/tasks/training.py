@@ -166,7 +166,7 @@ def _concluded(
 
 
 def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:
-    """Train with one seed, from the last checkpoint where there is one; returns metrics, also those of `conclude`."""
+    """Train with one seed, from the last checkpoint if there is one; returns metrics, also those of `conclude`."""
     config, choices = attempt.config(seed)
     setup = set_up(config)
     folder = attempt.folder / f"seed_{seed}"

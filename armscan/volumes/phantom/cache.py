@@ -37,7 +37,7 @@ def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None, version: 
 
 
 def load_phantom(seed: int, cache_dir: Path | None = None, version: int = 1) -> LabelVolume:
-    """Return the phantom of a seed, from the cache where it is there, made and kept otherwise.
+    """Return the phantom of a seed, from the cache if it is there, made and kept otherwise.
 
     Args:
         seed: Seed of everything drawn; see `make_phantom`.
