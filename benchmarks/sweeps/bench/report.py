@@ -79,7 +79,7 @@ def _print_table(curves: Curves, surrogate: Surrogate) -> None:
         ("the best of the surrogate", ", ".join(f"`{name}={value:.3g}`" for name, value in best.items())),
         ("configurations left out: rank correlation, variance explained", f"{correlation:.2f}, {explained:.2f}"),
         (
-            "chance between seeds of good configurations, in % of the steps",
+            "noise between seeds of good configurations, in % of the steps",
             f"{100 * chance_of_good(surrogate).std():.0f}",
         ),
     ]
