@@ -18,6 +18,7 @@ from sphinx.util.docutils import SphinxDirective, nodes
 from armscan.agents.hyperparameters import Parameters
 from armscan.config.sources import config_folder
 from armscan.envs import ArmscanEnv, EnvFactory
+from armscan.envs.rules import Rules
 from armscan.sweeps.study.settings import StudySettings
 
 TARGET = "_target_"
@@ -42,6 +43,7 @@ def argument_texts(target: Any) -> dict[str, str]:
 
 def argument_types(target: Any) -> dict[str, str]:
     """Read the arguments' types, as YAML has them: a sequence is a list."""
+    target = Rules if target is EnvFactory else target
     return {
         name: re.sub(r"\b(?:Sequence|tuple)\[.*\]", "list", str(argument.annotation)).replace("None", "null")
         for name, argument in inspect.signature(target).parameters.items()
@@ -62,14 +64,17 @@ def argument_ranges(target: Any) -> dict[str, str]:
     return ranges
 
 
-def study_range(key: str) -> str:
-    """Read what a key of the section `study` allows, as its errors name it."""
+def of_study(key: str) -> tuple[str, str]:
+    """Read the type of a key of the section `study`, and what it allows, as its errors name it."""
     model: Any = StudySettings
     *sections, name = key.split(".")
     for section in sections:
         model = model.model_fields[section].annotation
     field = model.model_fields.get(name)
-    return f"Allowed: {field.description}." if field and field.description else ""
+    if field is None:
+        return "", ""
+    of_type = getattr(field.annotation, "__name__", str(field.annotation)).replace("None", "null")
+    return of_type, f"Allowed: {field.description}." if field.description else ""
 
 
 def comments(keys: CommentedMap, source: list[str]) -> dict[str, str]:
@@ -100,10 +105,10 @@ def rows(keys: CommentedMap, source: list[str], prefix: str) -> Iterator[tuple[s
             yield from rows(value, source, f"{prefix}{key}.")
         # What only repeats another key is described there.
         elif not str(value).startswith("${"):
-            of_study = study_range(f"{prefix}{key}".removeprefix(STUDY)) if prefix.startswith(STUDY) else ""
+            of_type, allowed = of_study(f"{prefix}{key}".removeprefix(STUDY)) if prefix.startswith(STUDY) else ("", "")
             text = in_yaml(texts[key]) if texts.get(key) else beside[key]
-            words = " ".join(f"{text} {ranges.get(key, of_study)}".split())
-            yield f"{prefix}{key}", types.get(key) or kind(value), shown(value), words
+            words = " ".join(f"{text} {ranges.get(key, allowed)}".split())
+            yield f"{prefix}{key}", types.get(key) or kind(value) or of_type, shown(value), words
 
 
 def shown(value: Any) -> str:
