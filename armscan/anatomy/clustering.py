@@ -70,9 +70,12 @@ def _find_core(mask: Pixels, stride: int, margin: int, half_widths: IntArray, mi
                 shifted = counts[(reach + d) * stride :][:n_pixels]
                 for i in range(n_pixels):
                     shifted[i] += window[i]
-    core = np.empty(n_pixels, dtype=np.uint8)
-    for i in range(n_pixels):
-        core[i] = inside[i] & np.uint8(counts[reach * stride + i] >= min_samples)
+    core = np.zeros(n_pixels, dtype=np.uint8)
+    if min_samples <= count_disc_pixels(half_widths):
+        # Of the same type as the counts, or all of them would be widened to compare them.
+        fewest, of_pixels = type(zero)(min_samples), counts[reach * stride :]
+        for i in range(n_pixels):
+            core[i] = inside[i] & np.uint8(of_pixels[i] >= fewest)
     return core
 
 
@@ -198,10 +201,11 @@ def _cluster(
     stride, margin = (n_cols + pad + WORD - 1) // WORD * WORD, (pad + WORD - 1) // WORD * WORD
     flat = np.zeros((n_rows + 2 * reach) * stride + 2 * margin, dtype=np.uint8)
     mask = flat[reach * stride + margin :][: n_rows * stride].reshape((n_rows, stride))
+    wanted = np.uint8(label)
     for row in range(n_rows):
         labels, line = slice_xz[row_first + row, col_first : col_first + n_cols], mask[row, :n_cols]
         for col in range(n_cols):
-            line[col] = labels[col] == label
+            line[col] = labels[col] == wanted
     if count_disc_pixels(half_widths) < 2**8:
         flat_core = _find_core(flat, stride, margin, half_widths, min_samples, np.uint8(0))
     else:

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from armscan.anatomy.clustering import WORD, IntArray, Pixels, bounding_boxes, summarise_label
 from armscan.anatomy.landmarks import Landmarks
@@ -17,6 +18,7 @@ from armscan.volumes.plane import FloatArray
 from armscan.volumes.slicing import sample_plane
 from armscan.volumes.volume import LabelVolume
 
+Depths = NDArray[np.int32]
 # Parts that many planes are taken in, so that where one core is busy with other work, the others take more of them.
 N_CHUNKS = 16
 
@@ -24,6 +26,7 @@ N_CHUNKS = 16
 @numba.njit(cache=True, nogil=True)
 def _look(
     labels_xyz: Pixels,
+    occupied: Depths,
     which: int,
     matrix: FloatArray,
     offset_mm: FloatArray,
@@ -36,7 +39,7 @@ def _look(
 ) -> None:
     """Fill a slice and its summary; `half_widths` has for each volume a row a tissue, ended by -1."""
     s_x, s_y, s_z = spacings_mm[which]
-    sample_plane(labels_xyz, (s_x, s_y, s_z), matrix, offset_mm, slice_xz)
+    sample_plane(labels_xyz, occupied, (s_x, s_y, s_z), matrix, offset_mm, slice_xz)
     boxes = bounding_boxes(slice_xz)
     for tissue in range(tissue_labels.size):
         label, widths = tissue_labels[tissue], half_widths[which, tissue]
@@ -46,7 +49,7 @@ def _look(
 
 @numba.njit(cache=True, nogil=True)
 def _look_all(
-    volumes: Sequence[Pixels],
+    volumes: Sequence[tuple[Pixels, Depths]],
     which: IntArray,
     matrices: FloatArray,
     offsets_mm: FloatArray,
@@ -60,10 +63,10 @@ def _look_all(
     """Look at the planes i of the volumes `which[i]`, as `_look`; row i of `slices` begins with slice i."""
     rules = spacings_mm, tissue_labels, half_widths, min_samples
     for i in range(which.size):
-        labels_xyz = volumes[which[i]]
+        labels_xyz, occupied = volumes[which[i]]
         n_across, n_depth = labels_xyz.shape[0], labels_xyz.shape[2]
         slice_xz = slices[i, : n_across * n_depth].reshape((n_across, n_depth))
-        _look(labels_xyz, which[i], matrices[i], offsets_mm[i], *rules, slice_xz, landmarks[i])
+        _look(labels_xyz, occupied, which[i], matrices[i], offsets_mm[i], *rules, slice_xz, landmarks[i])
 
 
 @functools.cache
@@ -113,7 +116,8 @@ class Scanner:
         """
         slice_xz = np.empty(self._shapes[which], dtype=np.uint8)
         landmarks = np.empty((N_TISSUES, 4))
-        _look(self.volumes[which].labels, which, matrix, offset_mm, *self._rules, slice_xz, landmarks)
+        volume = self.volumes[which]
+        _look(volume.labels, volume.occupied, which, matrix, offset_mm, *self._rules, slice_xz, landmarks)
         return slice_xz, landmarks
 
     def look_all(
@@ -129,7 +133,9 @@ class Scanner:
         Returns:
             The slices, and the summaries of their clusters, shape (n, 3, 4): bit for bit what `look` gives.
         """
-        volumes = self._typed_volumes = self._typed_volumes or numba.typed.List([each.labels for each in self.volumes])
+        volumes = self._typed_volumes = self._typed_volumes or numba.typed.List(
+            [(each.labels, each.occupied) for each in self.volumes]
+        )
         shapes = [self._shapes[i] for i in which]
         longest = max(n_across * n_depth for n_across, n_depth in shapes)
         # Rows of whole words, so that each begins with one.

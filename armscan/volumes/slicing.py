@@ -10,17 +10,46 @@ from numpy.typing import NDArray
 
 from armscan.utils.prefetch import prefetch
 
-# Rows whose voxels are asked for before those of the first of them are read, and pixels between two that are asked for.
-N_AHEAD, PREFETCH_STEP = 8, 8
+# Rows that are looked up together, after those voxels of the next ones are asked for; pixels between two of these.
+N_ROWS, PREFETCH_STEP = 8, 8
+# Columns of voxels, along X and along Y, of a block of `occupied_depths`.
+BLOCK = 8
 LARGEST_INT32 = 2**31 - 1
 
 # First position of a row of pixels on an axis, in voxels, and the step from one pixel to the next.
 Line = tuple[float, float]
+Lines = tuple[Line, Line, Line]
+# Of an axis of the volume: how much of the way across it takes, the plane's origin and the spacing in mm, and the step.
+Axis = tuple[float, float, float, float]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def occupied_depths(labels_xyz: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Return the depths that a volume's labels occupy: the first, and that after the last, of each block of columns.
+
+    Blocks have 8 x 8 columns of voxels; the result has the shape (ceil(nx / 8), ceil(ny / 8), 2). A block of background
+    has the depths nz and 0.
+    """
+    n_x, n_y, n_z = labels_xyz.shape
+    depths = np.empty((-(-n_x // BLOCK), -(-n_y // BLOCK), 2), dtype=np.int32)
+    for i in range(depths.shape[0]):
+        for j in range(depths.shape[1]):
+            found = np.zeros(n_z, dtype=np.uint8)
+            for x in range(BLOCK * i, min(n_x, BLOCK * i + BLOCK)):
+                for y in range(BLOCK * j, min(n_y, BLOCK * j + BLOCK)):
+                    column = labels_xyz[x, y]
+                    for z in range(n_z):
+                        found[z] |= column[z]
+            occupied = np.flatnonzero(found)
+            depths[i, j, 0] = occupied[0] if occupied.size else n_z
+            depths[i, j, 1] = occupied[-1] + 1 if occupied.size else 0
+    return depths
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def sample_plane(
     labels_xyz: NDArray[np.uint8],
+    occupied: NDArray[np.int32],
     spacing_mm: tuple[float, float, float],
     matrix: NDArray[np.float64],
     offset_mm: NDArray[np.float64],
@@ -32,22 +61,25 @@ def sample_plane(
 
     Args:
         labels_xyz: Labels of the volume, C-contiguous.
+        occupied: Their `occupied_depths`: pixels beside them are 0, and not looked up.
         spacing_mm: Voxel spacing (sx, sy, sz) in mm.
         matrix: Rotation from the plane's frame into the volume's, shape (3, 3).
         offset_mm: Origin of the plane in the volume, in mm, shape (3,).
         slice_xz: Slice to fill, indexed [across, depth], C-contiguous.
     """
-    n_rows, n_depth = N_AHEAD + 1, slice_xz.shape[1]
+    n_rows, n_depth = 2 * N_ROWS, slice_xz.shape[1]
+    plane = occupied, spacing_mm, matrix, offset_mm
     # Of places half as wide, twice as many are computed at a time.
     if labels_xyz.size <= LARGEST_INT32:
-        _sample(labels_xyz, spacing_mm, matrix, offset_mm, np.empty((n_rows, n_depth), dtype=np.int32), slice_xz)
+        _sample(labels_xyz, *plane, np.empty((n_rows, n_depth), dtype=np.int32), slice_xz)
     else:
-        _sample(labels_xyz, spacing_mm, matrix, offset_mm, np.empty((n_rows, n_depth), dtype=np.int64), slice_xz)
+        _sample(labels_xyz, *plane, np.empty((n_rows, n_depth), dtype=np.int64), slice_xz)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sample(
     labels_xyz: NDArray[np.uint8],
+    occupied: NDArray[np.int32],
     spacing_mm: tuple[float, float, float],
     matrix: NDArray[np.float64],
     offset_mm: NDArray[np.float64],
@@ -56,38 +88,103 @@ def _sample(
 ) -> None:
     """As `sample_plane`; `places` is for the places, in the flat volume, of the voxels of the rows under way."""
     s_x, s_y, s_z = spacing_mm
+    axes = (
+        _axis(0, matrix, offset_mm, s_x, s_z),
+        _axis(1, matrix, offset_mm, s_y, s_z),
+        _axis(2, matrix, offset_mm, s_z, s_z),
+    )
     n_across, n_depth = slice_xz.shape
-    voxels, n_rows = labels_xyz.ravel(), places.shape[0]
-    inside = np.empty((n_rows, 2), dtype=np.int64)
+    voxels, shape = labels_xyz.ravel(), labels_xyz.shape
+    pixels = slice_xz.ravel()
+    for pixel in range(pixels.size):
+        pixels[pixel] = 0
+    inside = np.empty((2 * N_ROWS, 2), dtype=np.int64)
     along = np.arange(n_depth).astype(np.float64)
-    step_x, step_y, step_z = matrix[0, 2] * s_z / s_x, matrix[1, 2] * s_z / s_y, matrix[2, 2] * s_z / s_z
     # A slice lies scattered over the volume's memory: what it waits for is fetched while the next places are computed.
-    for i in range(n_across + N_AHEAD):
-        if i < n_across:
-            across_mm = i * s_x
-            lines = (
-                ((matrix[0, 0] * across_mm + offset_mm[0]) / s_x + 0.5, step_x),
-                ((matrix[1, 0] * across_mm + offset_mm[1]) / s_y + 0.5, step_y),
-                ((matrix[2, 0] * across_mm + offset_mm[2]) / s_z + 0.5, step_z),
-            )
-            start, stop = _within(lines[0], labels_xyz.shape[0], 0, n_depth)
-            start, stop = _within(lines[1], labels_xyz.shape[1], start, stop)
-            start, stop = _within(lines[2], labels_xyz.shape[2], start, stop)
-            inside[i % n_rows, 0], inside[i % n_rows, 1] = start, stop
-            row = places[i % n_rows, start:stop]
-            _find_places(lines, labels_xyz.shape, along[start:stop], row)
-            for pixel in range(0, row.size, PREFETCH_STEP):
-                prefetch(voxels, np.uint64(row[pixel]))
-        if i >= N_AHEAD:
-            read = i - N_AHEAD
-            start, stop = inside[read % n_rows]
-            _read(voxels, places[read % n_rows, start:stop], slice_xz[read], start)
+    for first in range(0, n_across + N_ROWS, N_ROWS):
+        if first < n_across:
+            ends = _lines(axes, first * s_x), _lines(axes, (min(first + N_ROWS, n_across) - 1) * s_x)
+            start_all, stop_all = _within_occupied(ends, occupied, shape, n_depth)
+            is_inside = _are_inside(ends, shape, start_all, stop_all)
+            for i in range(first, min(first + N_ROWS, n_across)):
+                lines, start, stop = _lines(axes, i * s_x), start_all, stop_all
+                if not is_inside:
+                    start, stop = _within(lines[0], 0, shape[0], start, stop)
+                    start, stop = _within(lines[1], 0, shape[1], start, stop)
+                    start, stop = _within(lines[2], 0, shape[2], start, stop)
+                slot = i % (2 * N_ROWS)
+                inside[slot, 0], inside[slot, 1] = start, stop
+                row = places[slot, start:stop]
+                _find_places(lines, shape, along[start:stop], row)
+                for pixel in range(0, row.size, PREFETCH_STEP):
+                    prefetch(voxels, np.uint64(row[pixel]))
+        for i in range(max(0, first - N_ROWS), min(first, n_across)):
+            start, stop = inside[i % (2 * N_ROWS)]
+            _read(voxels, places[i % (2 * N_ROWS), start:stop], slice_xz[i, start:stop])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _find_places(
-    lines: tuple[Line, Line, Line], shape: tuple[int, int, int], along: NDArray[np.float64], places: NDArray[Any]
-) -> None:
+def _axis(
+    axis: int, matrix: NDArray[np.float64], offset_mm: NDArray[np.float64], spacing_mm: float, s_z: float
+) -> Axis:
+    """Return what `_lines` requires of an axis with this spacing; steps of pixels in depth are `s_z` mm long."""
+    return matrix[axis, 0], offset_mm[axis], spacing_mm, matrix[axis, 2] * s_z / spacing_mm
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lines(axes: tuple[Axis, Axis, Axis], across_mm: float) -> Lines:
+    """Return the positions, on each axis, of the pixels of a row that begins so far across."""
+    (m_x, b_x, s_x, step_x), (m_y, b_y, s_y, step_y), (m_z, b_z, s_z, step_z) = axes
+    return (
+        ((m_x * across_mm + b_x) / s_x + 0.5, step_x),
+        ((m_y * across_mm + b_y) / s_y + 0.5, step_y),
+        ((m_z * across_mm + b_z) / s_z + 0.5, step_z),
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _within_occupied(
+    ends: tuple[Lines, Lines], occupied: NDArray[np.int32], shape: tuple[int, int, int], n_depth: int
+) -> tuple[int, int]:
+    """Return pixels (start, stop) beside which some rows show nothing; `ends` has the lines of the first and last."""
+    lowest_x, highest_x = _blocks(ends[0][0], ends[1][0], shape[0], n_depth)
+    lowest_y, highest_y = _blocks(ends[0][1], ends[1][1], shape[1], n_depth)
+    lowest, highest = shape[2], 0
+    for x in range(lowest_x, highest_x):
+        for y in range(lowest_y, highest_y):
+            lowest, highest = min(lowest, occupied[x, y, 0]), max(highest, occupied[x, y, 1])
+    if lowest >= highest:
+        return 0, 0
+    # Rounding keeps an order, so that positions rise or fall from row to row, and the first and last tell of all.
+    start, stop = _within(ends[0][2], lowest, highest, 0, n_depth)
+    start_last, stop_last = _within(ends[1][2], lowest, highest, 0, n_depth)
+    return min(start, start_last), max(stop, stop_last)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _blocks(first: Line, last: Line, n_voxels: int, n_depth: int) -> tuple[int, int]:
+    """Return the range of blocks on an axis that pixels of rows from `first` to `last` lie in."""
+    farthest = n_depth - 1
+    lowest = min(min(first[0], first[0] + first[1] * farthest), min(last[0], last[0] + last[1] * farthest))
+    highest = max(max(first[0], first[0] + first[1] * farthest), max(last[0], last[0] + last[1] * farthest))
+    if highest < 0.0 or lowest >= n_voxels:
+        return 0, 0
+    return int(max(lowest, 0.0)) // BLOCK, int(min(highest, n_voxels - 1.0)) // BLOCK + 1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _are_inside(ends: tuple[Lines, Lines], shape: tuple[int, int, int], start: int, stop: int) -> bool:
+    """Return whether the pixels from `start` to before `stop` of all rows lie in the volume, as those at the ends."""
+    for lines in ends:
+        for axis in range(3):
+            first, step = lines[axis]
+            if not 0.0 <= first + step * start < shape[axis] or not 0.0 <= first + step * (stop - 1) < shape[axis]:
+                return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _find_places(lines: Lines, shape: tuple[int, int, int], along: NDArray[np.float64], places: NDArray[Any]) -> None:
     """Fill the places of voxels, those of the pixels with the numbers `along` of a row."""
     (first_x, step_x), (first_y, step_y), (first_z, step_z) = lines
     n_y, n_z = float(shape[1]), float(shape[2])
@@ -98,26 +195,21 @@ def _find_places(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _read(voxels: NDArray[np.uint8], places: NDArray[Any], row: NDArray[np.uint8], start: int) -> None:
-    """Fill a row of a slice: voxels from the pixel `start` on, background before and after them."""
-    before, inside, after = row[:start], row[start : start + places.size], row[start + places.size :]
-    for k in range(before.size):
-        before[k] = 0
-    for k in range(inside.size):
+def _read(voxels: NDArray[np.uint8], places: NDArray[Any], row: NDArray[np.uint8]) -> None:
+    """Fill a part of a row of a slice."""
+    for k in range(places.size):
         # An index without a sign is not looked at for being negative.
-        inside[k] = voxels[np.uint64(places[k])]
-    for k in range(after.size):
-        after[k] = 0
+        row[k] = voxels[np.uint64(places[k])]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _within(line: Line, n_voxels: int, start: int, stop: int) -> tuple[int, int]:
-    """Return which of the pixels from `start` to before `stop` lie within an axis, as such a pair."""
+def _within(line: Line, lowest: int, highest: int, start: int, stop: int) -> tuple[int, int]:
+    """Return which of the pixels from `start` to before `stop` lie in voxels from `lowest` to before `highest`."""
     first, step = line
     # Rounding keeps an order, so that positions rise or fall all along a row, and its ends tell of all of it.
-    if 0.0 <= first + step * start < n_voxels and 0.0 <= first + step * (stop - 1) < n_voxels:
+    if lowest <= first + step * start < highest and lowest <= first + step * (stop - 1) < highest:
         return start, stop
-    enters, leaves = (0.0, float(n_voxels)) if step >= 0.0 else (float(n_voxels), 0.0)
+    enters, leaves = (float(lowest), float(highest)) if step >= 0.0 else (float(highest), float(lowest))
     start = _first_beyond(line, enters, start, stop)
     return start, _first_beyond(line, leaves, start, stop)
 

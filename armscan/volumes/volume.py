@@ -14,7 +14,7 @@ from armscan.errors import InvalidValueError, VolumeError, printable
 from armscan.utils.validation import check_int, check_numbers
 from armscan.volumes.labelmap import ALLOWED_LABELS, LABEL_NAMES, LANDMARK_LABELS, check_whole, shown
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
-from armscan.volumes.slicing import sample_plane
+from armscan.volumes.slicing import occupied_depths, sample_plane
 
 LONGEST_SIDE_PX = 65536
 # Far beyond what any image has; the ratio of two spacings still is a number that a slice can be looked up with.
@@ -135,6 +135,11 @@ class LabelVolume:
         """Size of a slice's pixel: (sx, sz)."""
         return self.spacing[0], self.spacing[2]
 
+    @cached_property
+    def occupied(self) -> NDArray[np.int32]:
+        """Depths that the labels occupy; see `occupied_depths`."""
+        return occupied_depths(self.labels)
+
     def slice(
         self,
         action: ManipulatorAction,
@@ -170,7 +175,7 @@ class LabelVolume:
         else:
             matrix, offset_mm = transform.plane_map(action)
         slice_xz = np.empty(shape, dtype=np.uint8)
-        sample_plane(self.labels, self.spacing, matrix, offset_mm, slice_xz)
+        sample_plane(self.labels, self.occupied, self.spacing, matrix, offset_mm, slice_xz)
         return slice_xz
 
 

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from armscan.errors import InvalidValueError
 from armscan.volumes import LabelVolume, ManipulatorAction, RigidTransform
+from armscan.volumes.slicing import BLOCK
 
 angles_deg = st.floats(-180, 180)
 shifts_mm = st.floats(-15, 25)
@@ -39,9 +40,11 @@ def resampled_slice(volume, matrix, offset_mm, shape):
 
 @st.composite
 def volumes(draw):
-    shape = draw(st.tuples(*[st.integers(1, 14)] * 3).filter(lambda n: np.prod(n) >= 3))
-    labels = np.random.default_rng(draw(st.integers(0, 2**32))).integers(0, 5, shape)
-    labels.flat[:3] = (1, 2, 3)
+    shape = draw(st.tuples(*[st.integers(1, 14) | st.integers(15, 30)] * 3).filter(lambda n: np.prod(n) >= 3))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    labels = rng.integers(0, 5, shape)
+    labels[rng.random(shape) > draw(st.sampled_from([0.01, 0.1, 1.0]))] = 0
+    labels.flat[rng.choice(labels.size, 3, replace=False)] = (1, 2, 3)
     return LabelVolume(labels, draw(st.tuples(spacings_mm, spacings_mm, spacings_mm)), "random")
 
 
@@ -96,6 +99,17 @@ def plainly_sliced(volume, action, shape):
 def test_slice_is_what_its_definition_says_at_every_pixel(volume, rotation, translation, shape):
     action = ManipulatorAction(rotation, translation)
     np.testing.assert_array_equal(volume.slice(action, shape), plainly_sliced(volume, action, shape))
+
+
+@settings(max_examples=50, deadline=None)
+@given(volume=volumes())
+def test_occupied_depths_hold_every_label_of_a_block_and_begin_and_end_with_one(volume):
+    (n_x, n_y, n_z), depths = volume.shape, volume.occupied
+    assert depths.shape == (-(-n_x // BLOCK), -(-n_y // BLOCK), 2)
+    for i, j in np.ndindex(depths.shape[:2]):
+        block = volume.labels[BLOCK * i : BLOCK * (i + 1), BLOCK * j : BLOCK * (j + 1)]
+        shown = np.flatnonzero(block.any(axis=(0, 1)))
+        assert tuple(depths[i, j]) == ((shown[0], shown[-1] + 1) if shown.size else (n_z, 0))
 
 
 def test_slice_takes_the_upper_voxel_at_a_tie(tiny_volume):
