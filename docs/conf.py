@@ -27,6 +27,8 @@ extensions = [
     "mathml",
 ]
 exclude_patterns = ["_build", "_ext"]
+# Options (--plan) and quotes are shown as they are typed.
+smartquotes = False
 
 # Markdown
 myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]

@@ -122,7 +122,7 @@ def table() -> str:
     """Return all that is kept as two Markdown tables: the figures of each seed, and the goals."""
     kept = json.loads(FIGURES.read_text())
     lines = [
-        "| | success, % | mean steps | success\\*, % | mean steps\\* | median, mm | median, ° | training, s |",
+        "| | median, mm | median, ° | mean steps | success, % | training, s | mean steps\\* | success\\*, % |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     goals = ["| | success | mean steps | training | reached by |", "| --- | --- | --- | --- | --- |"]
@@ -131,13 +131,13 @@ def table() -> str:
             of_seeds = [kept[name][seed] for seed in sorted(kept[name])]
             cells = [
                 f"{row.title} (`{name}`)",
-                _joined(of_seeds, "success", "{:.1f}", 100),
-                _joined(of_seeds, "mean_steps", "{:.2f}"),
-                _joined(of_seeds, "success_not_started_solved", "{:.1f}", 100),
-                _joined(of_seeds, "mean_steps_not_started_solved", "{:.2f}"),
                 _joined(of_seeds, "median_distance_mm", "{:.1f}"),
                 _joined(of_seeds, "median_distance_deg", "{:.1f}"),
+                _joined(of_seeds, "mean_steps", "{:.2f}"),
+                _joined(of_seeds, "success", "{:.1f}", 100),
                 _joined(of_seeds, "training_s", "{:.0f}"),
+                _joined(of_seeds, "mean_steps_not_started_solved", "{:.2f}"),
+                _joined(of_seeds, "success_not_started_solved", "{:.1f}", 100),
             ]
             lines.append("| " + " | ".join(cells) + " |")
             goals += _goal(name, row, of_seeds)

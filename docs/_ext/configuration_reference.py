@@ -19,9 +19,12 @@ from armscan.agents.hyperparameters import Parameters
 from armscan.config.sources import config_folder
 from armscan.envs import ArmscanEnv, EnvFactory
 from armscan.envs.rules import Rules
+from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.settings import StudySettings
 
 TARGET = "_target_"
+# OmegaConf's mark of a key without a default.
+REQUIRED = "???"
 STUDY = "study."
 
 
@@ -73,7 +76,8 @@ def of_study(key: str) -> tuple[str, str]:
     field = model.model_fields.get(name)
     if field is None:
         return "", ""
-    of_type = getattr(field.annotation, "__name__", str(field.annotation)).replace("None", "null")
+    of_type = field.annotation.__name__ if inspect.isclass(field.annotation) else str(field.annotation)
+    of_type = "dict" if field.annotation is Space else of_type.replace("None", "null")
     return of_type, f"Allowed: {field.description}." if field.description else ""
 
 
@@ -117,7 +121,7 @@ def shown(value: Any) -> str:
         return f"[{', '.join(map(shown, value))}]"
     if isinstance(value, CommentedMap) and TARGET in value:
         return str(value[TARGET]).rpartition(".")[2]
-    return json.dumps(value)
+    return "required" if value == REQUIRED else json.dumps(value)
 
 
 def in_yaml(text: str) -> str:
@@ -140,7 +144,7 @@ def sources(keys: CommentedMap) -> Iterator[Path]:
 
 def kind(value: Any) -> str:
     """Name the plain type of a value; empty where it refers to another key."""
-    if value is None or "${" in str(value):
+    if value in (None, REQUIRED) or "${" in str(value):
         return ""
     return next(each.__name__ for each in (bool, int, float, str, list, dict) if isinstance(value, each))
 
