@@ -133,6 +133,13 @@ def test_tutorial_runs_as_it_stands(data_folder, tmp_path, monkeypatch, capsys):
     assert "00001_labels.nii.gz (360, 800, 80)" in capsys.readouterr().out
 
 
+def armscan(words, folder):
+    """Run armscan in a process of its own, in a folder."""
+    command = [sys.executable, "-P", "-m", "armscan", *words]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+
 def small(words):
     """Return a command with small budgets in the place of its own."""
     budgets = [*SMALL]
@@ -163,12 +170,20 @@ def test_journeys_of_pages_are_made_with_small_budgets(page, tmp_path, data_fold
             continue
         if line[0] == "run" and "--help" not in line:
             line = small(line)
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, "-P", "-m", "armscan", *line]
-        ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        ended = armscan(line, tmp_path)
         assert ended.returncode == 0, (line, ended.stdout[-3000:], ended.stderr[-3000:])
         done += 1
     assert done
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("page", ["first-study", "studies", "extending"])
+def test_studies_of_pages_can_be_planned(page, tmp_path):
+    write_files(DOCS / f"{page}.md", tmp_path)
+    (sweep,) = (tmp_path / "sweeps").glob("*.yaml")
+    ended = armscan(["run", "-m", f"sweep={sweep.stem}", "--plan"], tmp_path)
+    assert ended.returncode == 0, ended.stderr[-3000:]
+    assert f"study {sweep.stem}: what is searched" in ended.stdout
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
