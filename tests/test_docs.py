@@ -109,13 +109,13 @@ def test_commands_of_pages_are_good_words(page, words, in_a_folder):
 
 
 def write_files(page, folder):
-    """Write the files that a page shows, which name themselves in their first line."""
+    """Write the files that a page shows as they stand; a comment at their head names them."""
     for block in (*blocks(page, "python"), *blocks(page, "yaml")):
-        if name := re.match(r"# ([\w./]+\.(?:py|yaml))\n", block):
+        if name := re.match(r"(?:# @package _global_\n)?# ([\w./]+\.(?:py|yaml))\n", block):
             file = folder / name[1]
             file.parent.mkdir(parents=True, exist_ok=True)
             with file.open("a") as opened:
-                opened.write(block.removeprefix(name[0]))
+                opened.write(block)
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "environment.md"], ids=lambda page: page.name)
