@@ -88,9 +88,8 @@ def test_looks_lie_beside_what_is_found_and_the_last_on_it(phantom):
     np.testing.assert_allclose(planes[:, :2], 0.0, atol=1e-3)
 
 
-def test_policy_answers_as_the_learner_does_also_exported(phantom):
-    learner, env = made(phantom)
-    learner.learn(24)
+def check_policy(learner, env):
+    """Check that a learner's policy, and the program made of it, answer as the learner does."""
     observations = []
     for seed in range(3):
         observation, _ = env.reset(seed=seed)
@@ -103,6 +102,12 @@ def test_policy_answers_as_the_learner_does_also_exported(phantom):
     np.testing.assert_allclose(policy(batch), actions, atol=1e-6)
     np.testing.assert_allclose(export_program(policy, batch).module()(batch), actions, atol=1e-6)
     assert policy.differs is None
+
+
+def test_policy_answers_as_the_learner_does_also_exported(phantom):
+    learner, env = made(phantom)
+    learner.learn(24)
+    check_policy(learner, env)
 
 
 def test_each_look_knows_its_place_in_the_episode(phantom):

@@ -2,17 +2,15 @@
 
 from copy import deepcopy
 
-import numpy as np
 import pytest
 import torch
 
 from armscan.agents import MLP, SAC, Learner, ResidualSAC
 from armscan.agents.policy import batch_of
-from armscan.agents.torch_export import export_program
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError
 from tests.agents.conftest import SMALL_SAC, setup_for
-from tests.agents.test_plane_finder import NAMES, RULES, SMALL, played
+from tests.agents.test_plane_finder import NAMES, RULES, SMALL, check_policy, played
 
 N_TAUGHT = 24
 
@@ -89,18 +87,7 @@ def test_learner_goes_on_from_its_state_to_the_bit(phantom, n_before):
 
 
 def test_policy_answers_as_the_learner_does_also_exported(corrected):
-    learner, env = corrected
-    observations = []
-    for seed in range(3):
-        observation, _ = env.reset(seed=seed)
-        for _ in range(3):
-            observations.append(observation)
-            observation = env.step(learner.act(observation, 0.0))[0]
-    batch = batch_of(observations)
-    actions = np.array([learner.act(observation, 0.0) for observation in observations])
-    policy = learner.policy()
-    np.testing.assert_allclose(policy(batch), actions, atol=1e-6)
-    np.testing.assert_allclose(export_program(policy, batch).module()(batch), actions, atol=1e-6)
+    check_policy(*corrected)
 
 
 def test_learner_stops_where_its_plane_finder_does(phantom):
