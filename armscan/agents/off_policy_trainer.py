@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from tianshou.algorithm.algorithm_base import TrainingStats
 from tianshou.data import CollectStatsBase
 from tianshou.trainer import OffPolicyTrainer, OffPolicyTrainerParams
@@ -33,11 +35,15 @@ class EvenUpdatesTrainer(OffPolicyTrainer):
         stats = TrainingStats()
         if n_due and self.algorithm.why_tianshou is None:
             stats = self.algorithm.update_repeatedly(collector.buffer, self.params.batch_size, n_due)
-            self._update_moving_avg_stats_and_log_update_data(stats)
+            # Tianshou copies them deeply, and smooths losses for its progress bar.
+            self._logger.log_update_data(vars(stats), self._current_update_step)
             return stats
         for _ in range(n_due):
             stats = self._sample_and_update(collector.buffer)
         return stats
+
+    def _create_epoch_pbar_data_dict(self, training_step_result: Any) -> dict[str, str]:
+        return {}
 
     def _n_due(self, n_env_steps: int) -> int:
         # Rounded: products that are whole come out as just below it here and there.
