@@ -173,6 +173,15 @@ def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: Ru
         reached: Final evaluations, and the baselines.
         folder: Folder of the run, which gets the picture of the learning curve, the episodes and the table.
     """
+    log_result(tracked, result, reached)
+    if result:
+        draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
+    reached.write(folder, title=tracked.name)
+    tracked.log_results(folder)
+
+
+def log_result(tracked: TrackedRun, result: TrainingResult | None, reached: RunResult) -> None:
+    """Log the final figures, the best checkpoint as a model, and the table as description; see `keep_results`."""
     for name, metrics in reached.metrics().items():
         figures = {f"{name.replace(' ', '_')}/{figure}": value for figure, value in metrics.items()}
         # The last validation is logged by the training.
@@ -181,9 +190,6 @@ def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: Ru
     if result:
         tracked.log_metrics({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
         tracked.log_model(reached.model_metrics(), n_env_steps=result.best.n_env_steps)
-        draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
-    reached.write(folder, title=tracked.name)
-    tracked.log_results(folder)
     curve = f"\n\n![learning curve]({artifact_address(tracked.run_id, LEARNING_CURVE_FILE)})" if result else ""
     tracked.set_note(reached.markdown() + curve)
 

@@ -9,6 +9,7 @@ from mlflow.entities import Metric, Run, RunTag
 from armscan.stats.on_plane import ON_PLANE, PREFIX
 from armscan.tracking import TrackingStore
 from armscan.tracking.outbox import now_ms
+from armscan.training.baselines import RANDOM
 from armscan.training.titles import leading_among
 
 TESTED = "test_volumes/"
@@ -27,10 +28,11 @@ def best_of(runs: Sequence[Run]) -> Run | None:
 
 
 def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:
-    """Log the leading figures of the best job to the run of a grid, in the columns of its jobs."""
+    """Log the leading figures of the best job and its random agent to the run of a grid, in the columns of its jobs."""
     if (best := best_of(jobs)) is None:
         return
-    tested = {name.removeprefix(TESTED): value for name, value in best.data.metrics.items() if name.startswith(TESTED)}
-    now = now_ms()
-    metrics = [Metric(f"{TESTED}{name}", tested[name], now, 0) for name in leading_among(tested)]
+    now, metrics = now_ms(), []
+    for group in (TESTED, f"{RANDOM}/"):
+        found = {name.removeprefix(group): value for name, value in best.data.metrics.items() if name.startswith(group)}
+        metrics += [Metric(f"{group}{name}", found[name], now, 0) for name in leading_among(found)]
     store.log_batch(parent_id, metrics=metrics, tags=[RunTag(BEST_TAG, best.info.run_id)])

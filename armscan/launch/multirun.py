@@ -159,11 +159,14 @@ def _keep_page(table: ResultTable, folder: Path, word: Mapping[str, Any]) -> Non
     """Keep the table of the jobs as a page, in the grid's folder and with its parent run."""
     from armscan.reports.html import page
     from armscan.tracking import open_store
+    from armscan.tracking.sanitize import MAX_TAG_CHARS, shortened
+    from armscan.tracking.uploader import NOTE_TAG
 
     file = folder / RESULTS_PAGE
     atomic_write(file, methodcaller("write", page(f"multirun {' '.join(word['overrides'])}", table.html()).encode()))
     store, _ = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
     store.log_artifact(word["run_id"], str(file))
+    store.set_tag(word["run_id"], NOTE_TAG, shortened(table.markdown(), MAX_TAG_CHARS, RESULTS_PAGE))
 
 
 def _pool_folds(folder: Path, word: Mapping[str, Any], outcomes: Mapping[str, JobOutcome], runs: Sequence[Run]) -> None:

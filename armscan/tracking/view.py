@@ -48,7 +48,8 @@ def _line(metric: str, title: str) -> dict[str, object]:
 
 def _columns() -> dict[str, int]:
     """Return the columns in their order, each with its width in pixels."""
-    metrics = [*(f"test_volumes/{name}" for name in FIGURES), f"validation/{LEADING}"]
+    leading, *others = (f"test_volumes/{name}" for name in FIGURES)
+    metrics = [leading, f"random/{LEADING}", *others, f"validation/{LEADING}"]
     return {
         **{f"metrics.`{name}`": LETTER_PX * len(name) + AROUND_PX for name in metrics},
         "params.`seed`": 80,

@@ -139,6 +139,7 @@ class ResultTable:
     def markdown(self) -> str:
         """Return the table in Markdown, a column for each result."""
         rows = [["with 95 % intervals", *self.results], ["---", *("---:" for _ in self.results)]]
+        rows += [[heading, *values] for heading, values in self.facts.items()]
         for column in self.quantities:
             cells = (" ".join(_cell(each, column, "({})")) for each in self.results.values())
             rows.append([column.title, *cells])

@@ -1,4 +1,4 @@
-"""The README's pictures of a study in MLflow and in Optuna's dashboard, as a browser shows them.
+"""Pictures of a study in MLflow and in Optuna's dashboard, as a browser shows them.
 
     python -m benchmarks.sweeps.screenshots [FOLDER]
 
@@ -8,7 +8,6 @@ Chromium and its driver (`apt-get install chromium chromium-driver`).
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -21,16 +20,16 @@ from armscan.config.defaults import default_storage, default_tracking
 from armscan.config.services import DASHBOARD_PORT, MLFLOW_PORT
 from armscan.sweeps.storage.storage import existing_storage
 from armscan.tracking.store import open_existing_store
+from armscan.ui.runs_page import runs_page
 from armscan.ui.servers import HOST, mlflow_server, start_dashboard
 from tests.support.browser import chromium
 
 PICTURES = Path(__file__).parents[2] / "docs" / "images"
-STUDY = ["-m", "sweep=sac_y", "study.n_trials=24", "training.env_steps=6000", "study.final_eval.top_k=0"]
-NAME, N_TRIALS, BEST = "sac_y", 24, "mean_steps"
-COLUMNS = (
-    *("metrics.`mean_steps`", "metrics.`success_rate`", "params.`agent.lr`", "params.`agent.gamma`"),
-    *("params.`agent.utd_ratio`", "params.`agent.batch_size`"),
+STUDY = (
+    *("-m", "sweep=sac_y", "study.n_trials=24", "training.env_steps=6000", "study.workers=1"),
+    *("study.final_eval.top_k=1", "study.final_eval.max_seeds=2", "study.final_eval.judge_seeds=3"),
 )
+NAME, N_TRIALS = "sac_y", 24
 WIDTH_PX, N_COLOURS = 1400, 256
 
 
@@ -45,26 +44,14 @@ def look_at_study(address: str, file: Path) -> None:
 
 
 def look_at_runs(address: str, file: Path) -> None:
-    """Keep what MLflow shows of the study: its run, those of its trials below it, below the best one its training."""
+    """Keep what MLflow shows where `armscan ui` leads: the run of the study, and those of its trials below it."""
     client = open_existing_store("sqlite:///mlruns.db")
     experiment = client.get_experiment_by_name("armscan")
-    runs = client.search_runs([experiment.experiment_id], order_by=[f"metrics.{BEST}"])
-    (study,) = [run for run in runs if run.info.run_name == f"study {NAME}"]
-    best = next(run for run in runs if run.data.tags.get("mlflow.parentRunId") == study.info.run_id)
-    (training,) = [run for run in runs if run.data.tags.get("mlflow.parentRunId") == best.info.run_id]
-    shown = {
-        "selectedColumns": COLUMNS,
-        "runsExpanded": {run.info.run_id: True for run in (study, best)},
-        "orderByKey": "attributes.start_time",
-        "orderByAsc": False,
-    }
-    # Where MLflow remembers what somebody has chosen to see.
-    key = f'MLflowLocalStorage-1.1-ExperimentPage-["{experiment.experiment_id}"]-ReactComponentState'
-    remembered = f"localStorage.setItem({json.dumps(key)}, {json.dumps(json.dumps(shown))})"
-    with tempfile.TemporaryDirectory() as profile, chromium(Path(profile), height=940) as browser:
-        browser.before_each_page(remembered)
-        browser.open(f"{address}/#/experiments/{experiment.experiment_id}/runs?workflowType=machine_learning")
-        browser.find("a", text=training.info.run_name)
+    (study,) = client.search_runs([experiment.experiment_id], f"attributes.run_name = 'study {NAME}'")
+    with tempfile.TemporaryDirectory() as profile, chromium(Path(profile), width=1750, height=940) as browser:
+        browser.open(runs_page(address))
+        browser.click(f'[row-id="{study.info.run_id}"] button')
+        browser.find("a", text=f"{NAME}-{N_TRIALS - 1:04d} (pruned)")
         browser.keep(file)
 
 

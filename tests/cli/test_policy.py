@@ -75,8 +75,11 @@ def test_policy_is_registered_with_the_figures_of_its_run(answer, armscan, tmp_p
     client = store_of(tmp_path)
     first = client.get_model_version("wrist plane", "1")
     assert first.run_id == run_id
+    # The version and the model of the run's best checkpoint name each other.
+    (model,) = client.search_logged_models([client.get_run(run_id).info.experiment_id])
+    assert first.tags == {"logged_model": model.model_id}
+    assert json.loads(model.tags["mlflow.modelVersions"]) == [{"name": "wrist plane", "version": "1"}]
     assert f"`armscan evaluate {run_id}" in first.description
-    assert first.tags == {}
     assert str(client.get_model_version_by_alias("wrist plane", "champion").version) == "1"
     assert client.get_run(run_id).data.tags["policy"] == "kept"
     models = [mlflow.pyfunc.load_model(uri) for uri in ("models:/wrist plane/1", f"runs:/{run_id}/policy")]

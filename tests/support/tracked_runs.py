@@ -65,6 +65,7 @@ def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json",
         if agent is None:
             facts = {"n_env_steps": 7, "run_id": run.run_id}
             save_checkpoint(folder / "best.pt", experiment.agent.weights(), facts)
+            run.log_model({}, n_env_steps=7)
         run.log_files(*(folder / name for name in kept if (folder / name).exists()))
     return run.run_id
 

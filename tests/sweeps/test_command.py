@@ -124,8 +124,13 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     assert sorted(kept) == sorted(str(model.parent.parent) for model in tmp_path.glob("studies/**/MLmodel"))
     assert all("/judged/" in folder for folder in kept)
     assert len(kept) == len(trials_of(tmp_path, "sac_y-judged"))
+    # So does the model of MLflow, and the study's run has the result, beside the random agent.
+    models = client.search_logged_models([runs[0].info.experiment_id])
+    assert sorted(by_id[each.source_run_id].data.tags["folder"] for each in models) == sorted(kept)
     storage = open_storage(str(tmp_path / "optuna.journal")).optuna
     (study_run,) = [each for each in runs if each.info.run_name == "study sac_y"]
+    assert "| random |" in study_run.data.tags["mlflow.note.content"]
+    assert {"random/mean_steps", "test_volumes/mean_steps"} <= study_run.data.metrics.keys()
     for trial in trials_of(tmp_path):
         # Trial, run, folder and configuration know each other.
         tracked = by_id[trial.user_attrs["mlflow_run"]]

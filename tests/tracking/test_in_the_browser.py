@@ -10,6 +10,7 @@ from armscan.tracking import TrackedRun, open_store
 from armscan.tracking.view import VIEW, VIEW_TAG
 
 RATE, STEPS = "test_volumes/on_plane_5mm_10deg", "test_volumes/mean_steps"
+RANDOM_RATE = "random/on_plane_5mm_10deg"
 
 
 @pytest.fixture
@@ -42,6 +43,7 @@ def test_experiment_has_the_view_also_where_it_was_made_before(store):
 def test_view_leads_with_the_on_plane_rate_and_its_curve():
     view = json.loads(VIEW)
     assert view["selectedColumns"][0] == f"metrics.`{RATE}`"
+    assert view["selectedColumns"][1] == f"metrics.`{RANDOM_RATE}`"
     assert view["columnOrder"] == view["selectedColumns"] == [*view["columnWidths"]]
     (section,) = view["compareRunSections"]
     first = view["compareRunCharts"][0]
@@ -53,11 +55,16 @@ def test_run_of_a_grid_shows_the_figures_of_its_best_job(store):
     client, experiment_id = store()
     parent, *jobs = (client.create_run(experiment_id, name=name, tags={}).info.run_id for name in ("parent", "a", "b"))
     for job, rate in zip(jobs, (0.25, 0.75), strict=True):
-        metrics = [Metric(RATE, rate, 1, 5), Metric(STEPS, 4 * rate, 1, 5), Metric(f"{RATE}_low", 0.1, 1, 5)]
+        metrics = [
+            Metric(RATE, rate, 1, 5),
+            Metric(RANDOM_RATE, 0.2, 1, 5),
+            Metric(STEPS, 4 * rate, 1, 5),
+            Metric(f"{RATE}_low", 0.1, 1, 5),
+        ]
         client.log_batch(job, metrics=metrics)
     show_best(client, parent, [client.get_run(job) for job in jobs])
     run = client.get_run(parent)
-    assert run.data.metrics == {RATE: 0.75, STEPS: 3.0}
+    assert run.data.metrics == {RATE: 0.75, STEPS: 3.0, RANDOM_RATE: 0.2}
     assert run.data.tags[BEST_TAG] == jobs[1]
 
 
@@ -112,3 +119,12 @@ def test_description_of_a_run_is_its_table_unless_somebody_wrote_one(tracked, st
         client.set_tag(other.run_id, "mlflow.note.content", "mine")
         other.set_note("| table |")
     assert client.get_run(other.run_id).data.tags["mlflow.note.content"] == "mine"
+
+
+def test_description_follows_a_result_that_changes(store, tmp_path):
+    client, experiment_id = store()
+    with TrackedRun.start(client, experiment_id, name="a", config={}, tags={}, folder=tmp_path) as first:
+        first.set_note("early")
+    with TrackedRun.joined(client, first.run_id, name="a", folder=tmp_path) as again:
+        again.set_note("late")
+    assert client.get_run(first.run_id).data.tags["mlflow.note.content"] == "late"

@@ -146,7 +146,7 @@ def _reports(trials: Sequence[FrozenTrial], number: int, objective: str) -> Figu
             continue
         name, style = looks.get(trial.state, ("failed", {"line": {"color": GREY, "width": 1, "dash": "dot"}}))
         symbols = ["circle"] * (len(points) - 1) + ["x" if trial.state == TrialState.PRUNED else "circle"]
-        sizes = [3] * (len(points) - 1) + [8 if trial.state == TrialState.PRUNED else 5]
+        sizes = [5] * (len(points) - 1) + [8 if trial.state == TrialState.PRUNED else 6]
         figure.add_scatter(
             x=[step for step, _ in points],
             y=[value for _, value in points],

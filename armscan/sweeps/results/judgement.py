@@ -14,10 +14,11 @@ from optuna.trial import FrozenTrial, TrialState
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
-from armscan.sweeps.results.summary import OF_TEST, ConfigResult, final_results, scores_of
+from armscan.sweeps.results.summary import OF_TEST, ConfigResult, final_results, final_table, scores_of
 from armscan.sweeps.scheduling.state import CONTROL, METRICS
 from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, training_of
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, best_trials
+from armscan.training.baselines import RANDOM
 from armscan.training.metrics import ENDS
 from armscan.training.titles import is_rate, leading_among, title_of, value_text
 
@@ -156,11 +157,22 @@ def best_metrics(search: optuna.Study, final: FinalEvaluation | None) -> dict[st
         return found
     of_chosen = judgement.results[0].figures.metrics()
     found |= {f"test_volumes/{name}": of_chosen[name] for name in leading_among(of_chosen)}
+    if (of_random := judgement.results[0].baselines.get(RANDOM)) is not None:
+        metrics = of_random.metrics()
+        found |= {f"{RANDOM}/{name}": metrics[name] for name in leading_among(metrics)}
     for each in judgement.differences:
         for key, estimate in (("difference", each.paired), ("probability_of_improvement", each.probability)):
             names = (f"{key}/{each.metric}{end}" for end in ("", *ENDS))
             found |= dict(zip(names, estimate, strict=True))
     return found
+
+
+def result_note(final: FinalEvaluation | None) -> str:
+    """Return the result of a study in Markdown, a sentence and the table; empty before a configuration was judged."""
+    judgement = judge(final) if final is not None else None
+    if judgement is None or not judgement.results:
+        return ""
+    return f"**{judgement.statement}**\n\n{final_table(judgement.results).markdown()}"
 
 
 def _differences(

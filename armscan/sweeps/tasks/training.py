@@ -19,7 +19,7 @@ from armscan.experiment.build import Experiment, build_experiment, check_keys, o
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
 from armscan.experiment.results import RunResult
-from armscan.experiment.runner import VIDEO_SEED, train_agent
+from armscan.experiment.runner import VIDEO_SEED, log_result, train_agent
 from armscan.stats.aggregation import interquartile_mean
 from armscan.sweeps.scheduling.state import ENV_STEPS
 from armscan.sweeps.tasks.attempt import STUDY_TAG, Attempt, volumes_of
@@ -150,6 +150,7 @@ def _concluded(
     """Evaluate a trained agent beside the baselines, and store the results; return the metrics of the test."""
     reached = RunResult.of(setup, result)
     reached.write(folder, title=tracked.name)
+    log_result(tracked, result, reached)
     tested = reached.evaluations[TEST]
     attempt.keep_episodes({TEST: tested, **reached.baselines})
     agent, seed = setup.agent, VIDEO_SEED + setup.seed
