@@ -28,9 +28,10 @@ from armscan.config.sources import SWEEP
 from armscan.errors import is_interruption
 from armscan.experiment.job import INTERRUPTED, Invocation, remove_if_untracked
 from armscan.launch.folds_grid import with_folds
+from armscan.launch.grid_plan import check_grid, print_grid_plan
 from armscan.launch.job_process import start_job
 from armscan.launch.multirun import Multirun, end_multirun
-from armscan.utils.log import silence_library_warnings
+from armscan.utils.log import silence_libraries
 
 WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
 
@@ -97,19 +98,19 @@ def main() -> int:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # A run that is ended by Ctrl-C or kill is closed as killed in the tracking store.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    silence_library_warnings()
+    silence_libraries()
     # Hydra reads its options only before the first override, and people write them anywhere.
     sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in MULTIRUN)
     try:
         check_words(sys.argv[1:])
         if any(word.startswith(f"{SWEEP}=") for word in sys.argv[1:]):
+            if PLAN not in sys.argv[1:]:
+                print("preparing a study: its space is checked first", flush=True)
+            # Deferred: it loads Optuna, after the first line.
             from armscan.sweeps.command import run_study
 
             return run_study(sys.argv[1:], launch)
         if PLAN in sys.argv[1:]:
-            # Deferred, because few commands need it.
-            from armscan.launch.grid_plan import print_grid_plan
-
             print_grid_plan(sys.argv[1:])
             return 0
         if any(word.startswith(f"{RESUME}=") for word in sys.argv[1:]):
@@ -118,7 +119,9 @@ def main() -> int:
 
             resume(sys.argv[1:], repeat_grid)
         else:
-            launch(with_folds(sys.argv[1:]))
+            words = with_folds(sys.argv[1:])
+            check_grid(words)
+            launch(words)
     except BrokenPipeError:
         # The reader of --help, such as `head`, may have closed the pipe: nothing can be written, not even on exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

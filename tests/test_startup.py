@@ -48,6 +48,8 @@ def test_words_that_are_wrong_are_answered_before_a_library_of_learning_or_track
         "resume=abcd": "no run was tracked there",
         "agent=sca": "agent is 'sca'",
         "foo=1": "there is no key 'foo'",
+        "-m training.env_steps=-1,-9": "training.env_steps is -1",
+        "-m data=nifti seed=0,1": "data.path is not set",
     }
     codes, said, modules = after(tmp_path, *(f"run {words}" for words in wrong))
     assert codes == [2] * len(wrong)

@@ -110,8 +110,8 @@ class TianshouLearner(BaseLearner):
 
     @property
     def warm_up_note(self) -> str | None:
-        """Return a note on the random steps before the first update; None if there are none."""
-        return f"{self._learning_starts:,} random steps before the first update" if self._learning_starts else None
+        """Return how many random steps come before the first update, as a text; None if there are none."""
+        return f"{self._learning_starts:,} before the first update" if self._learning_starts else None
 
     def warm_up(self) -> None:
         """Fill the replay buffer with random steps."""

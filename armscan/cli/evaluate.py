@@ -124,6 +124,7 @@ def evaluate(
             f"--data is {folder!r}, but there is no such folder: it must be a folder of volumes, or phantom"
         )
     overrides = [] if agent is None else [f"agent={agent}", *run, *(["data=nifti"] if folder else [])]
+    print(f"preparing {f'run {run[0]}' if agent is None else f'agent={agent}'}", flush=True)
     # Deferred: a mistake on the command line is answered before these are loaded.
     from armscan import evaluation
     from armscan.config.defaults import default_tracking

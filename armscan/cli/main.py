@@ -16,7 +16,7 @@ from armscan.cli.report import report
 from armscan.cli.runs import runs
 from armscan.cli.ui import ui
 from armscan.errors import is_interruption
-from armscan.utils.log import silence_library_warnings
+from armscan.utils.log import silence_libraries
 
 PROGRAM = "armscan"
 TRACEBACKS = "ARMSCAN_TRACEBACKS"
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: 2 for a mistake, 130 for an interrupt, else the command's own.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
-    silence_library_warnings()
+    silence_libraries()
     try:
         return armscan.main(words, prog_name=PROGRAM, standalone_mode=False, obj=words) or 0
     except click.exceptions.NoArgsIsHelpError as error:

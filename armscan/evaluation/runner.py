@@ -19,6 +19,7 @@ from armscan.tracking import FoundRun
 from armscan.training import PARTS, Evaluation, Split, TrainingDomain, evaluate, evaluate_baselines
 from armscan.training.domain import smallest_slice
 from armscan.training.episode_results import Env
+from armscan.utils.console import print_sentence
 
 # First seed of an evaluation's episodes: none of them is played by a run, whose seeds lie below.
 FIRST_SEED = 5 * 10**6
@@ -101,7 +102,7 @@ def apply(
     if source.run and source.volumes is None and own.cache_info().currsize:
         notes.append("the run has not kept fingerprints of its volumes: nobody knows whether these are still the same")
     for note in notes:
-        print(printable(f"note: {note}"))
+        print_sentence(printable(f"note: {note}"))
     return replace(prepared, notes=tuple(notes), data=data)
 
 

@@ -37,7 +37,7 @@ from armscan.training import (
 )
 from armscan.training.domain import smallest_slice, with_crops
 from armscan.training.episode_results import Env
-from armscan.utils.log import silence_library_warnings
+from armscan.utils.log import silence_libraries
 from armscan.utils.validation import check_int, check_seed
 from armscan.volumes import LabelVolume
 
@@ -111,7 +111,7 @@ def set_up(config: DictConfig) -> Experiment:
     Raises:
         InvalidValueError: If something in it is not allowed, or the agent cannot act in one of the environments.
     """
-    silence_library_warnings()
+    silence_libraries()
     experiment = build_experiment(config)
     envs = (experiment.training_env, experiment.validation_env, experiment.test_env, experiment.video_env)
     trained = TrainingDomain.of(envs[0])

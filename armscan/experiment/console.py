@@ -12,7 +12,7 @@ from armscan.experiment.job import INTERRUPTED, JobOutcome
 from armscan.experiment.results import TITLES, RunResult
 from armscan.training import TEST, MetricEstimates, ResultTable
 from armscan.training.result_table import HOW, with_baselines
-from armscan.utils.console import wide_console
+from armscan.utils.console import print_sentence, wide_console
 from armscan.utils.files import ID_CHARS
 
 
@@ -32,7 +32,7 @@ def print_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, ho
     if how and table.quantities:
         console.print(Text(HOW, style="dim"))
     for note in notes:
-        console.print(Text(f"note: {note}"), soft_wrap=True)
+        print_sentence(f"note: {note}")
 
 
 def print_results(title: str, reached: RunResult) -> None:

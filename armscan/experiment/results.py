@@ -166,7 +166,10 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
                 "the intervals do not overlap: volumes differ more than episodes do, and other wrists may lie anywhere "
                 f"between or outside; {WHAT_HELPS}"
             ]
-    if test.n_volumes >= FEWEST_VOLUMES:
+    numbers = {TEST: test.n_volumes} | ({VALIDATION: validation.n_volumes} if validation is not None else {})
+    few = [f"{n} {name.split()[0]} volume{'s' if n > 1 else ''}" for name, n in numbers.items() if n < FEWEST_VOLUMES]
+    if not few:
         return []
-    few = f"{test.n_volumes} test volume{'s are' if test.n_volumes > 1 else ' is'} fewer than {FEWEST_VOLUMES}"
-    return [f"{few}: the intervals are too narrow for other wrists; {WHAT_HELPS}"]
+    return [
+        f"{' and '.join(few)}, fewer than {FEWEST_VOLUMES}: the intervals are too narrow for other wrists; {WHAT_HELPS}"
+    ]

@@ -1,4 +1,4 @@
-"""Plan of a grid, without running it: its jobs, and what each of them varies."""
+"""Jobs of a grid, before it is run: their plan, and the check of their words."""
 
 from __future__ import annotations
 
@@ -6,12 +6,18 @@ from collections.abc import Sequence
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
 
 from armscan.config.compose import compose
 from armscan.config.defaults import MULTIRUN, PLAN
 from armscan.config.sources import SWEEP
-from armscan.errors import InvalidValueError
+from armscan.errors import ArmscanError, InvalidValueError
 from armscan.launch.folds_grid import with_folds
+
+# Words of which Hydra alone knows the jobs.
+NOT_CHECKED = ("-", "hydra/sweeper", "hydra.sweeper")
 
 
 def print_grid_plan(words: Sequence[str]) -> None:
@@ -25,8 +31,7 @@ def print_grid_plan(words: Sequence[str]) -> None:
         HydraException: If a job cannot be composed.
     """
     overrides = [word for word in with_folds([word for word in words if word != PLAN]) if word not in MULTIRUN]
-    parsed = OverridesParser.create().parse_overrides(overrides)
-    (jobs,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
+    parsed, jobs = _jobs_of(overrides)
     if len(jobs) == 1:
         raise InvalidValueError(
             f"{PLAN} is given, but this is a single run: it shows the jobs of a grid, and what a study searches "
@@ -38,3 +43,37 @@ def print_grid_plan(words: Sequence[str]) -> None:
         # Raises what the job would.
         compose(job)
         print(f"{number:4d}  {' '.join(word for word in job if word not in varied)}")
+
+
+def check_grid(words: Sequence[str]) -> None:
+    """Raise the error of the first job if the words of every job of a grid are wrong; others run beside wrong ones.
+
+    Args:
+        words: Words of the command line; those of a single run, or of another sweeper than Hydra's basic one, are left
+            to Hydra.
+    """
+    overrides = [word for word in words if word not in MULTIRUN]
+    if len(overrides) == len(words) or any(word.startswith(NOT_CHECKED) for word in overrides):
+        return
+    print("preparing a grid: its words are checked first", flush=True)
+    # Deferred: it loads what checks them, after the first line.
+    from armscan.experiment.build import check_words
+
+    errors = []
+    _, jobs = _jobs_of(overrides)
+    for job in jobs:
+        config = compose(job)
+        try:
+            check_words(config)
+        except (ArmscanError, HydraException, OmegaConfBaseException) as error:
+            errors.append(error)
+        else:
+            return
+    raise errors[0]
+
+
+def _jobs_of(overrides: Sequence[str]) -> tuple[list[Override], list[list[str]]]:
+    """Return the overrides of a grid, parsed, and those of each job."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    (jobs,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
+    return parsed, jobs

@@ -20,7 +20,8 @@ from armscan.sweeps.study.study import existing_study
 from armscan.sweeps.study.warm_start import beginnings
 from armscan.sweeps.tasks.attempt import composed
 from armscan.sweeps.workers.launch import run_workers
-from armscan.utils.log import silence_library_warnings
+from armscan.utils.console import print_sentence
+from armscan.utils.log import silence_libraries
 
 
 def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:
@@ -30,9 +31,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
         The exit code: 0 if there is a result, 1 where too many trials failed.
     """
     given = StudyCommand.read(words)
-    if not given.is_plan:
-        print("preparing a study: its space is checked first", flush=True)
-    silence_library_warnings()
+    silence_libraries()
     trial_words = words_of_trials(given.words)
     settings, task, config = read_settings(trial_words)
     for key, uri in ((STORAGE, settings.storage), (TRACKING_URI, config.tracking.uri)):
@@ -54,7 +53,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     search = opened.search.scheduler
     for beginning in begins:
         if beginning.add(search.storage, search.study):
-            print(printable(beginning.told))
+            print_sentence(printable(beginning.told))
     for phase in opened.phases:
         if phase.scheduler.go_on():
             print(f"{phase.name}: was stopped, and goes on")

@@ -97,7 +97,6 @@ def mlflow_server(uri: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
     store = database_url(uri, TRACKING_PASSWORD).render_as_string(hide_password=False)
     # In the environment, because anyone can read the command line of a process. Without jobs: eight processes fewer.
     environment = os.environ | {"MLFLOW_BACKEND_STORE_URI": store, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
-    environment.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     environment.pop("MLFLOW_TRACKING_URI", None)
     command = [*child_command(__name__, serve_mlflow.__name__), "server", *MLFLOW_OPTIONS, "--port", str(port)]
     with tempfile.TemporaryFile() as log:

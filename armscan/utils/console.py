@@ -24,6 +24,11 @@ def wide_console(log_chars: int = LOG_CHARS) -> Console:
     return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=log_chars)
 
 
+def print_sentence(text: str) -> None:
+    """Print a text whose lines break between words on a terminal, and nowhere in a file or pipe."""
+    wide_console(WHOLE_CHARS).print(Text(text), highlight=False)
+
+
 def print_table(heading: str, names: Sequence[str], columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
     """Print a table with a name for each row: in a column if it fits, else in a line above its row.
 

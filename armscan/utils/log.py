@@ -1,8 +1,9 @@
-"""Log lines of a process, and the warnings of its libraries that are silenced."""
+"""Log lines of a process, and what its libraries are kept from telling."""
 
 from __future__ import annotations
 
 import logging
+import os
 import warnings
 from datetime import datetime
 
@@ -14,8 +15,10 @@ def log(text: str) -> None:
     print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {printable(text)}", flush=True)
 
 
-def silence_library_warnings() -> None:
-    """Hide warnings of libraries that a user cannot act on."""
+def silence_libraries() -> None:
+    """Hide warnings of libraries that a user cannot act on, and keep MLflow from telling its makers of its use."""
+    # Read when MLflow is imported.
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     for message in (
         "Gym has been unmaintained",
         ".*is an experimental feature.*",

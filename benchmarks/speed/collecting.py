@@ -28,7 +28,7 @@ from armscan.agents import MLP, PPO, SAC, AgentSetup, Compute
 from armscan.agents.step_collector import StepCollector
 from armscan.agents.tianshou_envs import TianshouVectorEnv
 from armscan.envs import EnvFactory
-from armscan.utils.log import silence_library_warnings
+from armscan.utils.log import silence_libraries
 from armscan.volumes import load_phantoms
 
 N_COLLECTIONS, N_STEPS, TOTAL_STEPS = 50, 16, 100_000
@@ -94,7 +94,7 @@ def milliseconds(collector: Any) -> tuple[float, float]:
 
 def main(words: list[str]) -> None:
     """Measure every case and print its table."""
-    silence_library_warnings()
+    silence_libraries()
     torch.set_num_threads(1)
     n_rounds = int(words[0]) if words else 15
     print("| 16 steps | environments, ms | Tianshou, ms | ours, ms | ratio | without them: Tianshou | ours | ratio |")

@@ -25,7 +25,7 @@ from tianshou.utils.torch_utils import policy_within_training_step
 from armscan.agents import MLP, SAC, AgentSetup, Compute
 from armscan.agents.tianshou_learner import TianshouLearner
 from armscan.envs import EnvFactory
-from armscan.utils.log import silence_library_warnings
+from armscan.utils.log import silence_libraries
 from armscan.volumes import load_phantoms
 
 N_RANDOM_STEPS, BATCH_SIZE, N_AT_ONCE, N_TIANSHOU, N_COMPILED = 1_000, 256, 4, 20, 100
@@ -65,7 +65,7 @@ def milliseconds(made: TianshouLearner, n_updates: int, *, is_compiled: bool) ->
 
 def main(words: list[str]) -> None:
     """Measure every case and print its table."""
-    silence_library_warnings()
+    silence_libraries()
     torch.set_num_threads(1)
     n_rounds = int(words[0]) if words else 15
     print("| projection, network | Tianshou, ms | compiled, ms | ratio, median | least | most |")

@@ -31,7 +31,7 @@ from armscan.envs import EnvFactory
 from armscan.envs.actions import ActionBounds
 from armscan.training import Evaluation, evaluate
 from armscan.training.episodes import play
-from armscan.utils.log import silence_library_warnings
+from armscan.utils.log import silence_libraries
 from armscan.volumes import load_phantoms
 
 N_ROUNDS, SEED = 3, 10**6
@@ -101,7 +101,7 @@ def measured(task) -> tuple[float, Evaluation]:
 
 def main(words: list[str]) -> None:
     """Measure every case and print its row."""
-    silence_library_warnings()
+    silence_libraries()
     torch.set_num_threads(1)
     print("| agent | mean steps | through Tianshou, s | one by one, s | side by side, s | times as fast as the first |")
     print("| --- | --- | --- | --- | --- | --- |")

@@ -3,7 +3,8 @@
     python -m benchmarks.speed.start [--before CHECKOUT]
 
 Each figure is the least of several processes, after one that has compiled everything, made the phantoms and the store.
-With `--before`, each process of this checkout is followed by one of the other, whose figure stands beside it.
+With `--before`, each process of this checkout is followed by one of the other, whose figure stands beside it. A command
+that goes on after the line that is waited for is killed there.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import os
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -29,28 +31,51 @@ from armscan.run import main
 main()
 """
 VOLUMES = str(HERE / "tests" / "data" / "volumes")
+STUDY = ("run", "-m", "sweep=sac_y", "study.workers=1")
+# A command, and the beginning of the line that ends it; None if it ends by itself.
 COMMANDS = {
-    "a wrong word, `run training.env_steps=-1`": (RUN, "run", "training.env_steps=-1"),
-    "`run data=nifti` without a path": (RUN, "run", "data=nifti"),
-    "`run resume=zzzz`": (RUN, "run", "resume=zzzz"),
-    "`runs list`": (RUN, "runs", "list"),
-    "`report --runs` of a run that is not there": (RUN, "report", "--runs", "abcd"),
-    "`ui --help`": (RUN, "ui", "--help"),
-    "`data inspect`, four volumes": (RUN, "data", "inspect", VOLUMES),
-    "`run`, until the first training step": (UNTIL_TRAINING,),
+    "first line of `run`": (("run",), ""),
+    "first line of a grid, `run -m agent=sac,ppo`": (("run", "-m", "agent=sac,ppo"), ""),
+    "first line of a study, `run -m sweep=sac_y`": (STUDY, ""),
+    "a wrong word, `run training.env_steps=-1`": (("run", "training.env_steps=-1"), None),
+    "the same in a grid, `run -m training.env_steps=-1,9`": (("run", "-m", "training.env_steps=-1,9"), None),
+    "the same in a study": ((*STUDY, "training.env_steps=-1"), None),
+    "`run data=nifti` without a path": (("run", "data=nifti"), None),
+    "`run resume=zzzz`": (("run", "resume=zzzz"), None),
+    "`runs list`": (("runs", "list"), None),
+    "`report --runs` of a run that is not there": (("report", "--runs", "abcd"), None),
+    "`ui`, without its servers": (("ui", "--mlflow-port", "5998", "--dashboard-port", "5999"), "runs "),
+    "`data inspect`, four volumes": (("data", "inspect", VOLUMES), None),
+    "MLflow alone, its store opened": (None, None),
+    "`run`, until the first training step": ((), None),
 }
+STORE = "from mlflow import MlflowClient; MlflowClient('sqlite:///mlruns.db').search_experiments()"
 
 
-def processor_s(checkout: Path, folder: str, program: str, *words: str) -> float:
-    """Return the processor seconds of a fresh process, of its own and of its children."""
+def processor_s(checkout: Path, folder: str, words: tuple[str, ...] | None, until: str | None) -> float:
+    """Return the processor seconds of a fresh process.
+
+    Args:
+        checkout: Folder of the code.
+        folder: Working folder.
+        words: Words of the command; none for a run until its first training step, None for MLflow alone.
+        until: Beginning of the printed line at which the process is killed; None, if it ends by itself.
+    """
+    program = STORE if words is None else (RUN if words else UNTIL_TRAINING)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(
-        [sys.executable, "-c", program, *words],
+    with subprocess.Popen(
+        [sys.executable, "-c", program, *(words or ())],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        check=False,
-    )
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if until is not None and line.startswith(until):
+                os.killpg(process.pid, signal.SIGKILL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
@@ -64,7 +89,7 @@ def main() -> None:
     print(f"| processor seconds | {' | '.join(checkouts)} |\n| --- |{' ---: |' * len(checkouts)}")
     with tempfile.TemporaryDirectory() as folder:
         for checkout in checkouts.values():
-            processor_s(checkout, folder, *COMMANDS["`run`, until the first training step"])
+            processor_s(checkout, folder, (), None)
         for name, command in COMMANDS.items():
             rounds = [[processor_s(each, folder, *command) for each in checkouts.values()] for _ in range(N_PROCESSES)]
             least = (min(column) for column in zip(*rounds, strict=True))

@@ -34,7 +34,7 @@ from armscan.experiment.runner import train_agent
 from armscan.sweeps.tasks.attempt import composed
 from armscan.tracking import TrackedRun, open_store
 from armscan.training import EpochReport
-from armscan.utils.log import silence_library_warnings
+from armscan.utils.log import silence_libraries
 from tests.support.mlflow_server import MlflowServer, mlflow_server
 
 THREADS = ("uploader", "pending", "system metrics")
@@ -164,7 +164,7 @@ def main() -> None:
     for option, default in (("--rounds", 3), ("--env-steps", 20_000), ("--every", 1000)):
         parser.add_argument(option, type=int, default=default)
     given = parser.parse_args()
-    silence_library_warnings()
+    silence_libraries()
     config, _ = composed(
         [
             f"training.env_steps={given.env_steps}",

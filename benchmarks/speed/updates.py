@@ -24,7 +24,7 @@ from tianshou.utils.torch_utils import policy_within_training_step
 
 from armscan.agents import MLP, SAC, AgentSetup, Compute, Multimodal, Network
 from armscan.envs import EnvFactory, SliceChannelsObservation
-from armscan.utils.log import silence_library_warnings
+from armscan.utils.log import silence_libraries
 from armscan.volumes import load_phantoms
 
 N_ROUNDS, N_RANDOM_STEPS, ROUND_S = 5, 1_000, 3.0
@@ -82,7 +82,7 @@ def updater(env_factory: EnvFactory, network: Network, compute: Compute):
 
 def main(words: list[str]) -> None:
     """Measure every case and print its table."""
-    silence_library_warnings()
+    silence_libraries()
     torch.set_num_threads(1)
     chosen = {name: case for name, case in CASES.items() if not words or any(word in name for word in words)}
     print("| observation, network | computed | updates/s, median | best | beside the first |")

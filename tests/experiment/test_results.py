@@ -1,7 +1,11 @@
 """The result of a run in its table."""
 
-from armscan.experiment.results import RunResult
-from armscan.training import TEST, TRAINING, Evaluation
+from dataclasses import replace
+
+import pytest
+
+from armscan.experiment.results import RunResult, volume_notes
+from armscan.training import TEST, TRAINING, Evaluation, MetricEstimates
 from tests.training.test_result_table import made_episodes
 
 
@@ -12,3 +16,24 @@ def test_agent_that_is_a_baseline_has_one_row():
     assert list(alone.table().results) == ["agent, test", "agent, training"]
     beside = RunResult(played, {"random": baseline})
     assert list(beside.table().results) == ["agent, test", "random, test", "agent, training"]
+
+
+@pytest.mark.parametrize(
+    ("n_test", "n_validation", "few"),
+    [(8, 8, None), (8, None, None), (8, 4, "4 validation volumes"), (1, 4, "1 test volume and 4 validation volumes")],
+)
+def test_few_volumes_are_said_in_one_line(n_test, n_validation, few):
+    test, validation = (
+        MetricEstimates.of(Evaluation(made_episodes(0, n_volumes=n))) if n else None for n in (n_test, n_validation)
+    )
+    notes = volume_notes(test, validation)
+    assert [note.partition(", fewer than 8")[0] for note in notes] == ([few] if few else [])
+
+
+def test_validation_that_no_interval_shares_with_the_test_is_said_in_one_line():
+    on_plane, off_plane = (
+        MetricEstimates.of(Evaluation([replace(each, distance_mm=mm, distance_deg=0.0) for each in made_episodes(0)]))
+        for mm in (0.0, 50.0)
+    )
+    (note,) = volume_notes(on_plane, off_plane)
+    assert "0% on the validation and 100% on the test volumes, and the intervals do not overlap" in note

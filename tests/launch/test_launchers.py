@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from armscan.config.compose import compose
 from armscan.errors import InvalidValueError
 from armscan.launch.launchers import check_launcher
-from armscan.utils.log import silence_library_warnings
+from armscan.utils.log import silence_libraries
 
 
 @pytest.mark.parametrize(
@@ -46,6 +46,6 @@ def test_slurm_is_looked_for_where_the_command_is_typed(monkeypatch, tmp_path):
 def test_launcher_has_our_values_beside_its_own_and_nobody_is_warned(launcher, key, value):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        silence_library_warnings()
+        silence_libraries()
         config = compose([f"hydra/launcher={launcher}"], return_hydra_config=True)
     assert OmegaConf.select(config.hydra.launcher, key) == value

@@ -41,7 +41,7 @@ from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.training.titles import title_of, value_text
-from armscan.utils.console import WHOLE_CHARS, wide_console
+from armscan.utils.console import WHOLE_CHARS, print_sentence, wide_console
 from armscan.utils.files import RUN_FILE
 from armscan.utils.retry import no_retry
 
@@ -182,7 +182,7 @@ def print_result(opened: OpenedStudy) -> int:
     state = scheduler.state()
     print(_summary(opened, state))
     if stopped := scheduler.look_for_stop():
-        print(printable(f"the study was stopped {stopped}; the same command resumes it"))
+        print_sentence(printable(f"the study was stopped {stopped}; the same command resumes it"))
         return 0
     wrong = scheduler.broken(state)
     if wrong is None and scheduler.end(state) is None:
@@ -194,7 +194,8 @@ def print_result(opened: OpenedStudy) -> int:
         print(printable(f"error: {wrong}"), file=sys.stderr)
         return 1
     if scheduler.termination is not None and (ended := scheduler.termination.reason):
-        print(printable(f"the study has ended by itself: {ended}; study.n_trials or study.terminator change that"))
+        told = f"the study has ended by itself: {ended}; study.n_trials or study.terminator change that"
+        print_sentence(printable(told))
     if settings.constraints and state.finished and not best_trials(scheduler.study, 1):
         print(f"no trial keeps all constraints: {', '.join(map(str, settings.constraints))}")
     titles = map(title_of, settings.objectives)
@@ -244,16 +245,16 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
             reason = "trainings are missing; the same command resumes the study"
         print(f"error: no final evaluation, because {reason}", file=sys.stderr)
         return False
-    print(f"result: {judgement.statement}")
+    print_sentence(f"result: {judgement.statement}")
     if judgement.differences:
         title = f"{name_of(judgement.chosen)} and the control, {judgement.n_seeds} other seeds each"
         _print_rows(title, [each.row() for each in judgement.differences])
-        print(HOW)
+        print_sentence(HOW)
     notes = [*volume_notes(judgement.results[0].figures), *judgement.notes]
     print_table("the test volumes", final_table(judgement.results), notes)
     for result in judgement.results:
         settings = " ".join(overrides_of(settings_of(trials, result.number)))
-        print(f"{name_of(result.number)}: {settings or NOTHING_SEARCHED}")
+        print_sentence(f"{name_of(result.number)}: {settings or NOTHING_SEARCHED}")
     return True
 
 

@@ -40,7 +40,7 @@ from armscan.sweeps.workers.heartbeat import Heartbeat, LimitReachedError
 from armscan.tracking import TrackedRun, run_of_study
 from armscan.tracking.run import PARENT_TAG, SHORT_WAIT_S
 from armscan.utils.files import CONFIG_FILE, SHA256_TAGS
-from armscan.utils.log import log, silence_library_warnings
+from armscan.utils.log import log, silence_libraries
 
 WAIT_S = 1.0
 MAX_REASON_CHARS = 2000
@@ -238,7 +238,7 @@ def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None
     Raises:
         AwayError: If the storage or the tracking store is away for longer than a worker waits.
     """
-    silence_library_warnings()
+    silence_libraries()
     opened = open_for_work(*read_settings(words), words, retry=True)
 
     def run_phase(phase: Phase) -> None:

@@ -81,9 +81,9 @@ def trained_rows(words: Sequence[str], training: Mapping[str, Any], values: dict
     from armscan.sweeps.space.parameter import overrides_of
     from armscan.sweeps.tasks.attempt import composed, volumes_of
     from armscan.training import evaluate
-    from armscan.utils.log import silence_library_warnings
+    from armscan.utils.log import silence_libraries
 
-    silence_library_warnings()
+    silence_libraries()
     config, _ = composed([*words, *overrides_of(values), f"seed={training['seed']}"])
     setup = build_experiment(config, volumes_of(config))
     recorder = _Recorder()
