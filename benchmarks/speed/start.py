@@ -38,7 +38,7 @@ COMMANDS = {
     "first line of a grid, `run -m agent=sac,ppo`": (("run", "-m", "agent=sac,ppo"), ""),
     "first line of a study, `run -m sweep=sac_y`": (STUDY, ""),
     "a wrong word, `run training.env_steps=-1`": (("run", "training.env_steps=-1"), None),
-    "the same in a grid, `run -m training.env_steps=-1,9`": (("run", "-m", "training.env_steps=-1,9"), None),
+    "the same in a grid, `run -m training.env_steps=-1,-9`": (("run", "-m", "training.env_steps=-1,-9"), None),
     "the same in a study": ((*STUDY, "training.env_steps=-1"), None),
     "`run data=nifti` without a path": (("run", "data=nifti"), None),
     "`run resume=zzzz`": (("run", "resume=zzzz"), None),
