@@ -22,7 +22,7 @@ from armscan.cli.options import (
     tracking_option,
     trust_option,
 )
-from armscan.errors import printable
+from armscan.errors import TrackingError, printable
 
 if TYPE_CHECKING:
     from armscan.tracking import TrackingStore
@@ -160,7 +160,10 @@ def stop(target: str, storage: str, tracking: str) -> None:
         print(stop_study(storage, target))
         return
     with _open(tracking) as client:
-        run = find_run(client, target)
+        try:
+            run = find_run(client, target)
+        except TrackingError as error:
+            raise TrackingError(f"{error}; and {storage} has no study {target!r}") from error
     if (found := target_of(run)) is None:
         print(interrupt(run))
     elif found.trial is None:

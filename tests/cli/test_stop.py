@@ -85,6 +85,15 @@ def test_run_that_has_ended_is_not_interrupted(answer, run_with):
     assert answer(run_id) == (2, "", f"error: run {run_id} has ended already (FINISHED)")
 
 
+def test_what_is_neither_run_nor_study_is_refused_as_both(answer, study, run_with):
+    run_with()
+    for unknown in ("b", "nobody"):
+        code, _, said = answer(unknown)
+        assert code == 2
+        assert f"'{unknown}'" in said
+        assert said.endswith(f"; and optuna.journal has no study '{unknown}'")
+
+
 def test_nothing_is_made_where_there_is_no_study(answer, run_with, tmp_path):
     assert answer(run_with(study="a"))[0] == 2
     assert not (tmp_path / "optuna.journal").exists()

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import optuna
-from optuna.artifacts import FileSystemArtifactStore, upload_artifact
 from optuna.trial import Trial
 
 from armscan.config.services import MLFLOW_PORT
@@ -82,6 +81,9 @@ def named_as_of_runs(metrics: Mapping[str, float]) -> dict[str, float]:
 
 def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:
     """Copy a picture to where the dashboard finds those of a trial."""
+    # Deferred: it loads boto3 if that is installed.
+    from optuna.artifacts import FileSystemArtifactStore, upload_artifact
+
     try:
         artifacts.mkdir(parents=True, exist_ok=True)
         upload_artifact(study_or_trial=trial, file_path=str(picture), artifact_store=FileSystemArtifactStore(artifacts))
