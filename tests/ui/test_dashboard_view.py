@@ -85,7 +85,7 @@ def test_links_lead_to_the_port_at_which_mlflow_is(dashboard):
     note = study["trials"][0]["note"]["body"]
     assert f"({MLFLOW}/#/experiments/1/runs/{'1' * 32})" in note
     assert LOCAL_UI not in note
-    assert "| steps, mean | 3 |" in note
+    assert "| steps, mean | 3.00 |" in note
 
 
 def test_studies_of_others_are_shown_as_they_are(dashboard):

@@ -23,9 +23,9 @@ def test_table_of_seeds_is_rounded_and_called_as_people_call_it():
         "| validation, best epoch | seed 0 | seed 7 |",
         "| --- | ---: | ---: |",
         "| on plane, 5 mm 10° | 93.8% | 93.8% |",
-        "| distance mm, median | 1.235 | 1.235 |",
+        "| distance mm, median | 1.2 | 1.2 |",
         "| success, by reward | 100.0% | 100.0% |",
-        "| steps, mean | 3 | 3 |",
+        "| steps, mean | 3.00 | 3.00 |",
         "| environment steps | 12,000 | 12,000 |",
         "| training, s | – | – |",
     ]
