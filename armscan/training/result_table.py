@@ -18,6 +18,7 @@ from rich.text import Text
 
 from armscan.stats.bootstrap import Estimate
 from armscan.training.metrics import MetricEstimates
+from armscan.utils.markdown import markdown_table
 
 # The most results that stand side by side; more of them are lines of their own.
 MOST_ABREAST = 6
@@ -138,14 +139,13 @@ class ResultTable:
 
     def markdown(self) -> str:
         """Return the table in Markdown, a column for each result."""
-        rows = [["with 95 % intervals", *self.results], ["---", *("---:" for _ in self.results)]]
-        rows += [[heading, *values] for heading, values in self.facts.items()]
+        rows = [[heading, *values] for heading, values in self.facts.items()]
         for column in self.quantities:
             cells = (" ".join(_cell(each, column, "({})")) for each in self.results.values())
             rows.append([column.title, *cells])
         for title, count in COUNTS.items():
             rows.append([title, *(_count(each, count) for each in self.results.values())])
-        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        return markdown_table(["with 95 % intervals", *self.results], rows)
 
     def _abreast(self, width: int) -> list[Table]:
         """Return tables with a column for each result, as many beside each other as fit."""

@@ -18,7 +18,7 @@ STUDIES = re.compile(r"/api/studies(/\d+)?")
 LOCAL_RUNS = re.compile(rf"http://127\.0\.0\.1:{MLFLOW_PORT}(?=/#/)")
 # Attributes that are kept of a study and of its trials, by which they are known.
 OF_STUDY, OF_TRIAL = {"space", "fixed_config", "objectives"}, {"lease", "config_sha256", "judged"}
-HIDDEN_OF_STUDY = OF_STUDY | {"mlflow_run", "forgiven"}
+HIDDEN_OF_STUDY = OF_STUDY | {"mlflow_run", "note_sha256", "forgiven"}
 # The note has the run, the folder and the figures of the seeds.
 HIDDEN = {"lease", "figures", "seeds", "config_sha256", "attempt", "retried", "mlflow_run", "folder"}
 NAMES = {

@@ -14,6 +14,7 @@ import pytest
 from hydra.errors import HydraException
 from mlflow import MlflowClient
 from optuna.artifacts import get_all_artifact_meta
+from optuna_dashboard import get_note
 from optuna_dashboard._note import get_note_from_system_attrs
 from yaml import YAMLError
 
@@ -129,7 +130,10 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     assert sorted(by_id[each.source_run_id].data.tags["folder"] for each in models) == sorted(kept)
     storage = open_storage(str(tmp_path / "optuna.journal")).optuna
     (study_run,) = [each for each in runs if each.info.run_name == "study sac_y"]
-    assert "| random |" in study_run.data.tags["mlflow.note.content"]
+    note = study_run.data.tags["mlflow.note.content"]
+    assert "| random |" in note
+    # On the dashboard's page of the study, too.
+    assert get_note(optuna.load_study(study_name="sac_y", storage=storage)).endswith(note)
     assert {"random/mean_steps", "test_volumes/mean_steps"} <= study_run.data.metrics.keys()
     for trial in trials_of(tmp_path):
         # Trial, run, folder and configuration know each other.

@@ -7,7 +7,7 @@ import optuna
 import pytest
 
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.dashboard import LOCAL_UI, note_run
+from armscan.sweeps.study.dashboard import LOCAL_UI, note_run, table_of_seeds
 from armscan.ui.servers import start_dashboard
 from tests.ui.test_ui import free_ports
 
@@ -42,7 +42,7 @@ def dashboard(tmp_path):
         trial = study.ask()
         for name, value in of_trial.items():
             trial.set_user_attr(name, value)
-        note_run(trial, Store, "1", "1" * 32, tmp_path, {0: {"mean_steps": 3.0}})
+        note_run(trial, Store, "1", "1" * 32, tmp_path, table_of_seeds({0: {"mean_steps": 3.0}}))
         if not is_running:
             study.tell(trial, 1.0)
         port, _ = free_ports()

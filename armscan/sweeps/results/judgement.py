@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,16 +11,19 @@ import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
+from armscan.experiment.results import volume_notes
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
 from armscan.sweeps.results.summary import OF_TEST, ConfigResult, final_results, final_table, scores_of
 from armscan.sweeps.scheduling.state import CONTROL, METRICS
-from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, training_of
+from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, name_of, settings_of, training_of
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, best_trials
 from armscan.training.baselines import RANDOM
 from armscan.training.metrics import ENDS
 from armscan.training.titles import is_rate, leading_among, title_of, value_text
+from armscan.utils.markdown import markdown_table
 
 MAXIMIZE = "maximize"
 HOW = (
@@ -84,6 +87,8 @@ class Judgement:
         n_seeds: Number of seeds that both have been trained with.
         n_planned: Number of seeds that they are to be trained with.
         others: Other trials that the test volumes have been opened for, because the study continued after its end.
+        settings: The settings of the chosen one and the control, as words of the command line, by their names; empty
+            without any.
     """
 
     chosen: int
@@ -92,6 +97,7 @@ class Judgement:
     n_seeds: int
     n_planned: int
     others: tuple[int, ...]
+    settings: Mapping[str, str]
 
     @property
     def notes(self) -> list[str]:
@@ -101,7 +107,12 @@ class Judgement:
             notes.append(f"only {self.n_seeds} of {self.n_planned} seeds have been trained to their end")
         if names := ", ".join(map(name_of, self.others)):
             notes.append(f"the test volumes were opened before for {names}: the study went on after its end")
-        return notes
+        return [*notes, *(volume_notes(self.results[0].figures) if self.results else ())]
+
+    @property
+    def compared(self) -> str:
+        """The configurations that the differences are between, and their seeds."""
+        return f"{name_of(self.chosen).capitalize()} and the control, {self.n_seeds} other seeds each"
 
     @property
     def statement(self) -> str:
@@ -136,8 +147,15 @@ def judge(final: FinalEvaluation) -> Judgement | None:
     pairs = [[judged[number, seed] for seed in seeds] for number in both]
     differences = _differences(final.search, *pairs) if seeds and chosen != CONTROL else ()
     others = sorted({number for number, _ in judged} - set(both))
+    results, searched = tuple(final_results(now)), final.search.get_trials(deepcopy=False)
     return Judgement(
-        chosen, tuple(final_results(now)), tuple(differences), len(seeds), len(final.judge_seeds), tuple(others)
+        chosen=chosen,
+        results=results,
+        differences=tuple(differences),
+        n_seeds=len(seeds),
+        n_planned=len(final.judge_seeds),
+        others=tuple(others),
+        settings={name_of(each.number): " ".join(overrides_of(settings_of(searched, each.number))) for each in results},
     )
 
 
@@ -168,11 +186,15 @@ def best_metrics(search: optuna.Study, final: FinalEvaluation | None) -> dict[st
 
 
 def result_note(final: FinalEvaluation | None) -> str:
-    """Return the result of a study in Markdown, a sentence and the table; empty before a configuration was judged."""
+    """Return the result of a study in Markdown, as the study prints it; empty before a configuration was judged."""
     judgement = judge(final) if final is not None else None
     if judgement is None or not judgement.results:
         return ""
-    return f"**{judgement.statement}**\n\n{final_table(judgement.results).markdown()}"
+    settings = (f"{name}: {f'`{words}`' if words else NOTHING_SEARCHED}" for name, words in judgement.settings.items())
+    parts = [f"**{judgement.statement}**", *settings, "The test volumes:", final_table(judgement.results).markdown()]
+    if rows := [each.row() for each in judgement.differences]:
+        parts += [f"{judgement.compared}:", markdown_table([*rows[0]], [[*row.values()] for row in rows]), HOW]
+    return "\n\n".join([*parts, *(f"Note: {note}." for note in judgement.notes)])
 
 
 def _differences(

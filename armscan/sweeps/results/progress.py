@@ -18,7 +18,6 @@ from rich.text import Text
 from armscan.config.command_hints import armscan_command
 from armscan.errors import ArmscanError, printable
 from armscan.experiment.console import print_table, print_where_to_look
-from armscan.experiment.results import volume_notes
 from armscan.sweeps.results.judgement import HOW, judge
 from armscan.sweeps.results.selection import candidates_of, objective_of
 from armscan.sweeps.results.summary import final_table, values_of
@@ -36,7 +35,7 @@ from armscan.sweeps.scheduling.state import (
 )
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX, check_trials
-from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, n_trainings, name_of, settings_of
+from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, n_trainings, name_of
 from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import trial_folder
@@ -247,14 +246,11 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
         return False
     print_sentence(f"result: {judgement.statement}")
     if judgement.differences:
-        title = f"{name_of(judgement.chosen)} and the control, {judgement.n_seeds} other seeds each"
-        _print_rows(title, [each.row() for each in judgement.differences])
+        _print_rows(judgement.compared, [each.row() for each in judgement.differences])
         print_sentence(HOW)
-    notes = [*volume_notes(judgement.results[0].figures), *judgement.notes]
-    print_table("the test volumes", final_table(judgement.results), notes)
-    for result in judgement.results:
-        settings = " ".join(overrides_of(settings_of(trials, result.number)))
-        print_sentence(f"{name_of(result.number)}: {settings or NOTHING_SEARCHED}")
+    print_table("the test volumes", final_table(judgement.results), judgement.notes)
+    for name, settings in judgement.settings.items():
+        print_sentence(f"{name}: {settings or NOTHING_SEARCHED}")
     return True
 
 

@@ -53,6 +53,7 @@ class StudyAttributes(_Attributes):
     fixed_config: dict[str, Any] = Field(description="values by the names of keys")
     objectives: dict[str, str] = Field(description="directions by the names of metrics")
     mlflow_run: Text = ""
+    note_sha256: Text = ""
     stop: Text = ""
     forgiven: list[Number] = Field(default=[], description="a list of numbers of trials")
     terminated: dict[str, Text] = Field(default={}, description="texts by their names")

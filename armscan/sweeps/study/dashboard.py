@@ -12,10 +12,14 @@ from optuna.trial import Trial
 from armscan.config.services import MLFLOW_PORT
 from armscan.tracking import TrackingStore
 from armscan.training.titles import COSTS, leading_among, title_of, value_text
+from armscan.utils.files import sha256
 from armscan.utils.log import log
+from armscan.utils.markdown import markdown_table
 
 # Where `armscan ui` serves the runs of a store that is no server, but where it was given another port.
 LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
+# Of the note that was left at a study.
+NOTE_SUM = "note_sha256"
 # Before the metrics of a final training on the test volumes.
 TEST = "test/"
 
@@ -26,9 +30,11 @@ def note_run(
     experiment_id: str,
     run_id: str,
     folder: Path,
-    of_seeds: Mapping[int, Mapping[str, float]] | None = None,
+    figures: str = "",
 ) -> None:
-    """Leave a note with the link to the tracked run of a study or a trial, and its folder.
+    """Leave a note with the link to the tracked run of a study or a trial, its folder, and its figures.
+
+    A note of a study that somebody has changed stays as it is.
 
     Args:
         target: Study or trial to note it at.
@@ -36,26 +42,32 @@ def note_run(
         experiment_id: MLflow experiment ID of the run.
         run_id: MLflow run ID.
         folder: The folder of the study or the trial.
-        of_seeds: Metrics by the seeds of a trial that has ended. Default: None, no metrics.
+        figures: Figures in Markdown. Default: "", none.
     """
     # Deferred: it takes a second, and only who works at a study needs it.
-    from optuna_dashboard import save_note
+    from optuna_dashboard import get_note, save_note
 
     address = client.uri.rstrip("/") if client.uri.startswith("http") else LOCAL_UI
     link = f"[its run in MLflow]({address}/#/experiments/{experiment_id}/runs/{run_id})"
-    figures = f"\n\n{table_of_seeds(of_seeds)}" if of_seeds else ""
-    save_note(target, f"{link}, {run_id}\n\nits folder: `{folder.resolve()}`{figures}")
+    begun = f"{link}, {run_id}\n\nits folder: `{folder.resolve()}`"
+    note = f"{begun}\n\n{figures}" if figures else begun
+    if isinstance(target, optuna.Study):
+        left = target.user_attrs.get(NOTE_SUM, sha256(begun.encode()))
+        if (known := get_note(target)) and sha256(known.encode()) != left:
+            return
+        target.set_user_attr(NOTE_SUM, sha256(note.encode()))
+    save_note(target, note)
 
 
 def table_of_seeds(of_seeds: Mapping[int, Mapping[str, float]]) -> str:
     """Return the leading metrics of seeds as a table in Markdown, a column for each seed."""
     known = next(iter(of_seeds.values()))
     names = [*leading_among(known), *(name for name in COSTS if name in known)]
-    rows = [["validation, best epoch", *(f"seed {seed}" for seed in of_seeds)], ["---", *("---:" for _ in of_seeds)]]
+    rows = []
     for name in names:
         values = (metrics.get(name, math.nan) for metrics in of_seeds.values())
         rows.append([title_of(name), *("–" if math.isnan(value) else value_text(name, value) for value in values)])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return markdown_table(["validation, best epoch", *(f"seed {seed}" for seed in of_seeds)], rows)
 
 
 def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float]:

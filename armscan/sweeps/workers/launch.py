@@ -23,6 +23,7 @@ from armscan.sweeps.results.judgement import best_metrics, result_note
 from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.space.parameter import written
 from armscan.sweeps.study.arguments import STORAGE, USUAL_LAUNCHER, WORKER_KEY, StudyCommand, fixed_by
+from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.open import OpenedStudy
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.sweeps.workers.monitor import StudyMonitor
@@ -146,6 +147,8 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
             tracked.log_metrics(best_metrics(opened.search.scheduler.study, opened.final_eval), n_env_steps=0)
             if note := result_note(opened.final_eval):
                 tracked.set_note(note)
+                where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder
+                note_run(opened.search.scheduler.study, *where, note)
         _deliver(opened, tracked, "KILLED" if is_asked.is_set() else status)
         for each, handler in before.items():
             signal.signal(each, handler)

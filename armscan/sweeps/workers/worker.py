@@ -22,7 +22,7 @@ from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.components import make, read_settings
-from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_picture, shown_metrics
+from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_picture, shown_metrics, table_of_seeds
 from armscan.sweeps.study.open import Phase, open_for_work
 from armscan.sweeps.tasks.attempt import (
     CONFIG_SHA256,
@@ -159,7 +159,7 @@ class Worker:
             writes.append(partial(trial.set_user_attr, ENV_STEPS, attempt.env_steps))
             if attempt.seeds_done:
                 where = phase.client, phase.experiment_id, self._tracked.run_id, folder
-                writes.append(partial(note_run, trial, *where, attempt.seeds_done))
+                writes.append(partial(note_run, trial, *where, table_of_seeds(attempt.seeds_done)))
 
     def _begun(self, trial: Trial, chosen: dict[str, Any], folder: Path, config_sum: str) -> TrackedRun:
         """Open the tracked run of a trial, or resume that of a requeued one."""

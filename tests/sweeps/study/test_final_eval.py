@@ -9,7 +9,7 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.results.judgement import best_metrics, judge
+from armscan.sweeps.results.judgement import best_metrics, judge, result_note
 from armscan.sweeps.results.selection import candidates_of
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
@@ -199,6 +199,23 @@ def test_run_of_the_study_has_the_result(storage_uri):
     assert metrics["difference/mean_steps_low"] < metrics["difference/mean_steps"] < 0
     assert metrics["probability_of_improvement/mean_steps"] == 1.0
     assert metrics["test_volumes/mean_steps"] < 4.0
+
+
+def test_note_on_a_study_says_which_settings_how_sure_and_what_helps(storage_uri):
+    final = run(storage_uri)
+    said, chosen, control, *rest = result_note(final).split("\n\n")
+    assert said == "**Trial 1 is better than the default configuration: steps, mean.**"
+    assert chosen.startswith("trial 1: `agent.lr=0.0")
+    assert control.startswith("control: the configuration of the study without")
+    assert "| with 95 % intervals | trial 1 | control |" in rest[1]
+    assert rest[2] == "Trial 1 and the control, 3 other seeds each:"
+    difference = judge(final).differences[0].row()
+    assert rest[3].splitlines()[2] == f"| {' | '.join(difference.values())} |"
+    assert rest[-1].startswith("Note: 3 test volumes, fewer than 8")
+
+
+def test_note_on_a_study_that_has_no_result_is_empty(storage_uri):
+    assert result_note(None) == result_note(opened(storage_uri)[0]) == ""
 
 
 def test_final_evaluation_is_read_from_the_storage_and_that_of_an_earlier_version_is_none(storage_uri):

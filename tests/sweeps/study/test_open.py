@@ -7,9 +7,11 @@ import optuna
 import pytest
 from omegaconf import OmegaConf
 from optuna.trial import TrialState
+from optuna_dashboard import get_note, save_note
 
 from armscan.errors import TrackingError
 from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.dashboard import NOTE_SUM, note_run
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.study import STUDY_RUN
 from armscan.tracking import open_store
@@ -51,6 +53,44 @@ def test_run_of_a_study_that_is_anothers_is_refused_and_left_as_it_is(opened, ki
         opened()
     now = client.get_run(victim.info.run_id)
     assert (now.info.status, now.data.tags) == ("RUNNING", victim.data.tags)
+
+
+def note_result(search, result):
+    """Note a result at a study, as its launcher does; return what the dashboard shows then."""
+    study = search.scheduler.study
+    note_run(study, search.client, search.experiment_id, search.run_id, search.folder, result)
+    return get_note(study)
+
+
+def test_note_of_a_study_has_its_run_and_its_latest_result(opened):
+    search = opened().search
+    begun = get_note(search.scheduler.study)
+    assert search.run_id in begun
+    assert note_result(search, "early") == f"{begun}\n\nearly"
+    assert note_result(opened().search, "late") == f"{begun}\n\nlate"
+
+
+@pytest.mark.parametrize("results", [[], ["early"]], ids=["begun", "with a result"])
+def test_note_that_somebody_has_changed_stays(opened, results):
+    search = opened().search
+    for result in results:
+        note_result(search, result)
+    mine = f"{get_note(search.scheduler.study)}\n\nmine"
+    save_note(search.scheduler.study, mine)
+    assert note_result(search, "late") == mine
+
+
+def test_note_of_a_study_of_an_earlier_version_gets_its_result(opened, monkeypatch):
+    with monkeypatch.context() as earlier:
+        earlier.setattr(optuna.Study, "set_user_attr", unless_named(NOTE_SUM))
+        search = opened().search
+    assert NOTE_SUM not in search.scheduler.study.user_attrs
+    assert note_result(search, "late").endswith("late")
+
+
+def unless_named(left_out, set_user_attr=optuna.Study.set_user_attr):
+    """Return the function that sets a user attribute, but not this one."""
+    return lambda study, name, value: None if name == left_out else set_user_attr(study, name, value)
 
 
 def test_study_goes_on_with_its_own_run(opened):
