@@ -219,6 +219,8 @@ def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_pat
     assert len(children) == 2
     (parent,) = [each for each in tracked if each not in children]
     assert [file.path for file in client.list_artifacts(parent.info.run_id)] == ["results.html"]
+    (page,) = tmp_path.glob("multirun/*/*/results.html")
+    assert "<h1>Grid of 2 jobs</h1>" in page.read_text()
     for child in children:
         assert child.info.status == "FINISHED"
         assert child.info.run_name == f"{child.data.tags['choice.agent']}-cluster-zy-phantom-seed0"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -159,14 +160,14 @@ def _keep_page(table: ResultTable, folder: Path, word: Mapping[str, Any]) -> Non
     """Keep the table of the jobs as a page, in the grid's folder and with its parent run."""
     from armscan.reports.html import page
     from armscan.tracking import open_store
-    from armscan.tracking.sanitize import MAX_TAG_CHARS, shortened
-    from armscan.tracking.uploader import NOTE_TAG
+    from armscan.tracking.uploader import leave_note
 
-    file = folder / RESULTS_PAGE
-    atomic_write(file, methodcaller("write", page(f"multirun {' '.join(word['overrides'])}", table.html()).encode()))
+    file, n_jobs = folder / RESULTS_PAGE, sum(map(bool, table.facts["outcome"]))
+    body = f"<p><code>{html.escape(' '.join(word['overrides']))}</code></p>{table.html()}"
+    atomic_write(file, methodcaller("write", page(f"Grid of {n_jobs} job{'s' if n_jobs > 1 else ''}", body).encode()))
     store, _ = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
     store.log_artifact(word["run_id"], str(file))
-    store.set_tag(word["run_id"], NOTE_TAG, shortened(table.markdown(), MAX_TAG_CHARS, RESULTS_PAGE))
+    leave_note(store, word["run_id"], table.markdown())
 
 
 def _pool_folds(folder: Path, word: Mapping[str, Any], outcomes: Mapping[str, JobOutcome], runs: Sequence[Run]) -> None:

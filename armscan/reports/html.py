@@ -45,12 +45,14 @@ summary {{ cursor: pointer; font-weight: bold; margin: 1rem 0; }}
 .charts {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(min(20rem, 100%), 1fr)); gap: 0 1rem; }}
 .charts > .chart {{ min-width: 0; }}
 .charts .modebar {{ display: none; }}
-.wide > div {{ min-width: 36rem; }}
+.wide > div {{ min-width: 46rem; }}
 .videos {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: 1rem; }}
 .videos figure {{ margin: 0; max-width: 20rem; }}
 .videos img {{ width: 100%; }}
 @media (max-width: 640px) {{
   body {{ margin: .5rem auto; padding: 0 .7rem; }}
+  .matrix {{ font-size: 12px; }}
+  .matrix th, .matrix td:first-child, .matrix td > div {{ padding: .2rem .15rem; }}
   .rows thead {{ display: none; }}
   .rows, .rows tbody, .rows tr {{ display: block; }}
   .rows tr {{ border: 1px solid #ccc; border-radius: .4rem; margin: .6rem 0; padding: .3rem .6rem; }}

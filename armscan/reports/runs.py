@@ -45,7 +45,9 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
     with tempfile.TemporaryDirectory() as folder:
         trainings = read_trainings(store, found, Path(folder))
     groups, left_out = group_trainings(trainings)
-    title = f"Runs {', '.join(named)}" if len(", ".join(named)) <= MAX_NAME_CHARS else f"{len(trainings)} runs"
+    n_runs = f"{len(trainings)} run{'s' if len(trainings) > 1 else ''}"
+    experiments = [name.removeprefix(EXPERIMENT) for name in named if name.startswith(EXPERIMENT)]
+    title = f"{n_runs} of {', '.join(experiments)}" if len(experiments) == len(named) else n_runs
     return write_comparison(groups, left_out, title, Path(out) if out else REPORTS / _folder_name(named))
 
 

@@ -14,10 +14,10 @@ from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import DIFF_SUM, environment_tags, source
 from armscan.tracking.notes import forget
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
-from armscan.tracking.sanitize import MAX_TAG_CHARS, params_of, shortened, tags_of
+from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.uploader import Uploader
-from armscan.utils.files import RESULTS, RESULTS_PAGE, RESUMED_DIFF_FILE, atomic_write
+from armscan.utils.files import RESULTS, RESUMED_DIFF_FILE, atomic_write
 from armscan.utils.log import log
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ class TrackedRun:
 
     def set_note(self, text: str) -> None:
         """Give the run a description in Markdown, shown first on its page of MLflow, unless somebody gave it one."""
-        self._add(note=shortened(text, MAX_TAG_CHARS, RESULTS_PAGE))
+        self._add(note=text)
 
     def log_files(self, *files: Path) -> None:
         """Keep files as artifacts; they stay as they are until the run has ended."""

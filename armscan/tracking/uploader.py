@@ -15,8 +15,8 @@ from armscan.errors import TrackingError, UntrustedError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, why_away
 from armscan.tracking.logged_model import deliver_model
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
-from armscan.tracking.sanitize import MAX_PARAM_CHARS, shortened
-from armscan.utils.files import VOLUMES_FILE
+from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, shortened
+from armscan.utils.files import RESULTS_PAGE, VOLUMES_FILE
 from armscan.utils.log import log
 from armscan.utils.retry import FIRST_PAUSE_S
 
@@ -209,15 +209,20 @@ def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any])
             for step, metrics in values:
                 deliver_model(client, run_id, step, metrics)
         case "note":
-            tags = client.get_run(run_id).data.tags
-            # What a person has written stays.
-            if NOTE_TAG not in tags or _sum(tags[NOTE_TAG]) == tags.get(NOTE_SUM_TAG):
-                client.set_tag(run_id, NOTE_TAG, values[-1])
-                client.set_tag(run_id, NOTE_SUM_TAG, _sum(values[-1]))
+            leave_note(client, run_id, values[-1])
         case "address":
             return
         case _:
             raise TrackingError(f"{outbox.file}: holds {kind!r}, which this version of armscan does not know")
+
+
+def leave_note(client: MlflowClient | TrackingStore, run_id: str, text: str) -> None:
+    """Give a run a description; one that a person has written stays."""
+    text = shortened(text, MAX_TAG_CHARS, RESULTS_PAGE)
+    tags = client.get_run(run_id).data.tags
+    if NOTE_TAG not in tags or _sum(tags[NOTE_TAG]) == tags.get(NOTE_SUM_TAG):
+        client.set_tag(run_id, NOTE_TAG, text)
+        client.set_tag(run_id, NOTE_SUM_TAG, _sum(text))
 
 
 def _sum(text: str) -> str:

@@ -51,6 +51,7 @@ def test_report_of_a_multirun_groups_its_jobs_and_has_every_number_beside_it(ans
     assert (code, errors) == (0, "")
     assert printed.splitlines() == ["reading   6 runs", f"look at   {folder.relative_to(tmp_path)}/report.html"]
     shown = page(folder)
+    assert "<h1>6 runs</h1>" in shown
     assert all(f"<h2>{heading}</h2>" in shown for heading in SECTIONS)
     assert "6 runs in 2 groups" in shown
     assert "All groups: of two or three seeds" in shown
@@ -88,6 +89,7 @@ def test_the_same_runs_give_the_same_report_however_they_are_named(answer, runs,
     assert len(files) == 6
     for name in files:
         assert len({(tmp_path / each / name).read_bytes() for each in "abc"}) == 1, name
+    assert "<h1>6 runs of armscan</h1>" in page(tmp_path / "c")
 
 
 def test_one_training_has_a_report_without_bands(answer, runs, tmp_path):

@@ -7,6 +7,7 @@ from mlflow.entities import Metric
 
 from armscan.launch.best_job import BEST_TAG, show_best
 from armscan.tracking import TrackedRun, open_store
+from armscan.tracking.uploader import leave_note
 from armscan.tracking.view import VIEW, VIEW_TAG
 
 RATE, STEPS = "test_volumes/on_plane_5mm_10deg", "test_volumes/mean_steps"
@@ -119,6 +120,17 @@ def test_description_of_a_run_is_its_table_unless_somebody_wrote_one(tracked, st
         client.set_tag(other.run_id, "mlflow.note.content", "mine")
         other.set_note("| table |")
     assert client.get_run(other.run_id).data.tags["mlflow.note.content"] == "mine"
+
+
+def test_description_of_a_grid_follows_its_table_unless_somebody_wrote_one(store):
+    client, experiment_id = store()
+    run_id = client.create_run(experiment_id, name="multirun", tags={}).info.run_id
+    for table in ("early", "late"):
+        leave_note(client, run_id, table)
+        assert client.get_run(run_id).data.tags["mlflow.note.content"] == table
+    client.set_tag(run_id, "mlflow.note.content", "mine")
+    leave_note(client, run_id, "latest")
+    assert client.get_run(run_id).data.tags["mlflow.note.content"] == "mine"
 
 
 def test_description_follows_a_result_that_changes(store, tmp_path):

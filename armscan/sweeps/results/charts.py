@@ -109,7 +109,13 @@ def _is_infeasible(trial: FrozenTrial) -> bool:
 def _importance(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Return the importance of each key as bars, the most important on top."""
     figure = Figure()
-    bar = {"orientation": "h", "marker": {"color": BLUE}, "texttemplate": "%{x:.0%}", "textposition": "auto"}
+    bar = {
+        "orientation": "h",
+        "marker": {"color": BLUE},
+        "texttemplate": "%{x:.0%}",
+        "textposition": "auto",
+        "textangle": 0,
+    }
     figure.add_bar(x=[row["importance"] for row in rows], y=[row["key"] for row in rows], **bar)
     figure.update_yaxes(autorange="reversed").update_xaxes(rangemode="tozero", tickformat=".0%")
     return figure.update_layout(height=90 + BAR_PX * len(rows))

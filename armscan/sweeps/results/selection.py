@@ -144,11 +144,12 @@ def decided(
     better = "higher" if final.sign > 0 else "lower"
     n_selected = sum(len(each.scores) for each in candidates)
     n_candidates = max(0, len(candidates) - 1)
+    n_seeds = " to ".join(dict.fromkeys(map(str, (settings.min_seeds, settings.max_seeds))))
     steps = [
-        f"<b>Search</b>: {len(searched.finished)} trials, {n_pruned} of them pruned. Its {n_candidates} best different "
-        f"configurations are candidates, beside the control: {NOTHING_SEARCHED}.",
+        f"<b>Search</b>: {len(searched.finished)} trials, {n_pruned} of them pruned. Candidates are its best different "
+        f"configurations ({n_candidates}), and the control: {NOTHING_SEARCHED}.",
         f"<b>Selection</b>, on the validation volumes: {n_selected} trainings with seeds that the search has not used "
-        f"({settings.min_seeds} to {settings.max_seeds} of each candidate), compared by "
+        f"({n_seeds} of each candidate), compared by "
         f"{html.escape(title_of(objective))} ({better} is better). Those that were behind the "
         f"leader with {DROP_LEVEL:.0%} confidence got no further seed. Of the others, the one with the best "
         "unfavourable end of its interval is chosen.",
