@@ -24,7 +24,7 @@ KERNELS = (5, 3, 3)
 
 
 class Estimate(NamedTuple):
-    """What a plane finder makes of the latest looks of n episodes.
+    """Estimate of the wanted plane, from the latest looks of n episodes.
 
     Attributes:
         plane: Plane of the latest look, shape (n, 4), in degrees and mm.
@@ -159,7 +159,7 @@ class FinderModule(nn.Module):
         return self.network.place.in_features + 4 + 2 + len(self.offsets)
 
     def estimate(self, observations: dict[str, Tensor]) -> Estimate:
-        """Return what the network makes of observations, whose parts have the shape (n, n_looks, ...)."""
+        """Return the estimate from observations, whose parts have the shape (n, n_looks, ...)."""
         actions = observations[ACTION][:, :, :4]
         n_looks = actions.shape[1]
         is_first = (actions == actions[:, :1]).all(2).float()

@@ -50,7 +50,7 @@ class ResidualModule(nn.Module):
         return self.finder.calibration
 
     def estimate(self, observations: dict[str, Tensor]) -> Estimate:
-        """Return what the plane finder makes of observations."""
+        """Return the estimate of the plane finder."""
         return self.finder.estimate(observations)
 
     def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 import threading
@@ -16,7 +15,7 @@ from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, why_awa
 from armscan.tracking.logged_model import deliver_model
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
 from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, shortened
-from armscan.utils.files import RESULTS_PAGE, VOLUMES_FILE
+from armscan.utils.files import RESULTS_PAGE, VOLUMES_FILE, sha256
 from armscan.utils.log import log
 from armscan.utils.retry import FIRST_PAUSE_S
 
@@ -163,7 +162,7 @@ def dataset_input(part: str, prints: Mapping[str, str]) -> DatasetInput:
     """
     from mlflow.entities import Dataset, DatasetInput, InputTag
 
-    digest = hashlib.sha256("".join(sorted(prints.values())).encode()).hexdigest()[:DIGEST_CHARS]
+    digest = sha256("".join(sorted(prints.values())).encode())[:DIGEST_CHARS]
     profile = json.dumps({"volumes": len(prints)})
     source = shortened(" ".join(prints), MAX_PARAM_CHARS, VOLUMES_FILE)
     dataset = Dataset(f"{part} volumes", digest, "armscan", json.dumps({"volumes": source}), profile=profile)
@@ -220,10 +219,6 @@ def leave_note(client: MlflowClient | TrackingStore, run_id: str, text: str) -> 
     """Give a run a description; one that a person has written stays."""
     text = shortened(text, MAX_TAG_CHARS, RESULTS_PAGE)
     tags = client.get_run(run_id).data.tags
-    if NOTE_TAG not in tags or _sum(tags[NOTE_TAG]) == tags.get(NOTE_SUM_TAG):
+    if NOTE_TAG not in tags or sha256(tags[NOTE_TAG].encode()) == tags.get(NOTE_SUM_TAG):
         client.set_tag(run_id, NOTE_TAG, text)
-        client.set_tag(run_id, NOTE_SUM_TAG, _sum(text))
-
-
-def _sum(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+        client.set_tag(run_id, NOTE_SUM_TAG, sha256(text.encode()))

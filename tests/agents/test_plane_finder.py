@@ -88,8 +88,8 @@ def test_looks_lie_beside_what_is_found_and_the_last_on_it(phantom):
     np.testing.assert_allclose(planes[:, :2], 0.0, atol=1e-3)
 
 
-def check_policy(learner, env):
-    """Check that a learner's policy, and the program made of it, answer as the learner does."""
+def answers_of(learner, env):
+    """Return the actions of a learner, of its policy, and of the program made of that, for the same observations."""
     observations = []
     for seed in range(3):
         observation, _ = env.reset(seed=seed)
@@ -99,15 +99,16 @@ def check_policy(learner, env):
     batch = batch_of(observations)
     actions = np.array([learner.act(observation, 0.0) for observation in observations])
     policy = learner.policy()
-    np.testing.assert_allclose(policy(batch), actions, atol=1e-6)
-    np.testing.assert_allclose(export_program(policy, batch).module()(batch), actions, atol=1e-6)
-    assert policy.differs is None
+    return actions, policy(batch), export_program(policy, batch).module()(batch)
 
 
 def test_policy_answers_as_the_learner_does_also_exported(phantom):
     learner, env = made(phantom)
     learner.learn(24)
-    check_policy(learner, env)
+    actions, of_policy, of_program = answers_of(learner, env)
+    np.testing.assert_allclose(of_policy, actions, atol=1e-6)
+    np.testing.assert_allclose(of_program, actions, atol=1e-6)
+    assert learner.policy().differs is None
 
 
 def test_each_look_knows_its_place_in_the_episode(phantom):

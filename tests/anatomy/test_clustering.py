@@ -118,7 +118,7 @@ def test_tissue_clusters_equal_sklearns_on_a_phantom(phantom):
 @pytest.mark.parametrize("step", [0.1, 0.2, 0.3])
 @pytest.mark.parametrize("eps_mm", [0.6, 1.2])
 def test_metric_neighbourhood_is_the_same_for_spacings_of_32_bits(eps_mm, step):
-    """Pixels at exactly eps are neighbours, whichever way the spacing was kept."""
+    """Pixels at exactly eps are neighbours, for every way to store the spacing."""
     exact = disc_half_widths(round(eps_mm / step))
     for pixel in (step, float(np.float32(step))):
         np.testing.assert_array_equal(MetricTissue(1, eps_mm, 0.5).neighbourhood((pixel, pixel)).half_widths, exact)

@@ -128,7 +128,7 @@ class Containers:
             _end(process)
 
     def stop_all(self) -> None:
-        """End whatever is still there."""
+        """End the services that are still running."""
         for process in self._processes.values():
             self._terminate(process)
         for process in self._processes.values():

@@ -191,7 +191,7 @@ def test_model_that_answers_otherwise_than_the_agent_is_not_written(regression, 
 
 
 class Unmoved:
-    """An environment that shows its first plane, whatever is done."""
+    """An environment that shows its first plane after every action."""
 
     def __init__(self, env):
         self._env = env

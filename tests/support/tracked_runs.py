@@ -38,7 +38,7 @@ class Guesser:
 
 
 class GuesserOfAnything(Guesser):
-    """The same, whatever else its configuration says."""
+    """The same, for any other configuration."""
 
     def __init__(self, **_):
         pass

@@ -1,4 +1,4 @@
-"""Runs whose process was killed: whoever comes next ends them, if the process was of this machine and is gone."""
+"""Runs whose process was killed: the next process ends them, if the process was of this machine and is gone."""
 
 import json
 import shutil

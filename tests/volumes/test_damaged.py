@@ -1,4 +1,4 @@
-"""Whatever a file holds and whoever calls: a volume, or one of the project's own exceptions."""
+"""Damaged files and odd arguments are read as a volume, or refused by one of the project's own exceptions."""
 
 import json
 
