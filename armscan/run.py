@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 
-from armscan.utils.processes import limit_threads
+from armscan.utils.processes import collect_garbage_rarely, limit_threads
 
 limit_threads()
+collect_garbage_rarely()
 # Ray reads it when it is imported, which other libraries do where it is installed: it would abort a study that is told
 # to end with a trace.
 os.environ.setdefault("RAY_DISABLE_FAILURE_SIGNAL_HANDLER", "1")
@@ -106,7 +107,10 @@ def main() -> int:
         if any(word.startswith(f"{SWEEP}=") for word in sys.argv[1:]):
             if PLAN not in sys.argv[1:]:
                 print("preparing a study: its space is checked first", flush=True)
-            # Deferred: it loads Optuna, after the first line.
+            # Deferred, after the first line: wrong words are answered before Optuna is loaded.
+            from armscan.sweeps.study.arguments import check_training_words
+
+            check_training_words(sys.argv[1:])
             from armscan.sweeps.command import run_study
 
             return run_study(sys.argv[1:], launch)

@@ -50,6 +50,9 @@ def test_words_that_are_wrong_are_answered_before_a_library_of_learning_or_track
         "foo=1": "there is no key 'foo'",
         "-m training.env_steps=-1,-9": "training.env_steps is -1",
         "-m data=nifti seed=0,1": "data.path is not set",
+        "-m sweep=sac_y training.env_steps=-1": "training.env_steps is -1",
+        "-m sweep=sac_y data=nifti": "data.path is not set",
+        "-m sweep=sac_y agent=sac,ppo": "'agent=sac,ppo' gives several values",
     }
     codes, said, modules = after(tmp_path, *(f"run {words}" for words in wrong))
     assert codes == [2] * len(wrong)

@@ -17,6 +17,7 @@ from armscan.cli.runs import runs
 from armscan.cli.ui import ui
 from armscan.errors import is_interruption
 from armscan.utils.log import silence_libraries
+from armscan.utils.processes import collect_garbage_rarely
 
 PROGRAM = "armscan"
 TRACEBACKS = "ARMSCAN_TRACEBACKS"
@@ -68,6 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: 2 for a mistake, 130 for an interrupt, else the command's own.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
+    collect_garbage_rarely()
     silence_libraries()
     try:
         return armscan.main(words, prog_name=PROGRAM, standalone_mode=False, obj=words) or 0

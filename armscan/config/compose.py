@@ -15,11 +15,12 @@ from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
 
 # They register the resolvers that the configuration uses.
 from armscan.config import choices as choices
 from armscan.config import services as services
+from armscan.config.defaults import CLUSTER, to_plain
 from armscan.config.sources import (
     CONF,
     CONFIG_NAME,
@@ -110,3 +111,19 @@ def compose(overrides: Sequence[str] = (), *, return_hydra_config: bool = False)
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(config_folder()), version_base=VERSION_BASE):
         return hydra.compose(CONFIG_NAME, list(overrides), return_hydra_config=return_hydra_config)
+
+
+def compose_run(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+    """Return the configuration of a run, without the section of a study, and the choice of each group."""
+    return of_run(compose(words, return_hydra_config=True))
+
+
+def of_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
+    """Return a composed configuration without the parts that are not of a run, and the choice of each group."""
+    choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
+    with open_dict(config):
+        # The store is the same, however it was given.
+        config.tracking = to_plain(config.tracking)
+        for section in ("study", "hydra", CLUSTER):
+            config.pop(section, None)
+    return config, choices

@@ -30,6 +30,8 @@ MULTIRUN = ("-m", "--multirun")
 NOT_COMPARED = ("tracking", "device", "compute.device", "seed", "evaluation.on_plane")
 # Keys that earlier versions did not have; null is what these did.
 ADDED = ("training.schedule",)
+# Prefixes of keys that a study does not search.
+NOT_SEARCHED = ("study", "sweep", "tracking", "hydra", "seed")
 # The phantoms, where a command asks for volumes.
 PHANTOM = "phantom"
 

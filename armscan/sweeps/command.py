@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
+from armscan.config.compose import compose_run
 from armscan.config.credentials import check_address
 from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.errors import printable
@@ -18,7 +19,6 @@ from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.study import existing_study
 from armscan.sweeps.study.warm_start import beginnings
-from armscan.sweeps.tasks.attempt import composed
 from armscan.sweeps.workers.launch import run_workers
 from armscan.utils.console import print_sentence
 from armscan.utils.log import silence_libraries
@@ -36,7 +36,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     settings, task, config = read_settings(trial_words)
     for key, uri in ((STORAGE, settings.storage), (TRACKING_URI, config.tracking.uri)):
         check_address(key, uri)
-    launcher = composed(given.launching)[1][LAUNCHER]
+    launcher = compose_run(given.launching)[1][LAUNCHER]
     if launcher in ON_THIS_MACHINE:
         settings.check_workers(len(os.sched_getaffinity(0)))
     population_of(settings, config)

@@ -28,10 +28,10 @@ from typing import Any, NamedTuple
 
 import psutil
 
+from armscan.config.compose import compose_run
 from armscan.config.defaults import to_plain
 from armscan.experiment.build import set_up
 from armscan.experiment.runner import train_agent
-from armscan.sweeps.tasks.attempt import composed
 from armscan.tracking import TrackedRun, open_store
 from armscan.training import EpochReport
 from armscan.utils.log import silence_libraries
@@ -165,7 +165,7 @@ def main() -> None:
         parser.add_argument(option, type=int, default=default)
     given = parser.parse_args()
     silence_libraries()
-    config, _ = composed(
+    config, _ = compose_run(
         [
             f"training.env_steps={given.env_steps}",
             f"training.eval_every_env_steps={given.every}",

@@ -13,12 +13,11 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.trial import BaseTrial
 from pydantic import AfterValidator, Field
 
+from armscan.config.defaults import NOT_SEARCHED
 from armscan.config.legacy import renamed
 from armscan.errors import InvalidValueError
 from armscan.utils.section import Section
 
-# Prefixes of keys that are not searched.
-NOT_SEARCHED = ("study", "sweep", "tracking", "hydra", "seed")
 KEY = re.compile(r"[A-Za-z_][\w/]*(\.\w+)*")
 PLAIN_TEXT = re.compile(r"(?!(?i:true|false|null|nan|inf)$)[A-Za-z_][\w./\-]*")
 Value = bool | int | float | str | None

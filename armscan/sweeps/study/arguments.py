@@ -10,15 +10,18 @@ from typing import Any, Self
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from omegaconf import OmegaConf
 
 from armscan.config.command_hints import run_command
-from armscan.config.defaults import MULTIRUN, PLAN, RESUME
+from armscan.config.compose import compose, of_run
+from armscan.config.defaults import MULTIRUN, NOT_SEARCHED, PLAN, RESUME
 from armscan.config.sources import SWEEP
 from armscan.errors import InvalidValueError
+from armscan.experiment.build import check_words
 from armscan.launch.launchers import LAUNCHER
-from armscan.sweeps.space.parameter import NOT_SEARCHED
 
 STUDY = "study"
+TASK_TARGET, TRAINING_TASK = "study.task._target_", "armscan.sweeps.tasks.training.TrainingTask"
 USUAL_LAUNCHER = "submitit_local"
 WORKER_KEY, SPACE, STORAGE, SEARCH_PATH = "study.worker", "study.space", "study.storage", "hydra.searchpath"
 # Of one key: where the range begins, say, or all of it.
@@ -66,6 +69,20 @@ def words_of_trials(words: Sequence[str]) -> list[str]:
     """
     others = ("hydra", f"{WORKER_KEY}=")
     return [word for word in words if not word.lstrip("+~").startswith(others) or word.startswith(SEARCH_PATH)]
+
+
+def check_training_words(words: Sequence[str]) -> None:
+    """Check the configuration of a study's trainings as that of a run, before Optuna is loaded.
+
+    Args:
+        words: Words of the command line. Those of a study with another task than training are left to its task.
+
+    Raises:
+        InvalidValueError: If a value is not allowed.
+    """
+    config = compose(words_of_trials(StudyCommand.read(words).words), return_hydra_config=True)
+    if OmegaConf.select(config, TASK_TARGET) == TRAINING_TASK:
+        check_words(of_run(config)[0])
 
 
 def fixed_by(words: Sequence[str]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from optuna.pruners import BasePruner
 from optuna.samplers import BaseSampler
 
-from armscan.config.compose import compose
+from armscan.config.compose import compose, compose_run, of_run
 from armscan.config.defaults import to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
@@ -26,7 +26,7 @@ from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.samplers import CmaEsSampler
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.terminators import Terminator
-from armscan.sweeps.tasks.attempt import Task, composed, of_run
+from armscan.sweeps.tasks.attempt import Task
 
 TERMINATOR_MEMBERS = ("check", "reason")
 TASK_MEMBERS = ("metrics", "final_metric", "check", "run", "validate", "evaluate")
@@ -118,11 +118,11 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
     for chosen in whole:
         # Before an agent is built, because the first of a process compiles for many seconds.
         with _named(chosen):
-            composed([*words, *overrides_of(chosen)])
+            compose_run([*words, *overrides_of(chosen)])
     task.check(config)
     for chosen in (*tried, *map(settings.space.completed, whole)):
         with _named(chosen):
-            task.check(composed([*words, *overrides_of(chosen)])[0])
+            task.check(compose_run([*words, *overrides_of(chosen)])[0])
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import optuna
 from omegaconf import OmegaConf
 from optuna.trial import FrozenTrial, create_trial
 
+from armscan.config.compose import compose_run
 from armscan.config.defaults import to_plain
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError, listed
@@ -32,7 +33,6 @@ from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES as OBJECTIVES
 from armscan.sweeps.study.study import FIXED, SPACE, best_trials, described, is_ours
-from armscan.sweeps.tasks.attempt import composed
 
 # User attribute of a study: what it has begun with.
 BEGUN_WITH = "begun_with"
@@ -124,7 +124,7 @@ def _of_preset(space: Space, name: str, words: Sequence[str]) -> Beginning:
 
 def _settings(space: Space, words: Sequence[str]) -> tuple[dict[str, Value], str | None]:
     """Return the settings of a configuration by key, and why they do not fit the space; None if they fit."""
-    config, choices = composed(words)
+    config, choices = compose_run(words)
     # Of a group the name that was chosen, of any other key its value.
     found = {each.name: choices.get(each.name, OmegaConf.select(config, each.name)) for each in space.parameters}
     plain = {key: to_plain(value) if OmegaConf.is_config(value) else value for key, value in found.items()}

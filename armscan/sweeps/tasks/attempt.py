@@ -14,11 +14,9 @@ from typing import Any, Protocol
 
 import optuna
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from optuna.trial import Trial
 
-from armscan.config.compose import compose
-from armscan.config.defaults import CLUSTER, to_plain
 from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.scheduling.state import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, SEEDS, PendingWrites
 from armscan.sweeps.storage.reports import keep_report, reports_of
@@ -219,22 +217,6 @@ class Task(Protocol):
 def trial_folder(study_folder: Path, number: int) -> Path:
     """Return the folder of a trial."""
     return study_folder / "trials" / f"{number:0{TRIAL_DIGITS}}"
-
-
-def composed(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
-    """Return the configuration of a run, without the section of the study, and the choice of each group."""
-    return of_run(compose(words, return_hydra_config=True))
-
-
-def of_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
-    """Return a composed configuration without the parts that are not of a run, and the choice of each group."""
-    choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
-    with open_dict(config):
-        # The store is the same, however it was given.
-        config.tracking = to_plain(config.tracking)
-        for section in ("study", "hydra", CLUSTER):
-            config.pop(section, None)
-    return config, choices
 
 
 def config_sha256(config: Mapping[str, Any]) -> str:

@@ -16,6 +16,7 @@ from optuna.samplers import BaseSampler
 from optuna.trial import Trial, TrialState
 
 from armscan.config.command_hints import kept_command
+from armscan.config.compose import compose_run
 from armscan.config.defaults import MULTIRUN, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.errors import StorageAwayError, TrackingAwayError
@@ -32,7 +33,6 @@ from armscan.sweeps.tasks.attempt import (
     TRIAL_TAG,
     Attempt,
     check_metrics,
-    composed,
     config_sha256,
     trial_folder,
 )
@@ -128,7 +128,7 @@ class Worker:
         trial.study.sampler = make("sampler", phase.sampler, BaseSampler, seed=int(seed))
         # Of a new object each time: what the trial believes written may have been lost with the connection.
         chosen = phase.scheduler.storage.transaction(lambda: phase.suggest(Trial(trial.study, trial._trial_id)))
-        config, choices = composed([*self._words, *overrides_of(chosen)])
+        config, choices = compose_run([*self._words, *overrides_of(chosen)])
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)
         config_sum = config_sha256(to_plain(config))

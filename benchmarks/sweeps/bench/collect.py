@@ -75,16 +75,17 @@ def trained_rows(words: Sequence[str], training: Mapping[str, Any], values: dict
         training: What every row has, the seed among it.
         values: Values of the configuration by name.
     """
+    from armscan.config.compose import compose_run
     from armscan.experiment.build import build_experiment
     from armscan.experiment.results import TEST_VOLUMES_SEED
     from armscan.experiment.runner import train_agent
     from armscan.sweeps.space.parameter import overrides_of
-    from armscan.sweeps.tasks.attempt import composed, volumes_of
+    from armscan.sweeps.tasks.attempt import volumes_of
     from armscan.training import evaluate
     from armscan.utils.log import silence_libraries
 
     silence_libraries()
-    config, _ = composed([*words, *overrides_of(values), f"seed={training['seed']}"])
+    config, _ = compose_run([*words, *overrides_of(values), f"seed={training['seed']}"])
     setup = build_experiment(config, volumes_of(config))
     recorder = _Recorder()
     with tempfile.TemporaryDirectory() as folder:

@@ -12,10 +12,10 @@ from omegaconf import DictConfig, OmegaConf
 from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
 from scipy.stats import qmc
 
-from armscan.config.compose import compose
+from armscan.config.compose import compose, of_run
 from armscan.sweeps.space.parameter import Value, as_kept
 from armscan.sweeps.space.space import Space
-from armscan.sweeps.tasks.attempt import config_sha256, of_run
+from armscan.sweeps.tasks.attempt import config_sha256
 from armscan.volumes.plane import FloatArray
 
 # Of the Sobol sequence's scrambling.

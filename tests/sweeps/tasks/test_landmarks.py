@@ -3,8 +3,8 @@
 import pytest
 from omegaconf import OmegaConf
 
+from armscan.config.compose import compose_run
 from armscan.errors import InvalidValueError
-from armscan.sweeps.tasks.attempt import composed
 from armscan.sweeps.tasks.landmarks import LandmarksTask
 
 FEW = ["data.n_training=2", "data.n_validation=1", "data.n_test=1"]
@@ -19,7 +19,7 @@ class Trial:
         self._words = ["sweep=landmarks", *FEW, *overrides]
 
     def config(self, seed):
-        return composed([*self._words, f"seed={seed}"])
+        return compose_run([*self._words, f"seed={seed}"])
 
 
 def test_landmarks_of_the_published_clusters_are_there_at_labelled_planes_and_not_elsewhere():
