@@ -18,7 +18,7 @@ from tests.support.requirements import unavailable
 # As a run does: tests run on all cores already.
 limit_threads()
 
-# Whatever is compiled at first, or waits for a busy machine, takes longer than any deadline.
+# A first compile, or a wait for a busy machine, takes longer than any deadline.
 settings.register_profile("armscan", deadline=None)
 settings.load_profile("armscan")
 

@@ -1,5 +1,6 @@
 """The README and the pages: code blocks run, commands compose, and journeys succeed with small budgets."""
 
+import json
 import os
 import re
 import shlex
@@ -79,6 +80,9 @@ COMMANDS = [
     for words in commands(page)
     if words
 ]
+
+# Runs as pages name them.
+RUNS_OF_PAGES = {"ID", "RUN_ID", "3bf2", "4f2a,91c0", "experiment:armscan"}
 
 
 @pytest.fixture
@@ -174,6 +178,32 @@ def test_journeys_of_pages_are_made_with_small_budgets(page, tmp_path, data_fold
         assert ended.returncode == 0, (line, ended.stdout[-3000:], ended.stderr[-3000:])
         done += 1
     assert done
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Return a folder with the store of one training, and its run ID."""
+    folder = tmp_path_factory.mktemp("trained")
+    ended = armscan(["run", *SMALL[:-1], *OF_PHANTOMS], folder)
+    assert ended.returncode == 0, ended.stderr[-3000:]
+    (run,) = json.loads(armscan(["runs", "list", "--format", "json"], folder).stdout)
+    return folder, run["run_id"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("page", "words"),
+    [each for each in COMMANDS if RUNS_OF_PAGES & {*each.values[1]} and "stop" not in each.values[1]],
+)
+def test_commands_of_pages_about_a_run_succeed(page, words, trained, data_folder):
+    folder, run_id = trained
+    out = words.index("--out") + 1 if "--out" in words else None
+    line = [
+        "exported" if place == out else re.sub(r"\b(RUN_ID|ID|3bf2|4f2a|91c0)\b", run_id, word)
+        for place, word in enumerate(words)
+    ]
+    ended = armscan([filled_in(word.replace("FOLDER", str(data_folder))) for word in line], folder)
+    assert ended.returncode == 0, (line, ended.stdout[-3000:], ended.stderr[-3000:])
 
 
 @pytest.mark.full

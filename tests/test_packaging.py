@@ -1,4 +1,4 @@
-"""The configuration wherever armscan is installed: wheel, editable install, image."""
+"""The configuration of an installed armscan: wheel, editable install, image."""
 
 import json
 import os

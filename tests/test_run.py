@@ -407,7 +407,7 @@ def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
     def are_tracked():
         return all(label in (tmp_path / "printed").read_text() for label in ("[0 seed=0]", "[1 seed=1]"))
 
-    # Whichever of them is killed.
+    # Each of them may be killed.
     wait_until(are_tracked, process=process, log=(tmp_path / "printed").read_text)
     os.kill(job_process_ids(process.pid)[0], ending)
     assert process.wait(HANG_S) == 1

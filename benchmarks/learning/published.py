@@ -39,11 +39,11 @@ class Published:
     """A published experiment.
 
     Args:
-        title: of its panel.
-        reference: name of the published curve.
-        n_volumes: that were trained on.
-        small_env_steps: of the small run.
-        ours: the preset of ours that is drawn beside it.
+        title: Title of its panel.
+        reference: Name of the published curve.
+        n_volumes: Number of training volumes.
+        small_env_steps: Environment steps of the small run.
+        ours: Our preset that is drawn beside it.
     """
 
     title: str
@@ -86,9 +86,9 @@ class Curve:
     """Mean lengths of episodes.
 
     Args:
-        steps: environment steps. Shape (n,).
-        lengths: mean steps of the episodes that have ended. Shape (n,).
-        seconds: since the training began. Shape (n,).
+        steps: Environment steps, shape (n,).
+        lengths: Mean steps of the episodes that have ended, shape (n,).
+        seconds: Seconds since the training began, shape (n,).
     """
 
     steps: np.ndarray

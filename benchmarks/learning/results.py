@@ -32,11 +32,11 @@ class Row:
     """A row of the table.
 
     Args:
-        title: what is shown.
-        overrides: of the run.
-        success: wanted, at least; None where nothing is.
-        mean_steps: wanted, at most.
-        minutes: of training, at most.
+        title: Title of the row.
+        overrides: Overrides of the run.
+        success: Required success rate; None for no requirement.
+        mean_steps: Most mean steps allowed.
+        minutes: Most minutes of training allowed.
     """
 
     title: str

@@ -27,8 +27,8 @@ class Run:
     """A finished run.
 
     Args:
-        folder: what it left.
-        store: address of the tracking store that it is in.
+        folder: Folder of the run.
+        store: Address of its tracking store.
     """
 
     folder: Path

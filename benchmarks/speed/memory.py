@@ -60,8 +60,8 @@ def bytes_over_steps(volumes: Sequence[LabelVolume], num_envs: int) -> list[floa
     """Take a million environment steps; return the bytes after each tenth, and the seconds of all.
 
     Args:
-        volumes: volumes of the environments.
-        num_envs: number of environments side by side; 1 for the single environment.
+        volumes: Volumes of the environments.
+        num_envs: Number of environments side by side; 1 for the single environment.
     """
     envs = make_armscan_env(volumes, **LONG_RULES)
     if num_envs > 1:

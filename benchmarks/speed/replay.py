@@ -126,7 +126,7 @@ def measure(folder: str | Path, name: str, near: tuple) -> None:
     space = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES).make_env(read_dataset(folder))
     to_plain = Replay(N_PLAIN, N_ENVS)
     image = replay_for(space.observation_space, N_TRANSITIONS, N_ENVS)
-    # Whatever is compiled at first is no growth of the buffer's.
+    # What the first call compiles is no growth of the buffer.
     replay_for(space.observation_space, N_ENVS, N_ENVS).add(steps[0])
     endless, n_steps = cycle(steps), N_PLAIN // N_ENVS
     plain_s, plain_bytes = filled(to_plain, islice(cycle(steps), n_steps))

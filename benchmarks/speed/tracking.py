@@ -45,10 +45,10 @@ class Cost(NamedTuple):
     """Times of a training.
 
     Args:
-        wall_s: all of it.
-        calls_s: in calls to tracking.
-        longest_s: in one of them.
-        threads_s: computed by tracking's threads, while the training goes on.
+        wall_s: Seconds of the whole training.
+        calls_s: Seconds in calls to tracking.
+        longest_s: Seconds of the longest call.
+        threads_s: Processor seconds of tracking's threads during the training.
     """
 
     wall_s: float

@@ -33,9 +33,9 @@ class Sweep:
     """Outcome of a sweep.
 
     Args:
-        occupation: of its workers.
-        n_finished: trials whose result is in the storage.
-        command_s: seconds that the command took, the start of its workers included.
+        occupation: Occupation of its workers.
+        n_finished: Number of trials whose result is in the storage.
+        command_s: Seconds that the command took, the start of its workers included.
     """
 
     occupation: Occupation

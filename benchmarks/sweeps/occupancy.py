@@ -23,7 +23,7 @@ class Occupation:
     """Time of a sweep's workers, from the begin of the first trial to the end of the last.
 
     Args:
-        of_worker: what each has waited.
+        of_worker: Waits of each worker.
     """
 
     of_worker: Mapping[str, Sequence[Waited]]

@@ -75,10 +75,10 @@ class Shares:
     """Seconds of a trial from its claim to its tell, in four parts that add up to all of them.
 
     Args:
-        training_s: learning, validating, tracking, checkpoints.
-        single_s: what else a single run does.
-        around_s: the study's, before and after the task.
-        within_s: the study's, within the task.
+        training_s: Seconds of learning, validating, tracking and writing checkpoints.
+        single_s: Seconds of everything else that a single run does.
+        around_s: Seconds of the study before and after the task.
+        within_s: Seconds of the study within the task.
     """
 
     training_s: float

@@ -57,9 +57,9 @@ class Asked(NamedTuple):
     """Statements and transactions of a database.
 
     Args:
-        statements: in all.
-        commits: of transactions.
-        busy_s: what the database took for the statements.
+        statements: Number of statements.
+        commits: Number of commits.
+        busy_s: Seconds that the database spent on the statements.
     """
 
     statements: int

@@ -15,9 +15,9 @@ class Waited(NamedTuple):
     """Record of a trial.
 
     Args:
-        length_s: that it had to wait.
-        begin_s: when it began, by the clock that all processes share.
-        end_s: when it ended.
+        length_s: Seconds that it had to wait.
+        begin_s: Time when it began, on the clock that all processes share.
+        end_s: Time when it ended.
     """
 
     length_s: float
@@ -31,10 +31,10 @@ def wait(
     """Wait as long as the trial of this number takes, on any platform.
 
     Args:
-        number: of the trial.
-        shortest_s: any trial waits.
-        longest_s: likewise; lengths are spread evenly between the two.
-        on_part: called after each of the `N_PARTS` parts with its number, from 1; its time is part of the waiting.
+        number: Number of the trial.
+        shortest_s: Shortest wait in seconds.
+        longest_s: Longest wait in seconds; lengths are spread evenly between the two.
+        on_part: Function called after each of the `N_PARTS` parts with its number, from 1; its time counts as waiting.
     """
     length_s = random.Random(number).uniform(shortest_s, longest_s)
     begin_s = time.time()

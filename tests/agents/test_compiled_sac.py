@@ -204,7 +204,7 @@ def test_fork_goes_on_with_updates_that_its_parent_has_begun():
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
-        # Ends without what pytest would do at its end, whatever happens.
+        # Ends without pytest's own end, even after an error.
         try:
             updated(ours, replay, 4, seed=2, at_once=2)
             os.write(writer, digest(ours).encode())

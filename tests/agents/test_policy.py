@@ -1,4 +1,4 @@
-"""A learner's policy alone: what it answers, wherever the learner computes, and how it is written down."""
+"""A learner's policy alone: its answers on every device, and its file."""
 
 import numpy as np
 import onnxruntime

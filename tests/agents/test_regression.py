@@ -116,7 +116,7 @@ def test_regression_learns_from_random_planes_and_those_near_its_own(phantom):
     assert 0.2 < near[0.5] < 0.4 < near[1.0] < 0.8
 
 
-def test_regression_answers_the_same_observation_alike_whatever_came_before(phantom):
+def test_regression_does_not_depend_on_earlier_observations(phantom):
     env_factory, network = ENV_FACTORIES["images"]
     learner = Regression(network=network, **SMALL_REGRESSION).agent(setup_for(env_factory, phantom))
     env = env_factory.make_env([phantom])

@@ -1,4 +1,4 @@
-"""A study in PostgreSQL on an MLflow server, wherever its workers are."""
+"""A study in PostgreSQL on an MLflow server, with workers on any machine."""
 
 import pytest
 

@@ -58,11 +58,11 @@ class StartedStudy:
     """A study that is at work.
 
     Args:
-        folder: empty, that it is started in.
-        words: of its command line, without where it is kept.
-        storage: address of an empty database.
-        tracking: address of the tracking server.
-        environment: what the command has beside that of this process.
+        folder: Empty folder that it is started in.
+        words: Words of its command line, without its storage and store.
+        storage: Address of an empty database.
+        tracking: Address of the tracking server.
+        environment: Environment variables of the command, beside those of this process.
     """
 
     def __init__(

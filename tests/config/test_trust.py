@@ -33,7 +33,7 @@ def default_config():
 
 
 @given(data=st.data(), target=st.sampled_from(FOREIGN))
-def test_class_of_others_is_refused_wherever_it_stands(data, target):
+def test_class_of_others_is_refused_at_every_place(data, target):
     config = copy.deepcopy(default_config())
     # Any place of the configuration, in a list or a mapping of its own.
     node, path = config, []

@@ -30,11 +30,11 @@ class Containers:
     volumes, secrets and the image's own folders are folders here.
 
     Args:
-        folder: for all of it, empty.
-        postgres_port: where PostgreSQL answers.
-        programs: the folder of PostgreSQL's programs.
-        password: of the database.
-        **given: the compose file's variables.
+        folder: Empty folder for its files.
+        postgres_port: Port of PostgreSQL.
+        programs: Folder of PostgreSQL's programs.
+        password: Password of the database.
+        **given: Values of the compose file's variables.
     """
 
     def __init__(self, folder: Path, postgres_port: int, programs: Path, password: str, **given: str) -> None:

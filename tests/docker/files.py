@@ -22,8 +22,8 @@ def read_compose(path: Path = COMPOSE, **given: str) -> dict[str, Any]:
     """Read a compose file.
 
     Args:
-        path: of the file.
-        **given: the variables that somebody has given a value.
+        path: Path of the file.
+        **given: Values of the variables that are set.
     """
     return _interpolated(yaml.safe_load(path.read_text()), given)
 
@@ -54,9 +54,9 @@ class Image:
     """The image that the last stage of the Dockerfile makes.
 
     Args:
-        environment: variables.
-        copied: files of the repository by where they are in the image.
-        words: of the instructions of which the last one counts, such as `USER`.
+        environment: Environment variables.
+        copied: Files of the repository by their paths in the image.
+        words: Words of the instructions of which the last one counts, such as `USER`.
     """
 
     environment: dict[str, str] = field(default_factory=dict)

@@ -33,7 +33,7 @@ class Buildah:
     """Images and containers in a folder of their own.
 
     Args:
-        folder: for all of them, empty.
+        folder: Empty folder for all of them.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -76,7 +76,7 @@ def pip_sources(config: Path) -> list[str]:
     """Return the words that let pip find packages in a container where it finds them on this machine.
 
     Args:
-        config: the file to write pip's configuration to.
+        config: File to write pip's configuration to.
     """
     listed = subprocess.run([sys.executable, "-m", "pip", "config", "list"], capture_output=True, text=True, check=True)
     pairs = (line.partition("=") for line in listed.stdout.splitlines())
@@ -93,9 +93,9 @@ class ImageContainers(Containers):
     """The services in containers of the built image, as its user; they share this machine's network.
 
     Args:
-        buildah: that has built the image.
-        *args: see `Containers`.
-        **given: the compose file's variables.
+        buildah: Buildah that has built the image.
+        *args: Arguments of `Containers`.
+        **given: Values of the compose file's variables.
     """
 
     def __init__(self, buildah, *args, **given):

@@ -213,7 +213,7 @@ def test_model_whose_place_cannot_be_written_to_is_named(regression, tmp_path):
         make_model(*regression, tmp_path / "file" / "in" / "model", {"armscan": "0"})
 
 
-def test_whatever_a_library_refuses_is_one_line_but_an_interrupt_stays_one(regression, tmp_path, monkeypatch):
+def test_error_of_a_library_is_one_line_but_an_interrupt_stays_one(regression, tmp_path, monkeypatch):
     def refuse(_):
         raise MlflowException("no\nsuch flavour")
 

@@ -46,7 +46,7 @@ class Runs:
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory):
-    """Six runs of armscan.run, as people make them; whoever changes one puts it back."""
+    """Six runs of armscan.run, as people make them; a test that changes one puts it back."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

@@ -54,9 +54,9 @@ def chromium(profile: Path, *, width: int = 1400, height: int = 900) -> Iterator
     """Open a browser; close it at the end of the block.
 
     Args:
-        profile: folder of its own.
-        width: of the page, in pixels.
-        height: likewise.
+        profile: Folder of its profile.
+        width: Width of the page in pixels.
+        height: Height of the page in pixels.
     """
     found = programs()
     assert found is not None
@@ -79,7 +79,7 @@ class Browser:
     """A browser, in which everything is waited for.
 
     Args:
-        driver: of Selenium.
+        driver: Driver of Selenium.
     """
 
     def __init__(self, driver: Chrome) -> None:
@@ -110,8 +110,8 @@ class Browser:
         """Return an element on the page, of several the innermost, as soon as it is there.
 
         Args:
-            css: what it is.
-            text: all that can be read in it, None for anything.
+            css: CSS selector of the element.
+            text: Whole text of the element; None for any text.
         """
         element = self._wait.until(lambda _: self._seen(css, text), f"there is no {css} {text or ''}")
         assert isinstance(element, WebElement)

@@ -17,7 +17,7 @@ class WallClock:
     """A wall clock, by libfaketime.
 
     Args:
-        folder: a folder of its own.
+        folder: Folder for its files.
     """
 
     def __init__(self, folder: Path) -> None:

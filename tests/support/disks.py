@@ -17,7 +17,7 @@ class Disk:
     """A small disk in memory.
 
     Args:
-        folder: folder that the disk is mounted on.
+        folder: Folder that the disk is mounted on.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,8 +47,8 @@ def small_disk(folder: Path, size: str) -> Iterator[Disk]:
     """Mount a disk for the block; skip the test if none can be mounted.
 
     Args:
-        folder: where it is mounted; made where it is not there.
-        size: as `mount` takes it, such as 20m.
+        folder: Folder that it is mounted on; made if it is missing.
+        size: Size as `mount` takes it, such as 20m.
     """
     folder.mkdir(parents=True, exist_ok=True)
     mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]

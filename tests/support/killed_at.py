@@ -26,9 +26,9 @@ class Moment:
     """The moment at which a process kills itself.
 
     Args:
-        place: a function or method, such as `torch.optim:Adam.step`.
-        number: number of the call that ends the process, from 1.
-        delay_s: after the beginning of that call, in seconds; the call is followed by the end in any case. Default:
+        place: Function or method, such as `torch.optim:Adam.step`.
+        number: Number of the call that ends the process, from 1.
+        delay_s: Seconds after the beginning of that call; the call is followed by the end in any case. Default:
             None, before the call.
     """
 
@@ -67,7 +67,7 @@ class Commands:
     """Runner of commands.
 
     Args:
-        process: this module, as a program.
+        process: Process of this module.
     """
 
     def __init__(self, process: subprocess.Popen[str]) -> None:

@@ -22,8 +22,8 @@ class Machine:
     """One of them, which is nowhere to be reached but from the other.
 
     Args:
-        name: of the namespace, and what its processes take their machine to be called.
-        address: that it has for the other.
+        name: Name of the namespace, which its processes take for the host name.
+        address: Address at which the other machine reaches it.
     """
 
     name: str

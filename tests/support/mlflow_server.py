@@ -33,9 +33,9 @@ class MlflowServer:
     """A tracking server that serves the artifacts, too.
 
     Args:
-        folder: of its artifacts and its log.
-        backend: address of the database that it keeps runs in.
-        host: that it listens on.
+        folder: Folder of its artifacts and its log.
+        backend: Address of its database.
+        host: Address that it listens on.
     """
 
     def __init__(self, folder: Path, backend: str, host: str = LOOPBACK) -> None:

@@ -60,9 +60,9 @@ class PostgresServer:
     """A server with one user who has a password.
 
     Args:
-        folder: of its data, empty.
-        settings: of PostgreSQL, beside those that a server of one's own needs.
-        host: address that it listens on.
+        folder: Empty folder for its data.
+        settings: Settings of PostgreSQL, beside those of a private server.
+        host: Address that it listens on.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, str] | None = None, host: str = LOOPBACK) -> None:
@@ -99,7 +99,7 @@ class PostgresServer:
         """Stop it, with all connections.
 
         Args:
-            at_once: as if the power failed, which the next start has to mend.
+            at_once: Whether to stop as if the power failed; the next start then recovers.
         """
         if self._process is not None:
             self._process.send_signal(signal.SIGQUIT if at_once else signal.SIGINT)

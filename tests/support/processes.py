@@ -52,7 +52,7 @@ def end_all(found: Callable[[], list[int]]) -> None:
     """Kill processes until none is found any more.
 
     Args:
-        found: returns their ids.
+        found: Function that returns their IDs.
     """
 
     def are_gone() -> bool:

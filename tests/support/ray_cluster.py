@@ -38,9 +38,9 @@ class RayCluster:
     """Two machines with two cores each, as far as Ray knows.
 
     Args:
-        head: the machine that the command is to be typed on.
-        other: another one.
-        environment: of who uses the cluster.
+        head: Machine that the command is typed on.
+        other: Second machine.
+        environment: Environment variables of a command that uses the cluster.
     """
 
     head: Machine
@@ -53,7 +53,7 @@ def ray_cluster(environment: Mapping[str, str]) -> Iterator[RayCluster]:
     """Start a cluster; stop it at the end of the block.
 
     Args:
-        environment: of both machines, beside that of this process.
+        environment: Environment variables of both machines, beside those of this process.
     """
     # Short, because the paths of sockets are limited.
     folder = Path(tempfile.mkdtemp(prefix="armscan-ray-"))

@@ -12,6 +12,6 @@ def unavailable(reason: str) -> NoReturn:
     """Skip the test, or fail it where the environment variable CI is true.
 
     Args:
-        reason: what is missing, and how to install it.
+        reason: Name of what is missing, and how to install it.
     """
     (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)

@@ -76,10 +76,10 @@ def slurm() -> Iterator[Slurm]:
 
 
 class Slurm:
-    """One node that takes eight jobs at once, whatever it has.
+    """One node that takes eight jobs at once, with any number of cores.
 
     Args:
-        folder: of its configuration and everything that it writes, empty.
+        folder: Empty folder for its configuration and everything that it writes.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -20,10 +20,10 @@ def wait_until(
     """Wait until a condition is true.
 
     Args:
-        is_seen: returns whether it is true now.
-        process: process that must be alive until then, default: none.
-        log: returns what to show where it never becomes true.
-        poll_s: pause between two looks, in seconds.
+        is_seen: Function that returns whether it is true now.
+        process: Process that must be alive until then. Default: None.
+        log: Function that returns the text to show if it never becomes true.
+        poll_s: Pause between two looks, in seconds.
     """
     until_s = time.monotonic() + HANG_S
     while not is_seen():

@@ -50,7 +50,7 @@ def run(*words, cwd):
 
 def started(*words, cwd):
     printed = (cwd / "printed").open("ab")
-    # Whatever this process was started by, a Ctrl-C reaches the study.
+    # A Ctrl-C reaches the study even if this process ignores it.
     return subprocess.Popen(
         [*COMMAND, *words],
         cwd=cwd,

@@ -50,7 +50,7 @@ def ending_of(uri, run_id):
 
 @pytest.mark.parametrize("is_removed", [False, True])
 @pytest.mark.parametrize("who", ["a start", "runs sync"])
-def test_run_that_was_killed_is_ended_by_whoever_comes_next(uri, run_id, tmp_path, who, is_removed):
+def test_run_that_was_killed_is_ended_by_the_next_process(uri, run_id, tmp_path, who, is_removed):
     if is_removed:
         shutil.rmtree(tmp_path / "run")
     if who == "a start":

@@ -103,7 +103,7 @@ def test_source_that_git_cannot_compare_is_not_taken_for_clean(repository, damag
     }
 
 
-def test_source_is_that_of_its_own_repository_whatever_the_environment_names(repository, tmp_path, monkeypatch):
+def test_source_is_that_of_its_own_repository_despite_the_environment(repository, tmp_path, monkeypatch):
     (other := tmp_path / "other").mkdir()
     git(other, "init", "--quiet")
     commit = git(repository, "rev-parse", "HEAD")

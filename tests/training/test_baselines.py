@@ -35,7 +35,7 @@ def test_sweep_stands_beside_random_planes_where_one_component_is_free(volumes, 
     assert names == [["random", "sweep 5 mm"], ["random", "sweep 10°"], ["random"]]
 
 
-def test_episodes_are_kept_for_the_same_volumes_and_rules_whatever_is_observed(volumes, played):
+def test_episodes_are_kept_for_the_same_volumes_and_rules_with_any_observation(volumes, played):
     first = evaluate_baselines(EnvFactory(max_steps=3).make_env(volumes), n_episodes=2, seed=0)
     again = evaluate_baselines(
         EnvFactory(max_steps=3, observation="action_reward", stack=2).make_env(volumes), n_episodes=2, seed=0

@@ -172,7 +172,7 @@ def test_markup_is_read_back_as_the_plane_it_was_written_from(tmp_path, volume, 
 # Inside, because what only touches a corner of the volume may miss it by a rounding.
 @given(volume=volumes(), action=actions(within=inside))
 @settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_markup_is_read_whichever_way_it_says_the_plane(tmp_path, change, volume, action):
+def test_markup_is_read_in_every_notation_of_the_plane(tmp_path, change, volume, action):
     path = rewritten(tmp_path, change, volume, action)
     assert_same_plane(read_markup(path, volume), action)
 

@@ -32,7 +32,7 @@ class Candidate(NamedTuple):
         scores: The objective on the validation volumes by seed, NaN for a training that failed.
         estimate: Its mean with the 95 % interval by which candidates are compared.
         n_seeds: Number of seeds that the estimate is over.
-        outcome: What became of it: `chosen`, `dropped`, `failed`, `not chosen`, or `in the race`.
+        outcome: Outcome of the race: `chosen`, `dropped`, `failed`, `not chosen`, or `in the race`.
         settings: Its values as overrides.
     """
 

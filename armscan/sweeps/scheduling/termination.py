@@ -57,7 +57,7 @@ def ended_because(study: optuna.Study, asked: str) -> str | None:
 
     Args:
         study: The study in its storage.
-        asked: What is asked of it; see `Termination`.
+        asked: See `Termination`.
     """
     kept = study.user_attrs.get(TERMINATED, {})
     return kept[REASON] if kept.get(ASKED) == asked and REASON in kept else None

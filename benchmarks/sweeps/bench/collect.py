@@ -36,7 +36,7 @@ def collect(
         workers: Processes that train. Default: 1, this one.
         allow_changes: Whether to add to a table although other settings than the searched ones have changed since.
             Default: False.
-        overrides: Of the configuration of all trainings, as on the command line. Default: none.
+        overrides: Overrides of all trainings, as on the command line. Default: none.
         file: The table. Default: None, the one of the bench.
     """
     file = file or table_file(sweep)
@@ -72,7 +72,7 @@ def trained_rows(words: Sequence[str], training: Mapping[str, Any], values: dict
 
     Args:
         words: Overrides of the configuration, as on the command line.
-        training: What every row has, the seed among it.
+        training: Columns that every row has, such as the seed.
         values: Values of the configuration by name.
     """
     from armscan.config.compose import compose_run

@@ -30,7 +30,7 @@ class Design:
         sweep: Name of the sweep whose space it is.
         space: The space.
         configs: Values by name of each configuration, the default one first.
-        fixed_sha256: sum of the configuration that the space is searched in.
+        fixed_sha256: SHA-256 of the configuration that the space is searched in.
     """
 
     sweep: str
@@ -43,9 +43,9 @@ class Design:
         """Return the first configurations of a sweep; those of a smaller number are among those of a larger.
 
         Args:
-            sweep: name of the sweep, such as `sac_y`.
-            n_configs: number of configurations, at least 1.
-            overrides: of the configuration, as on the command line. Default: none.
+            sweep: Name of the sweep, such as `sac_y`.
+            n_configs: Number of configurations, at least 1.
+            overrides: Overrides of the configuration, as on the command line. Default: none.
         """
         config = compose([f"sweep={sweep}", *overrides], return_hydra_config=True)
         space = Space.read(OmegaConf.to_container(config.study.space, resolve=True))
@@ -83,7 +83,7 @@ def value_at(distribution: BaseDistribution, place: float) -> Value:
     is_whole = isinstance(drawn, IntDistribution)
     low, high = (drawn.low - 0.5, drawn.high + 0.5) if is_whole else (drawn.low, drawn.high)
     number = math.exp(_between(math.log(low), math.log(high), place)) if drawn.log else _between(low, high, place)
-    # Seven digits are enough, and the same wherever it is read again.
+    # Seven digits are enough, and are the same when read again.
     return min(max(round(number), drawn.low), drawn.high) if is_whole else float(f"{number:.7g}")
 
 

@@ -24,7 +24,7 @@ def draw(ranks: pd.DataFrame, races: Mapping[int, Races], keys: Mapping[str, Key
     Args:
         ranks: Rows of `ranked`.
         races: Fixed seeds and races, by the number of candidates; the last are drawn.
-        keys: What is known of each key.
+        keys: Importance and sensitivity of each key.
         path: The file.
         title: Title of the picture.
     """

@@ -31,7 +31,7 @@ def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, pi
         n_studies: Simulated studies of each rule.
         n_trainings: Budget of the search of each, in whole trainings.
         n_resamples: Resamples of the importances' intervals.
-        picture: Where the picture is written. Default: None, nowhere.
+        picture: File of the picture. Default: None, no picture.
     """
     curves = Curves.read(sweep)
     surrogate = Surrogate.of(curves)

@@ -54,7 +54,7 @@ class Surrogate:
         high: Its upper corner, likewise.
         share: Inverse of the number of configurations in that box, shape (trees, configurations).
         means: Mean logarithm of each configuration's epochs and test, shape (configurations, epochs + 1).
-        chance: What each training is off that mean, shape (trainings, epochs + 1).
+        chance: Difference of each training from that mean, shape (trainings, epochs + 1).
         config_of: Configuration of each training, shape (trainings,).
         bounds: Smallest and largest logarithm of the table.
     """
@@ -74,9 +74,9 @@ class Surrogate:
         """Return the model of a table.
 
         Args:
-            curves: the table.
-            without: fold of the configurations that is left out. Default: None, all are in.
-            seed: seed of the forest. Default: 0.
+            curves: Table of the trainings.
+            without: Fold of the configurations that is left out. Default: None, no fold.
+            seed: Seed of the forest. Default: 0.
         """
         logs = np.log(np.column_stack([curves.validation["mean_steps"], curves.test["mean_steps"]]))
         means, n_seeds = curves.mean_over_seeds(logs), np.bincount(curves.config_of)[curves.config_of, np.newaxis]

@@ -86,8 +86,8 @@ class Curves:
         """Return the curves of a table, without the configurations that have few seeds yet.
 
         Args:
-            sweep: name of the sweep.
-            file: the table. Default: None, the one that `collect` keeps.
+            sweep: Name of the sweep.
+            file: File of the table. Default: None, the one that `collect` writes.
         """
         rows = read_rows(file or table_file(sweep))
         if rows.empty:

@@ -1,4 +1,4 @@
-"""The books of a study: exactly as many trials as asked for, whoever dies in between."""
+"""The scheduler of a study: exactly as many trials as asked for, even if workers die in between."""
 
 import multiprocessing
 import os
@@ -108,7 +108,7 @@ def test_trial_of_a_dead_worker_is_retried_once_with_its_values(make_scheduler):
     other.reclaim(lambda _: True)
     assert len(other.state().failed) == 1
     assert RETRIED not in other.state().failed[0].user_attrs
-    # Whoever was taken for dead finds that it is not its own any more.
+    # A worker that was taken for dead finds that the trial is no longer its own.
     with pytest.raises(optuna.exceptions.UpdateFinishedTrialError):
         trial.report(1.0, 1)
     scheduler.requeue(trial, {})

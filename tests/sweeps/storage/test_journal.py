@@ -88,7 +88,7 @@ def test_journal_without_its_last_lines_is_as_it_was_before_they_were_written(tm
     assert len(seen_in(file)[1][0]) == 9
 
 
-def test_journal_that_loses_lines_while_it_is_open_is_refused_to_whoever_reads_or_writes(journal):
+def test_journal_that_loses_lines_while_it_is_open_is_refused_to_readers_and_writers(journal):
     storage = open_storage(str(journal)).optuna
     journal.write_bytes(b"".join(journal.read_bytes().splitlines(keepends=True)[:-3]))
     with pytest.raises(StudyError, match=r"a\.journal is damaged"):

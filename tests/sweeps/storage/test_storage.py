@@ -14,7 +14,7 @@ from armscan.errors import InvalidValueError, StudyError
 from armscan.sweeps.storage.storage import existing_storage, open_storage
 
 
-def test_storage_keeps_a_study_for_whoever_opens_it_next(storage_uri):
+def test_storage_keeps_a_study_for_the_next_process(storage_uri):
     study = optuna.create_study(study_name="a", storage=open_storage(storage_uri).optuna)
     study.tell(study.ask(), 3.0)
     again = optuna.load_study(study_name="a", storage=open_storage(storage_uri).optuna)

@@ -1,4 +1,4 @@
-"""The final evaluation of a study: decided from the storage alone, whoever dies, and exactly as many trainings."""
+"""The final evaluation of a study: decided from the storage alone; exact numbers of trainings even if workers die."""
 
 import math
 import random

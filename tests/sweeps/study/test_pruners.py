@@ -38,7 +38,7 @@ def test_front_of_a_trial_is_the_longest_chain_of_trials_that_dominate_it(losses
 
 
 @given(LOSSES)
-def test_order_of_trials_is_one_by_front_and_crowding_whichever_trial_is_asked_for(losses):
+def test_order_by_front_and_crowding_is_the_same_for_every_trial(losses):
     counts = []
     for index in range(len(losses)):
         others = np.delete(losses, index, axis=0)
