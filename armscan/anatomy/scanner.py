@@ -19,13 +19,14 @@ from armscan.volumes.slicing import sample_plane
 from armscan.volumes.volume import LabelVolume
 
 Depths = NDArray[np.int32]
-# Parts that many planes are taken in, so that where one core is busy with other work, the others take more of them.
-N_CHUNKS = 16
+# Planes that a thread takes at once: few, so that where one core is busy with other work, the others take more of them,
+# but enough that it pays to wake a thread for them.
+N_AT_ONCE = 4
 
 
 @numba.njit(cache=True, nogil=True)
 def _look(
-    labels_xyz: Pixels,
+    labels_yxz: Pixels,
     occupied: Depths,
     which: int,
     matrix: FloatArray,
@@ -39,7 +40,7 @@ def _look(
 ) -> None:
     """Fill a slice and its summary; `half_widths` has for each volume a row a tissue, ended by -1."""
     s_x, s_y, s_z = spacings_mm[which]
-    sample_plane(labels_xyz, occupied, (s_x, s_y, s_z), matrix, offset_mm, slice_xz)
+    sample_plane(labels_yxz, occupied, (s_x, s_y, s_z), matrix, offset_mm, slice_xz)
     boxes = bounding_boxes(slice_xz)
     for tissue in range(tissue_labels.size):
         label, widths = tissue_labels[tissue], half_widths[which, tissue]
@@ -63,10 +64,10 @@ def _look_all(
     """Look at the planes i of the volumes `which[i]`, as `_look`; row i of `slices` begins with slice i."""
     rules = spacings_mm, tissue_labels, half_widths, min_samples
     for i in range(which.size):
-        labels_xyz, occupied = volumes[which[i]]
-        n_across, n_depth = labels_xyz.shape[0], labels_xyz.shape[2]
+        labels_yxz, occupied = volumes[which[i]]
+        _, n_across, n_depth = labels_yxz.shape
         slice_xz = slices[i, : n_across * n_depth].reshape((n_across, n_depth))
-        _look(labels_xyz, occupied, which[i], matrices[i], offsets_mm[i], *rules, slice_xz, landmarks[i])
+        _look(labels_yxz, occupied, which[i], matrices[i], offsets_mm[i], *rules, slice_xz, landmarks[i])
 
 
 @functools.cache
@@ -117,7 +118,7 @@ class Scanner:
         slice_xz = np.empty(self._shapes[which], dtype=np.uint8)
         landmarks = np.empty((N_TISSUES, 4))
         volume = self.volumes[which]
-        _look(volume.labels, volume.occupied, which, matrix, offset_mm, *self._rules, slice_xz, landmarks)
+        _look(volume.labels_yxz, volume.occupied, which, matrix, offset_mm, *self._rules, slice_xz, landmarks)
         return slice_xz, landmarks
 
     def look_all(
@@ -134,7 +135,7 @@ class Scanner:
             The slices, and the summaries of their clusters, shape (n, 3, 4): bit for bit what `look` gives.
         """
         volumes = self._typed_volumes = self._typed_volumes or numba.typed.List(
-            [(each.labels, each.occupied) for each in self.volumes]
+            [(each.labels_yxz, each.occupied) for each in self.volumes]
         )
         shapes = [self._shapes[i] for i in which]
         longest = max(n_across * n_depth for n_across, n_depth in shapes)
@@ -142,17 +143,23 @@ class Scanner:
         slices = np.empty((len(which), -(-longest // WORD) * WORD), dtype=np.uint8)
         landmarks = np.empty((len(which), N_TISSUES, 4))
 
-        def look_from(start: int, stop: int) -> None:
-            planes = (which[start:stop], matrices[start:stop], offsets_mm[start:stop])
-            _look_all(volumes, *planes, *self._rules, slices[start:stop], landmarks[start:stop])
+        starts = iter(range(0, len(which), N_AT_ONCE))
+
+        def look_at_rest() -> None:
+            for start in starts:
+                part = slice(start, start + N_AT_ONCE)
+                planes = which[part], matrices[part], offsets_mm[part]
+                _look_all(volumes, *planes, *self._rules, slices[part], landmarks[part])
 
         # Numba's default is the number of cores that this process may use.
         n_threads = int(os.environ.get("NUMBA_NUM_THREADS") or vars(numba.config)["NUMBA_DEFAULT_NUM_THREADS"])
-        if n_threads == 1:
-            look_from(0, len(which))
-        else:
-            bounds = range(0, len(which), max(1, len(which) // N_CHUNKS))
-            list(_threads(os.getpid(), n_threads).map(look_from, bounds, [*bounds[1:], len(which)]))
+        n_helpers = min(n_threads, -(-len(which) // N_AT_ONCE)) - 1
+        helpers = [_threads(os.getpid(), n_threads).submit(look_at_rest) for _ in range(n_helpers)]
+        look_at_rest()
+        for helper in helpers:
+            # One that has not begun would find nothing left.
+            if not helper.cancel():
+                helper.result()
         return [
             row[: n_across * n_depth].reshape(n_across, n_depth)
             for row, (n_across, n_depth) in zip(slices, shapes, strict=True)

@@ -26,8 +26,10 @@ from armscan.utils.log import log
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.volume import LabelVolume
 
-MAGIC = b"armscan volume 1\n"
-SUFFIX = ".volume"
+MAGIC = b"armscan volume 2\n"
+OF_VOLUMES = ".volume"
+# With the order of the voxels: an earlier version, which has another, keeps its own files.
+SUFFIX = f".yxz{OF_VOLUMES}"
 SHA256_CHARACTERS = 64
 # Of the folder: those that nobody has opened for longest make way. Mapped voxels outlive their file.
 DEFAULT_GIB = 16.0
@@ -84,9 +86,10 @@ def open_mapped(path: Path) -> Made | None:
     except (OSError, ValueError):
         return None
     labels = np.frombuffer(contents, np.uint8, offset=_next_page(end))
+    n_x, n_y, n_z = kept["shape"]
     plane = kept["optimal_action"]
     volume = LabelVolume.from_checked(
-        labels.reshape(kept["shape"]),
+        labels.reshape(n_y, n_x, n_z).transpose(1, 0, 2),
         spacing=tuple(kept["spacing"]),
         name=kept["name"],
         optimal_action=None if plane is None else ManipulatorAction.from_array(np.array(plane)),
@@ -113,9 +116,9 @@ def _write(file: BinaryIO, volume: LabelVolume, about: Any) -> None:
     length = len(MAGIC) + SHA256_CHARACTERS + 1 + len(line)
     head = line + bytes(_next_page(length) - length)
     digest = hashlib.sha256(head)
-    digest.update(volume.labels.data)
+    digest.update(volume.labels_yxz.data)
     file.write(MAGIC + digest.hexdigest().encode() + b"\n" + head)
-    file.write(volume.labels.data)
+    file.write(volume.labels_yxz.data)
 
 
 def _next_page(n_bytes: int) -> int:
@@ -125,12 +128,12 @@ def _next_page(n_bytes: int) -> int:
 def _make_room(kept: Path) -> None:
     """Remove the least recently opened files until the folder is within its limit, and those of killed processes."""
     limit = limit_bytes()
-    for unfinished in kept.parent.glob(f".*{SUFFIX}.*.{UNFINISHED}"):
+    for unfinished in kept.parent.glob(f".*{OF_VOLUMES}.*.{UNFINISHED}"):
         with contextlib.suppress(OSError):
             if unfinished.stat().st_mtime < time.time() - UNFINISHED_FOR_S:
                 unfinished.unlink()
     files = []
-    for file in kept.parent.glob(f"*{SUFFIX}"):
+    for file in kept.parent.glob(f"*{OF_VOLUMES}"):
         with contextlib.suppress(OSError):
             files.append((file.stat().st_mtime, file.stat().st_size, file))
     n_bytes = sum(size for _, size, _ in files)

@@ -24,20 +24,20 @@ Axis = tuple[float, float, float, float]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def occupied_depths(labels_xyz: NDArray[np.uint8]) -> NDArray[np.int32]:
+def occupied_depths(labels_yxz: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Return the depths that a volume's labels occupy: the first, and that after the last, of each block of columns.
 
     Blocks have 8 x 8 columns of voxels; the result has the shape (ceil(nx / 8), ceil(ny / 8), 2). A block of background
     has the depths nz and 0.
     """
-    n_x, n_y, n_z = labels_xyz.shape
+    n_y, n_x, n_z = labels_yxz.shape
     depths = np.empty((-(-n_x // BLOCK), -(-n_y // BLOCK), 2), dtype=np.int32)
     for i in range(depths.shape[0]):
         for j in range(depths.shape[1]):
             found = np.zeros(n_z, dtype=np.uint8)
             for x in range(BLOCK * i, min(n_x, BLOCK * i + BLOCK)):
                 for y in range(BLOCK * j, min(n_y, BLOCK * j + BLOCK)):
-                    column = labels_xyz[x, y]
+                    column = labels_yxz[y, x]
                     for z in range(n_z):
                         found[z] |= column[z]
             occupied = np.flatnonzero(found)
@@ -48,7 +48,7 @@ def occupied_depths(labels_xyz: NDArray[np.uint8]) -> NDArray[np.int32]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def sample_plane(
-    labels_xyz: NDArray[np.uint8],
+    labels_yxz: NDArray[np.uint8],
     occupied: NDArray[np.int32],
     spacing_mm: tuple[float, float, float],
     matrix: NDArray[np.float64],
@@ -60,7 +60,8 @@ def sample_plane(
     Pixel (i, k) is p = (i sx, 0, k sz) and takes the voxel floor(q / s + 0.5) of q = matrix p + offset, 0 outside.
 
     Args:
-        labels_xyz: Labels of the volume, C-contiguous.
+        labels_yxz: Labels of the volume, shape (ny, nx, nz), C-contiguous: with Y first, because a slice shows few of the
+            planes across the arm, and all of it then lies in little of the memory.
         occupied: Their `occupied_depths`: pixels beside them are 0, and not looked up.
         spacing_mm: Voxel spacing (sx, sy, sz) in mm.
         matrix: Rotation from the plane's frame into the volume's, shape (3, 3).
@@ -70,15 +71,15 @@ def sample_plane(
     n_rows, n_depth = 2 * N_ROWS, slice_xz.shape[1]
     plane = occupied, spacing_mm, matrix, offset_mm
     # Of places half as wide, twice as many are computed at a time.
-    if labels_xyz.size <= LARGEST_INT32:
-        _sample(labels_xyz, *plane, np.empty((n_rows, n_depth), dtype=np.int32), slice_xz)
+    if labels_yxz.size <= LARGEST_INT32:
+        _sample(labels_yxz, *plane, np.empty((n_rows, n_depth), dtype=np.int32), slice_xz)
     else:
-        _sample(labels_xyz, *plane, np.empty((n_rows, n_depth), dtype=np.int64), slice_xz)
+        _sample(labels_yxz, *plane, np.empty((n_rows, n_depth), dtype=np.int64), slice_xz)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sample(
-    labels_xyz: NDArray[np.uint8],
+    labels_yxz: NDArray[np.uint8],
     occupied: NDArray[np.int32],
     spacing_mm: tuple[float, float, float],
     matrix: NDArray[np.float64],
@@ -94,7 +95,8 @@ def _sample(
         _axis(2, matrix, offset_mm, s_z, s_z),
     )
     n_across, n_depth = slice_xz.shape
-    voxels, shape = labels_xyz.ravel(), labels_xyz.shape
+    n_y, n_x, n_z = labels_yxz.shape
+    voxels, shape = labels_yxz.ravel(), (n_x, n_y, n_z)
     pixels = slice_xz.ravel()
     for pixel in range(pixels.size):
         pixels[pixel] = 0
@@ -187,11 +189,11 @@ def _are_inside(ends: tuple[Lines, Lines], shape: tuple[int, int, int], start: i
 def _find_places(lines: Lines, shape: tuple[int, int, int], along: NDArray[np.float64], places: NDArray[Any]) -> None:
     """Fill the places of voxels, those of the pixels with the numbers `along` of a row."""
     (first_x, step_x), (first_y, step_y), (first_z, step_z) = lines
-    n_y, n_z = float(shape[1]), float(shape[2])
+    n_x, n_z = float(shape[0]), float(shape[2])
     # In floats, which hold such whole numbers exactly, because several of them are computed at a time.
     for k in range(places.size):
         x, y = np.floor(first_x + step_x * along[k]), np.floor(first_y + step_y * along[k])
-        places[k] = (x * n_y + y) * n_z + np.floor(first_z + step_z * along[k])
+        places[k] = (y * n_x + x) * n_z + np.floor(first_z + step_z * along[k])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -31,7 +31,8 @@ class LabelVolume:
 
     Args:
         labels: Integers over (x, y, z), shape (nx, ny, nz): X across the palm, Y along the arm, Z through the depth; 0
-            background, 1 bones, 2 flexor tendons, 3 ulnar artery, 4 median nerve. Kept as C-contiguous uint8.
+            background, 1 bones, 2 flexor tendons, 3 ulnar artery, 4 median nerve. Kept as uint8, in memory with Y
+            first (`labels_yxz`).
         spacing: Voxel spacing (sx, sy, sz) in mm.
         name: Name of the volume in errors, `info` and tables.
         optimal_action: Labelled plane, in the volume's own frame.
@@ -71,7 +72,7 @@ class LabelVolume:
         """Return a volume with the checked labels of an earlier one, which are not copied.
 
         Args:
-            labels: Labels of the earlier volume, C-contiguous and not writeable.
+            labels: `labels` of the earlier volume.
             direction: Direction cosines of the earlier volume.
             fingerprint: `fingerprint` of the earlier volume.
             **rest: Other arguments of `LabelVolume`.
@@ -82,7 +83,9 @@ class LabelVolume:
         return volume
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # A copy, or one in another process, is as constant as this one: arrays forget that on their way.
+        # A copy, or one in another process, is as constant as this one, and lies in memory alike: arrays forget that on
+        # their way.
+        state["labels"] = np.ascontiguousarray(state["labels"].transpose(1, 0, 2)).transpose(1, 0, 2)
         for array in (state["labels"], state["direction"]):
             array.flags.writeable = False
         self.__dict__.update(state)
@@ -110,13 +113,18 @@ class LabelVolume:
         n_x, n_y, n_z = (n * s for n, s in zip(self.shape, self.spacing, strict=True))
         return n_x, n_y, n_z
 
+    @property
+    def labels_yxz(self) -> NDArray[np.uint8]:
+        """The labels over (y, x, z), C-contiguous."""
+        return self.labels.transpose(1, 0, 2)
+
     @cached_property
     def fingerprint(self) -> str:
         """The SHA-256 of all that an agent can notice of the volume: voxels, spacing and labelled plane."""
         plane = self.optimal_action
         rest = (self.shape, self.spacing, None if plane is None else plane.to_array().tolist())
         digest = hashlib.sha256(repr(rest).encode())
-        digest.update(self.labels.data)
+        digest.update(np.ascontiguousarray(self.labels).data)
         return digest.hexdigest()
 
     @cached_property
@@ -138,7 +146,7 @@ class LabelVolume:
     @cached_property
     def occupied(self) -> NDArray[np.int32]:
         """Depths that the labels occupy; see `occupied_depths`."""
-        return occupied_depths(self.labels)
+        return occupied_depths(self.labels_yxz)
 
     def slice(
         self,
@@ -175,7 +183,7 @@ class LabelVolume:
         else:
             matrix, offset_mm = transform.plane_map(action)
         slice_xz = np.empty(shape, dtype=np.uint8)
-        sample_plane(self.labels, self.occupied, self.spacing, matrix, offset_mm, slice_xz)
+        sample_plane(self.labels_yxz, self.occupied, self.spacing, matrix, offset_mm, slice_xz)
         return slice_xz
 
 
@@ -190,7 +198,7 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
     if whole.min() < 0 or whole.max() > max(LABEL_NAMES):
         raise VolumeError(f"{name}: holds the values {shown(np.unique(whole).tolist())}, but {ALLOWED_LABELS} only")
     # A copy: what the caller does with the array afterwards must not change the volume.
-    checked = np.array(whole, dtype=np.uint8, order="C")
+    checked = np.array(whole.transpose(1, 0, 2), dtype=np.uint8, order="C").transpose(1, 0, 2)
     for label in LANDMARK_LABELS:
         if not (checked == label).any():
             raise VolumeError(

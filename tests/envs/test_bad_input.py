@@ -259,6 +259,7 @@ def test_volumes_that_were_pickled_play_beside_others(wrist):
     """Compiled code takes arrays that cannot be written to for others than those that can."""
     copy = pickle.loads(pickle.dumps(wrist))
     assert not copy.labels.flags.writeable
+    assert copy.labels_yxz.flags.c_contiguous
     other = LabelVolume(wrist.labels, wrist.spacing, "other", wrist.optimal_action)
     try_out(ArmscanVectorEnv(2, [copy, other]))
 

@@ -69,7 +69,7 @@ def test_mapped_volume_is_found_as_it_was_made(path, volume):
         assert about == ABOUT
         assert not found.labels.flags.writeable
         assert not found.direction.flags.writeable
-        assert found.labels.flags.c_contiguous
+        assert found.labels_yxz.flags.c_contiguous
         assert type(found.labels) is np.ndarray
     assert replace(found).fingerprint == volume.fingerprint
 

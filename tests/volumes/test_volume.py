@@ -18,7 +18,7 @@ def labels_with(*values, dtype=np.uint8):
 def test_volume_keeps_whole_valued_floats_as_bytes():
     volume = LabelVolume(labels_with(1, 2, 3, 4, dtype=np.float64), SPACING, "v")
     assert volume.labels.dtype == np.uint8
-    assert volume.labels.flags.c_contiguous
+    assert volume.labels_yxz.flags.c_contiguous
     np.testing.assert_array_equal(volume.labels.flat[:5], [1, 2, 3, 4, 0])
 
 
