@@ -38,7 +38,8 @@ class TianshouVectorEnv(BaseVectorEnv):
         self.is_closed = False
         self._envs = envs
         if isinstance(bare := envs.unwrapped, ArmscanVectorEnv):
-            bare.info_keys = ("action", "reward", "is_success")
+            # The wrappers require more than is read here.
+            bare.info_keys = ("is_success",) if bare is envs else ("action", "reward", "is_success")
         self._seeds: list[int | None] | None = None
         self.n_ended = self.n_successes = 0
         self._action_spaces = [deepcopy(envs.single_action_space) for _ in range(envs.num_envs)]

@@ -93,7 +93,8 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             The observations and `info` of all environments; only those that were reset are marked in `info`.
         """
         options = dict(options) if isinstance(options, dict) else options
-        chosen = np.flatnonzero(self._popped_mask(options))
+        mask = self._popped_mask(options)
+        chosen = np.flatnonzero(mask)
         names, seeds = self._volume_names(options), self._seeds(seed)
         for i, one_seed in enumerate(seeds):
             if one_seed is not None and i in chosen:
@@ -101,7 +102,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         self._begin(chosen, names)
         look(self.rules, [self._episode(int(i)) for i in chosen])
         episodes = [self._episode(i) for i in range(self.num_envs)]
-        return self._observed(episodes), self._infos(episodes, np.isin(np.arange(self.num_envs), chosen))
+        return self._observed(episodes), self._infos(episodes, mask)
 
     def step(self, actions: Any, env_ids: Sequence[int] | EnvIds | None = None) -> VectorStep:
         """Take a step in every environment, or in some of them.

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from functools import cache
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -113,13 +114,19 @@ def estimates(
 
 @cache
 def wilson(n_successes: int, n_trials: int) -> Estimate:
-    """Return a rate with Wilson's interval, as if all trials were independent."""
+    """Return a rate with Wilson's interval, as if all trials were independent (Newcombe 1998, method 3)."""
     if n_trials == 0:
         return Estimate(math.nan, math.nan, math.nan)
-    from scipy.stats import binomtest
-
-    interval = binomtest(n_successes, n_trials).proportion_ci(LEVEL, method="wilson")
-    return Estimate(n_successes / n_trials, float(interval.low), float(interval.high))
+    # Of scipy.stats, this alone would be needed, and its import takes a second.
+    z = NormalDist().inv_cdf((1 + LEVEL) / 2)
+    rate, whole = n_successes / n_trials, 2 * (n_trials + z**2)
+    middle = (2 * n_successes + z**2) / whole
+    delta = z / whole * math.sqrt(4 * n_successes * (1 - rate) + z**2)
+    return Estimate(
+        rate,
+        middle - delta if n_successes else 0.0,
+        middle + delta if n_successes < n_trials else 1.0,
+    )
 
 
 def _estimate(value: float, resampled: FloatArray) -> Estimate:

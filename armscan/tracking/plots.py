@@ -18,7 +18,9 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
     from matplotlib.figure import Figure
 
     steps = [report.n_env_steps for report in reports]
-    figure = Figure(figsize=(8, 5.4), layout="constrained")
+    figure = Figure(figsize=(8, 5.4))
+    # A layout that matplotlib finds by itself takes a second drawing.
+    figure.subplots_adjust(left=0.09, right=0.98, bottom=0.09, top=0.92, hspace=0.08)
     FigureCanvasAgg(figure)
     rates, lengths = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
     limits = reports[0].evaluation.on_plane[0]

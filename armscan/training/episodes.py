@@ -55,6 +55,8 @@ def _play_all(
     """Play episodes on the named volumes with the seeds beside them, at most one in each environment."""
     bare = envs.unwrapped
     assert isinstance(bare, ArmscanVectorEnv)
+    # What wrappers require; the rest is known of the episodes.
+    bare.info_keys = ("action", "reward")
     names, seeds = [name for name, _ in planned], [seed for _, seed in planned]
     n_idle = envs.num_envs - len(planned)
     is_played = np.arange(envs.num_envs) < len(planned)
