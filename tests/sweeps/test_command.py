@@ -125,6 +125,8 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     assert sorted(kept) == sorted(str(model.parent.parent) for model in tmp_path.glob("studies/**/MLmodel"))
     assert all("/judged/" in folder for folder in kept)
     assert len(kept) == len(trials_of(tmp_path, "sac_y-judged"))
+    # And has a film.
+    assert sorted(str(film.parent) for film in tmp_path.glob("studies/**/episode.gif")) == sorted(kept)
     # So does the model of MLflow, and the study's run has the result, beside the random agent.
     models = client.search_logged_models([runs[0].info.experiment_id])
     assert sorted(by_id[each.source_run_id].data.tags["folder"] for each in models) == sorted(kept)

@@ -1,0 +1,28 @@
+"""The order of a run's end: figures before the film and the export of the policy, which take time."""
+
+import pytest
+
+from armscan.config.compose import compose
+from armscan.experiment import runner
+from armscan.experiment.job import Invocation
+from armscan.policies import build
+from tests.test_run import SMALL
+
+
+@pytest.mark.full
+def test_figures_are_shown_before_the_film_and_the_export(tmp_path, monkeypatch, capsys):
+    printed_before = []
+
+    def noted(*_arguments, **_options):
+        printed_before.append(capsys.readouterr().out)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runner, "record_episode", noted)
+    monkeypatch.setattr(build, "save_policy", noted)
+    invocation = Invocation(tmp_path / "run", [*SMALL], "armscan run", {"agent": "sac", "obs": "cluster", "data": "phantom"}, None)
+    invocation.folder.mkdir()
+    runner.run_experiment(compose(SMALL), invocation)
+    before_film, before_export = printed_before
+    assert "results (deterministic policy" in before_film
+    assert "on plane" in before_film
+    assert "results" not in before_export
