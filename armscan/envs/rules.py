@@ -23,7 +23,7 @@ from armscan.anatomy import (
 from armscan.envs.actions import COMPONENTS, STOP, ActionBounds, free_components
 from armscan.envs.observation_registry import with_action_reward
 from armscan.envs.observations import Observation, SliceGeometry, View, observe_all, smallest_shape
-from armscan.envs.scene import RandomTransform, Scene, SceneSampler
+from armscan.envs.scene import RandomTransform, Scene, SceneSampler, shows_labelled
 from armscan.envs.spaces import MultiBoxSpace, Parts, flat_space, flatten, in_order
 from armscan.errors import InvalidValueError, OptimalPlaneError, listed
 from armscan.utils.validation import check_bool, check_choice, check_float, check_int, check_numbers
@@ -81,6 +81,7 @@ class Rules:
         )
         self._scanner = Scanner(list(self.volumes.values()), self.tissues)
         self._place = {name: place for place, name in enumerate(self.names)}
+        self._labelled_views: dict[str, View] = {}
         self._check_optimal_planes()
         self.free = free_components(projection)
         self.action_names = (*(COMPONENTS[i] for i in self.free), *([STOP] if ends == ON_STOP else []))
@@ -140,7 +141,7 @@ class Rules:
                 if i not in drawn and (scene := self._sampler.propose(self.volumes[name], rng)) is not None
             }
             if proposed:
-                views = self.look(list(proposed.values()), [scene.optimum for scene in proposed.values()])
+                views = self._look_at_optima(list(proposed.values()))
                 seen = zip(proposed.items(), views, strict=True)
                 drawn |= {i: (scene, view.slice_xz) for (i, scene), view in seen if self.is_solved(view)}
             if len(drawn) == len(names):
@@ -151,6 +152,24 @@ class Rules:
             f"the bounds {self._sampler.bounds(self.volumes[name])} and its reward above -success_threshold = "
             f"{-self.success_threshold:g}"
         )
+
+    def _look_at_optima(self, scenes: Sequence[Scene]) -> list[View]:
+        """Look at the optimal plane of each scene; where it shows the labelled slice, that is not looked up again."""
+        views = {i: self._labelled_view(scene.volume) for i, scene in enumerate(scenes) if shows_labelled(scene)}
+        others = [i for i in range(len(scenes)) if i not in views]
+        if others:
+            looked = self.look([scenes[i] for i in others], [scenes[i].optimum for i in others])
+            views |= dict(zip(others, looked, strict=True))
+        return [views[i] for i in range(len(scenes))]
+
+    def _labelled_view(self, volume: LabelVolume) -> View:
+        """Return the view of the labelled plane of a volume as it was read."""
+        if volume.name not in self._labelled_views:
+            plane = volume.optimal_action
+            assert plane is not None
+            seen = self._scanner.look(self._place[volume.name], plane.matrix, plane.offset_mm)
+            self._labelled_views[volume.name] = self._view(self._sampler.unmoved(volume), *seen)
+        return self._labelled_views[volume.name]
 
     def is_solved(self, view: View) -> bool:
         """Return whether a view's reward is a success."""

@@ -192,5 +192,18 @@ class SceneSampler:
         return Scene(volume, transform, within, bounds)
 
 
+def shows_labelled(scene: Scene) -> bool:
+    """Return whether the optimal plane of a scene shows the slice of the labelled plane, to the last voxel.
+
+    It does unless the picture was shifted into the bounds, or turned within the plane by a motion about X, or the
+    volume was deformed; and but for rounding, which `labelled_clearance` leaves room for.
+    """
+    labelled = scene.volume.optimal_action
+    assert labelled is not None
+    matrix, offset_mm = scene.plane_map(scene.optimum)
+    off = max(np.abs(matrix - labelled.matrix).max(), np.abs(offset_mm - labelled.offset_mm).max())
+    return bool(off < scene.volume.labelled_clearance)
+
+
 # Checked once, not at every reset.
 _bounds = lru_cache(ActionBounds)

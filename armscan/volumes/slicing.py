@@ -15,6 +15,8 @@ N_ROWS, PREFETCH_STEP = 8, 8
 # Columns of voxels, along X and along Y, of a block of `occupied_depths`.
 BLOCK = 8
 LARGEST_INT32 = 2**31 - 1
+# Of positions in mm, far above what their rounding is.
+SMALLEST_CLEARANCE = 1e-12
 
 # First position of a row of pixels on an axis, in voxels, and the step from one pixel to the next.
 Line = tuple[float, float]
@@ -60,8 +62,8 @@ def sample_plane(
     Pixel (i, k) is p = (i sx, 0, k sz) and takes the voxel floor(q / s + 0.5) of q = matrix p + offset, 0 outside.
 
     Args:
-        labels_yxz: Labels of the volume, shape (ny, nx, nz), C-contiguous: with Y first, because a slice shows few of the
-            planes across the arm, and all of it then lies in little of the memory.
+        labels_yxz: Labels of the volume, shape (ny, nx, nz), C-contiguous: with Y first, so that a slice across the arm
+            lies in a small part of the memory.
         occupied: Their `occupied_depths`: pixels beside them are 0, and not looked up.
         spacing_mm: Voxel spacing (sx, sy, sz) in mm.
         matrix: Rotation from the plane's frame into the volume's, shape (3, 3).
@@ -75,6 +77,30 @@ def sample_plane(
         _sample(labels_yxz, *plane, np.empty((n_rows, n_depth), dtype=np.int32), slice_xz)
     else:
         _sample(labels_yxz, *plane, np.empty((n_rows, n_depth), dtype=np.int64), slice_xz)
+
+
+def clearance(
+    spacing_mm: tuple[float, float, float],
+    matrix: NDArray[np.float64],
+    offset_mm: NDArray[np.float64],
+    shape: tuple[int, int],
+) -> float:
+    """Return how far each number of a plane's matrix and offset may be off without changing a voxel of its slice.
+
+    Args:
+        spacing_mm: Voxel spacing (sx, sy, sz) in mm.
+        matrix: Rotation from the plane's frame into the volume's, shape (3, 3).
+        offset_mm: Origin of the plane in the volume, in mm, shape (3,).
+        shape: Number of pixels (across, depth).
+    """
+    across_mm, depth_mm = (np.arange(n) * step for n, step in zip(shape, (spacing_mm[0], spacing_mm[2]), strict=True))
+    nearest = 0.5
+    for row, offset, step in zip(matrix, offset_mm, spacing_mm, strict=True):
+        places = (row[0] * across_mm[:, None] + row[2] * depth_mm + offset) / step + 0.5
+        nearest = min(nearest, float(np.abs(places - np.rint(places)).min()))
+    # Half of it, for rounding; where less is left than that is sure to be, nothing.
+    free: float = nearest * min(spacing_mm) / (across_mm[-1] + depth_mm[-1] + 1.0) / 2.0
+    return free if free > SMALLEST_CLEARANCE else 0.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -14,7 +14,7 @@ from armscan.errors import InvalidValueError, VolumeError, printable
 from armscan.utils.validation import check_int, check_numbers
 from armscan.volumes.labelmap import ALLOWED_LABELS, LABEL_NAMES, LANDMARK_LABELS, check_whole, shown
 from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
-from armscan.volumes.slicing import occupied_depths, sample_plane
+from armscan.volumes.slicing import clearance, occupied_depths, sample_plane
 
 LONGEST_SIDE_PX = 65536
 # Far beyond what any image has; the ratio of two spacings still is a number that a slice can be looked up with.
@@ -147,6 +147,13 @@ class LabelVolume:
     def occupied(self) -> NDArray[np.int32]:
         """Depths that the labels occupy; see `occupied_depths`."""
         return occupied_depths(self.labels_yxz)
+
+    @cached_property
+    def labelled_clearance(self) -> float:
+        """How far the labelled plane's matrix and offset may be off without changing its slice; see `clearance`."""
+        plane = self.optimal_action
+        assert plane is not None
+        return clearance(self.spacing, plane.matrix, plane.offset_mm, self.slice_shape)
 
     def slice(
         self,

@@ -6,6 +6,7 @@ import pytest
 from armscan.anatomy import TissueClusters, landmark_reward
 from armscan.envs import EnvFactory, ManipulatorAction, RandomTransform
 from armscan.envs.rules import Rules
+from armscan.envs.scene import SceneSampler, shows_labelled
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.volumes import LabelVolume
 from tests.conftest import make_tiny_volume
@@ -39,6 +40,31 @@ def test_scene_optimum_shows_the_labelled_plane(phantom):
     assert abs(matrix[:, 1] @ phantom.optimal_action.normal) == pytest.approx(1.0)
     seen = TissueClusters.from_slice(phantom.slice(scene.optimum, transform=scene.transform))
     assert seen.bones.n_points == pytest.approx(TissueClusters.from_slice(labelled).bones.n_points, rel=0.03)
+
+
+DEFORMED = {"scale": 0.1, "stretch": 0.1, "shear": 0.1, "mirror": True}
+
+
+@pytest.mark.parametrize("motion", [{}, {"rx_deg": 8.0}, DEFORMED], ids=["as by default", "about X", "deformed"])
+def test_slice_of_an_optimal_plane_is_as_it_would_be_looked_up(dataset, phantom, motion):
+    shown = set()
+    for volume in (*dataset.values(), phantom):
+        rules, rng = make_rules(volume, transform=RandomTransform(**motion)), np.random.default_rng(3)
+        for scene, slice_xz in rules.draw_scenes([volume.name] * 20, [rng] * 20):
+            np.testing.assert_array_equal(slice_xz, volume.slice(scene.optimum, transform=scene.transform))
+            shown.add(shows_labelled(scene))
+    # Only the default moves some pictures as they are, and shifts others.
+    assert shown == ({False} if motion else {True, False})
+
+
+def test_no_picture_counts_as_the_labelled_one_where_rounding_may_change_a_voxel(phantom):
+    between = ManipulatorAction((0.0, 0.0), (0.0, 100.5 * phantom.spacing[1]))
+    volume = LabelVolume(phantom.labels, phantom.spacing, "between", between)
+    assert phantom.labelled_clearance > 0.0
+    assert volume.labelled_clearance == 0.0
+    sampler = SceneSampler(rotation_bounds_deg=(180.0, 180.0), translation_bounds_mm=None, transform=None)
+    assert shows_labelled(sampler.unmoved(phantom))
+    assert not shows_labelled(sampler.unmoved(volume))
 
 
 def test_scene_optimum_stays_within_tight_rotation_bounds(phantom):

@@ -2,10 +2,10 @@
 
 import pytest
 
-from armscan.config.compose import compose
 from armscan.experiment import runner
 from armscan.experiment.job import Invocation
 from armscan.policies import build
+from armscan.sweeps.tasks.attempt import composed
 from tests.test_run import SMALL
 
 
@@ -19,9 +19,10 @@ def test_figures_are_shown_before_the_film_and_the_export(tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(runner, "record_episode", noted)
     monkeypatch.setattr(build, "save_policy", noted)
-    invocation = Invocation(tmp_path / "run", [*SMALL], "armscan run", {"agent": "sac", "obs": "cluster", "data": "phantom"}, None)
+    config, choices = composed(SMALL)
+    invocation = Invocation(tmp_path / "run", SMALL, "armscan run", choices, None)
     invocation.folder.mkdir()
-    runner.run_experiment(compose(SMALL), invocation)
+    runner.run_experiment(config, invocation)
     before_film, before_export = printed_before
     assert "results (deterministic policy" in before_film
     assert "on plane" in before_film
