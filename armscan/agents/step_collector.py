@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
 from tianshou.algorithm.modelfree.sac import SACPolicy
 from tianshou.data import Collector, CollectStats
-from tianshou.utils.net.continuous import ContinuousActorProbabilistic
+from tianshou.utils.net.continuous import SIGMA_MAX, SIGMA_MIN, ContinuousActorProbabilistic
+from torch import nn
 from torch.distributions import Distribution, Independent, Normal
+from torch.nn.functional import linear
 
+from armscan.agents.compiled_sac import layer_sizes
 from armscan.agents.replay import Replay
 from armscan.agents.tianshou_envs import TianshouVectorEnv, batched
 from armscan.envs.rules import Observed
@@ -36,6 +39,8 @@ class StepCollector(Collector[CollectStats]):
     def __init__(self, policy: Any, envs: TianshouVectorEnv, replay: Replay) -> None:
         super().__init__(policy, envs, replay, exploration_noise=True)
         self._envs, self._replay = envs, replay
+        actor = policy.actor
+        self._layers = [each for each in actor.modules() if isinstance(each, nn.Linear)] if layer_sizes(actor) else None
 
     def _is_plain(self, render: float | None, reset_arguments: dict[str, Any] | None) -> bool:
         """Return whether steps are collected as arrays: Gaussian policies without hooks, rendering or reset options."""
@@ -101,7 +106,7 @@ class StepCollector(Collector[CollectStats]):
         """Return the policy's actions and their standard deviations, each of shape (n_envs, n_free)."""
         policy: Any = self.policy
         is_sac = type(policy) is SACPolicy
-        means_and_spreads, _ = policy.actor(observations)
+        means_and_spreads = self._means_and_spreads(observations)
         # Checks that they are numbers, as the distributions of Tianshou do.
         chosen_from: Distribution = (
             Independent(Normal(*means_and_spreads), 1) if is_sac else policy.dist_fn(means_and_spreads)
@@ -111,6 +116,17 @@ class StepCollector(Collector[CollectStats]):
         else:
             actions = chosen_from.sample()
         return (torch.tanh(actions) if is_sac else actions).cpu().numpy(), chosen_from.stddev.cpu().numpy()
+
+    def _means_and_spreads(self, observations: Observed) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return what the actor does, to the bit; of plain layers without the calls around them, half its time."""
+        if self._layers is None:
+            means_and_spreads: tuple[torch.Tensor, torch.Tensor] = self.policy.actor(observations)[0]
+            return means_and_spreads
+        *hidden, mean, spread = ((layer.weight, layer.bias) for layer in self._layers)
+        features = torch.as_tensor(observations, dtype=torch.float32, device=mean[0].device)
+        for weights in hidden:
+            features = linear(features, *weights).relu()
+        return linear(features, *mean), linear(features, *spread).clamp(SIGMA_MIN, SIGMA_MAX).exp()
 
     def _step(self, observations: Observed, actions: Actions, sent: Actions) -> tuple[Observed, NDArray[Any]]:
         """Take a step in all environments and keep the transitions.

@@ -2,10 +2,10 @@
 
 import pytest
 
+from armscan.config.compose import compose_run
 from armscan.experiment import runner
 from armscan.experiment.job import Invocation
 from armscan.policies import build
-from armscan.sweeps.tasks.attempt import composed
 from tests.test_run import SMALL
 
 
@@ -19,7 +19,7 @@ def test_figures_are_shown_before_the_film_and_the_export(tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(runner, "record_episode", noted)
     monkeypatch.setattr(build, "save_policy", noted)
-    config, choices = composed(SMALL)
+    config, choices = compose_run(SMALL)
     invocation = Invocation(tmp_path / "run", SMALL, "armscan run", choices, None)
     invocation.folder.mkdir()
     runner.run_experiment(config, invocation)
