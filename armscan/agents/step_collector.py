@@ -118,9 +118,10 @@ class StepCollector(Collector[CollectStats]):
         return (torch.tanh(actions) if is_sac else actions).cpu().numpy(), chosen_from.stddev.cpu().numpy()
 
     def _means_and_spreads(self, observations: Observed) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return what the actor does, to the bit; of plain layers without the calls around them, half its time."""
+        """Return what the actor answers, to the bit; its plain layers alone take a third of the time of the whole module."""
         if self._layers is None:
-            means_and_spreads: tuple[torch.Tensor, torch.Tensor] = self.policy.actor(observations)[0]
+            policy: Any = self.policy
+            means_and_spreads: tuple[torch.Tensor, torch.Tensor] = policy.actor(observations)[0]
             return means_and_spreads
         *hidden, mean, spread = ((layer.weight, layer.bias) for layer in self._layers)
         features = torch.as_tensor(observations, dtype=torch.float32, device=mean[0].device)
