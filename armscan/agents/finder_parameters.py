@@ -41,6 +41,12 @@ class FinderParameters:
     n_seen: int = 3
     """Number of latest looks that the network sees; at most the number of looks."""
 
+    n_averaged: int = 1
+    """Number of latest looks whose estimates are averaged, weighted by the inverse squares of their expected errors; at
+    most the number of looks. Looks lie beside this mean, and the last plane is the mean. 1: the latest estimate alone.
+    The network is taught in the same way.
+    """
+
     filters: Sequence[int] = (12, 24, 36)
     """Filters of each of the three convolutions."""
 
@@ -85,7 +91,7 @@ class FinderParameters:
         for each in fields(self):
             if "limits" in each.metadata:
                 check_float(f"agent.{each.name}", getattr(self, each.name), **each.metadata["limits"])
-        for name in ("num_envs", "n_seen"):
+        for name in ("num_envs", "n_seen", "n_averaged"):
             check_int(f"agent.{name}", getattr(self, name), at_least=1)
         for name, n_sizes in (("filters", N_CONVOLUTIONS), ("hidden_sizes", None)):
             check_ints(f"agent.{name}", getattr(self, name), n_sizes, "", at_least=1, at_most=MOST_UNITS)
@@ -98,10 +104,11 @@ class FinderParameters:
             )
         if self.phantom_share is not None:
             check_float("agent.phantom_share", self.phantom_share, at_least=0.0, at_most=1.0)
-        if self.n_seen > n_offsets:
-            raise InvalidValueError(
-                f"agent.n_seen is {self.n_seen}, but it must be at most {n_offsets}, the looks of agent.offsets_mm"
-            )
+        for name in ("n_seen", "n_averaged"):
+            if (n_latest := getattr(self, name)) > n_offsets:
+                raise InvalidValueError(
+                    f"agent.{name} is {n_latest}, but it must be at most {n_offsets}, the looks of agent.offsets_mm"
+                )
         if (self.sure_mm is None) != (self.sure_deg is None):
             raise InvalidValueError(
                 f"agent.sure_mm is {self.sure_mm} and agent.sure_deg is {self.sure_deg}, but both or none must be given"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain, pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -47,6 +47,24 @@ class Estimate(NamedTuple):
     def features(self) -> Tensor:
         """Return all but the plane as one row of numbers for each episode, shape (n, n_features)."""
         return torch.cat([self.hidden, self.place, self.expected, self.step], dim=1)
+
+
+class PlaneModule(Protocol):
+    """Module that maps observations of several looks to the next plane."""
+
+    @property
+    def geometry(self) -> PlaneGeometry:
+        """Free components and bounds of the planes."""
+
+    @property
+    def calibration(self) -> Tensor:
+        """Factors of the expected errors, in mm and degrees, shape (2,)."""
+
+    def estimate(self, observations: dict[str, Tensor]) -> Estimate:
+        """Return the estimate of the latest look, from observations, whose parts have the shape (n, n_looks, ...)."""
+
+    def __call__(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
+        """Return the next actions, shape (n, n_action), and the expected errors of the planes found so far, (n, 2)."""
 
 
 class LookNetwork(nn.Module):
@@ -130,6 +148,8 @@ class FinderModule(nn.Module):
         offsets_mm: Offset of the next look along the normal from the plane found so far, in mm, after each look; the
             last is 0.
         sure: Expected errors, in mm and degrees, below which it takes no further looks. None: it takes all looks.
+        n_averaged: Number of latest looks whose estimates are averaged, weighted by the inverse squares of their
+            expected errors.
         has_stop: Whether actions end with the component `stop`, as with `env.ends=on_stop`.
     """
 
@@ -144,11 +164,12 @@ class FinderModule(nn.Module):
         offsets_mm: Sequence[float],
         sure: tuple[float, float] | None,
         *,
+        n_averaged: int,
         has_stop: bool,
     ) -> None:
         super().__init__()
         self.network, self.geometry = network, geometry
-        self._is_ever_sure, self._has_stop = sure is not None, has_stop
+        self._n_averaged, self._is_ever_sure, self._has_stop = n_averaged, sure is not None, has_stop
         self.register_buffer("offsets", torch.tensor(offsets_mm, dtype=torch.float32), persistent=False)
         self.register_buffer("sure", torch.tensor(sure or (0.0, 0.0), dtype=torch.float32), persistent=False)
         self.register_buffer("calibration", torch.ones(2))
@@ -159,7 +180,7 @@ class FinderModule(nn.Module):
         return self.network.place.in_features + 4 + 2 + len(self.offsets)
 
     def estimate(self, observations: dict[str, Tensor]) -> Estimate:
-        """Return the estimate from observations, whose parts have the shape (n, n_looks, ...)."""
+        """Return the estimate of the latest look, from observations, whose parts have the shape (n, n_looks, ...)."""
         actions = observations[ACTION][:, :, :4]
         n_looks = actions.shape[1]
         is_first = (actions == actions[:, :1]).all(2).float()
@@ -171,6 +192,30 @@ class FinderModule(nn.Module):
         step = ((n_looks - n_first)[:, None] == latest).float()
         place, expected, hidden = self.network(observations[IMAGE], actions, step, self.geometry)
         return Estimate(self.geometry.planes(actions[:, -1]), place, expected * self.calibration, step, hidden)
+
+    def found(self, observations: dict[str, Tensor]) -> Estimate:
+        """Return the estimate of the latest look, its place averaged over the estimates of the latest looks."""
+        n_averaged = self._n_averaged
+        if n_averaged == 1:
+            return self.estimate(observations)
+        every = self.estimate(self._latest(observations))
+        by_look = Estimate(*(part.unflatten(0, (n_averaged, -1)) for part in every))
+        latest = Estimate(*(part[0] for part in by_look))
+        planes = self.geometry.from_frame(every.plane, every.place, torch.zeros_like(every.place[:, 0]))
+        places = self.geometry.seen_from(latest.plane.repeat(n_averaged, 1), planes).unflatten(0, (n_averaged, -1))
+        # Two components are angles, two are in mm.
+        weights = by_look.expected[:, :, [1, 1, 0, 0]] ** -2
+        return latest._replace(place=(weights * places).sum(0) / weights.sum(0))
+
+    def _latest(self, observations: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return what was observed after the latest look, then one look earlier, and so on, shape (n_averaged n, ...).
+
+        Before the first look there is the first again.
+        """
+        looks = [{name: observations[name] for name in (IMAGE, ACTION)}]
+        for _ in range(1, self._n_averaged):
+            looks.append({name: torch.cat([part[:, :1], part[:, :-1]], dim=1) for name, part in looks[-1].items()})
+        return {name: torch.cat([each[name] for each in looks]) for name in (IMAGE, ACTION)}
 
     def actions(self, estimate: Estimate) -> Tensor:
         """Return the next actions, shape (n, n_action)."""
@@ -187,7 +232,7 @@ class FinderModule(nn.Module):
 
     def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
         """Return the next actions, shape (n, n_action), and the expected errors of the planes found so far, (n, 2)."""
-        estimate = self.estimate(observations)
+        estimate = self.found(observations)
         return (self.actions(estimate), estimate.expected), None
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from armscan.agents.base_learner import SupervisedLearner, diverged, teacher_of
 from armscan.agents.finder_parameters import FinderParameters
-from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork, looks_of
+from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork, PlaneModule, looks_of
 from armscan.agents.plane_geometry import common_geometry
 from armscan.agents.policy import Policy, batch_of, clip_action
 from armscan.agents.protocols import AgentSetup
@@ -58,8 +58,11 @@ class PlaneFinderLearner(SupervisedLearner):
         )
         sure = None if finder.sure_mm is None or finder.sure_deg is None else (finder.sure_mm, finder.sure_deg)
         geometry = common_geometry(teacher_of(envs).rules, finder.n_looks)
-        self._module: Any = FinderModule(network, geometry, finder.offsets_mm, sure, has_stop=self._has_stop)
-        super().__init__(self._module, finder.lr, envs, setup)
+        module = FinderModule(
+            network, geometry, finder.offsets_mm, sure, n_averaged=finder.n_averaged, has_stop=self._has_stop
+        )
+        self._module: PlaneModule = module
+        super().__init__(module, finder.lr, envs, setup)
         self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
         self.expected_error: tuple[float, float] | None = None
         """Expected error of the plane that `act` chose last, in mm and degrees."""
@@ -205,5 +208,5 @@ class PlaneFinderLearner(SupervisedLearner):
         return np.array(actions)
 
     def policy(self) -> Policy:
-        """Return a copy of the module that `act` evaluates."""
-        return Policy(self._module, clip_action, self._compute)
+        """Return a copy of the network that `act` evaluates."""
+        return Policy(self._network, clip_action, self._compute)

@@ -63,7 +63,7 @@ class ResidualVectorEnv(VectorWrapper):
 
     def _features(self, observations: Observed) -> FloatArray:
         with torch.no_grad():
-            self._estimate = self._finder.estimate(looks_of(observations, self._limits.device))
+            self._estimate = self._finder.found(looks_of(observations, self._limits.device))
             return np.asarray(self._estimate.features().cpu().numpy())
 
 

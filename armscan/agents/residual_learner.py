@@ -17,6 +17,7 @@ from armscan.agents.protocols import AgentSetup
 from armscan.agents.residual_envs import ResidualVectorEnv, feature_space
 from armscan.agents.sac import SAC
 from armscan.envs.actions import COMPONENTS
+from armscan.errors import InvalidValueError
 
 
 class ResidualModule(nn.Module):
@@ -50,12 +51,12 @@ class ResidualModule(nn.Module):
         return self.finder.calibration
 
     def estimate(self, observations: dict[str, Tensor]) -> Estimate:
-        """Return the estimate of the plane finder."""
+        """Return the plane finder's estimate of the latest look."""
         return self.finder.estimate(observations)
 
     def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
         """Return the next actions, shape (n, n_action), and the expected errors of the plane finder, shape (n, 2)."""
-        estimate = self.estimate(observations)
+        estimate = self.finder.found(observations)
         (means, _), _ = self.actor(estimate.features())
         corrections = self.is_corrected * torch.tanh(means) * self.limits
         return (self.finder.actions(estimate.moved(corrections)), estimate.expected), None
@@ -71,6 +72,9 @@ class ResidualLearner(PlaneFinderLearner):
         taught_env_steps: Number of environment steps of the teaching; the rest of the budget is for SAC.
         correction_mm: Largest correction along the normal of the plane, and across, in mm.
         correction_deg: Largest correction of each of the two tilts of the plane, in degrees.
+
+    Raises:
+        InvalidValueError: If the environment steps after the teaching are too few for SAC.
     """
 
     def __init__(
@@ -86,17 +90,22 @@ class ResidualLearner(PlaneFinderLearner):
         self._taught_env_steps = taught_env_steps
         super().__init__(parameters, replace(setup, total_env_steps=taught_env_steps))
         finder, tilt = self._module, math.sin(math.radians(correction_deg))
+        assert isinstance(finder, FinderModule), "only the teaching's own module is corrected"
         limits = torch.tensor([tilt, tilt, correction_mm, correction_mm], device=self._device)
-        self._sac = sac.agent(
-            replace(
-                setup,
-                make_envs=lambda n: ResidualVectorEnv(setup.make_envs(n), finder, limits, self._volumes),
-                observation_space=feature_space(finder),
-                action_names=COMPONENTS,
-                total_env_steps=setup.total_env_steps - taught_env_steps,
-            )
+        sac_setup = replace(
+            setup,
+            make_envs=lambda n: ResidualVectorEnv(setup.make_envs(n), finder, limits, self._volumes),
+            observation_space=feature_space(finder),
+            action_names=COMPONENTS,
+            total_env_steps=setup.total_env_steps - taught_env_steps,
         )
-        self._network = self._module = ResidualModule(finder, self._sac.actor, limits)
+        try:
+            self._sac = sac.agent(sac_setup)
+        except InvalidValueError as error:
+            budget = "training.env_steps"
+            message = str(error).replace("agent.", "agent.sac.").replace(budget, f"{budget} - agent.taught_env_steps")
+            raise InvalidValueError(message) from error
+        self._network = self._module = self._corrected = ResidualModule(finder, self._sac.actor, limits)
 
     @property
     def n_env_steps(self) -> int:
@@ -117,9 +126,9 @@ class ResidualLearner(PlaneFinderLearner):
         """Learn for an epoch, which ends with the teaching if it is of that; see `Learner.learn`."""
         if (n_left := self._taught_env_steps - super().n_env_steps) > 0:
             return super().learn(min(n_env_steps, n_left))
-        if not self._module.is_corrected:
+        if not self._corrected.is_corrected:
             self._sac.warm_up()
-            self._module.is_corrected.fill_(1.0)
+            self._corrected.is_corrected.fill_(1.0)
             n_env_steps = max(1, n_env_steps - self._sac.n_env_steps)
         return self._sac.learn(n_env_steps)
 

@@ -22,9 +22,9 @@ from armscan.utils.files import FULL_DISK
 
 def one_line_message(error: BaseException) -> str | None:
     """Return a user's mistake and the allowed values in one line; None if the error is no user's mistake."""
-    if (ours := _ours(error)) is not None:
-        return str(ours)
     text = " ".join(str(error).split())
+    if (ours := _ours(error)) is not None:
+        return _named(str(ours), text.rpartition("full_key: ")[2])
     match error:
         case MissingConfigException(options=options) if options:
             group, _, choice = str(error.missing_cfg_file).rpartition("/")
@@ -50,6 +50,11 @@ def one_line_message(error: BaseException) -> str | None:
         case OSError() if error.errno in FULL_DISK:
             return f"a file cannot be written: {error.strerror}"
     return None
+
+
+def _named(message: str, section: str) -> str:
+    """Return a message whose keys of `agent` are named as those of the section in it that they were read from."""
+    return message.replace("agent.", f"{section}.") if section.startswith("agent.") else message
 
 
 def _ours(error: BaseException | None) -> ArmscanError | None:

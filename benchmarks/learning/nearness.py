@@ -1,21 +1,23 @@
 """Compare how near the labelled plane the agents of runs come with the error that they expect.
 
     python -m benchmarks.learning.nearness RUN [FOLDER | phantom] [--tracking URI] [--episodes N] [--rx DEG]
+                                           [--averaged N]
     python -m benchmarks.learning.nearness GRID ...
 
 Medians and 90th percentiles of the distance and the angle, how often both are within 1.5 mm and 4 degrees, over all
 volumes and for each; and, for an agent that says how far off it expects to be (`agent=plane_finder`), the errors by
 decile of that. Volumes: a folder, or 12 phantoms that no run trains on; default: the run's own test volumes. Of a
 grid (`data.folds`) all runs, each on its own test volumes. `--rx` turns volumes by up to as many degrees about the axis
-across, as `env.transform.rx_deg` does.
+across, as `env.transform.rx_deg` does. `--averaged` sets `agent.n_averaged`, which changes no training.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from omegaconf import OmegaConf
 
 from armscan.config.defaults import PHANTOM, default_tracking
 from armscan.evaluation.agent_source import agent_of_run
@@ -36,11 +38,14 @@ def runs_of(tracking: str, run_id: str) -> list[str]:
     return [child.info.run_id for child in children if "choice.agent" in child.data.tags] or [run.info.run_id]
 
 
-def played(tracking: str, run_id: str, data: str | None, n_episodes: int, rx_deg: float | None) -> list[EpisodeResult]:
-    """Return the episodes of a run's agent on the volumes."""
+def played(
+    tracking: str, run_id: str, data: str | None, n_episodes: int, changes: Mapping[str, float | None]
+) -> list[EpisodeResult]:
+    """Return the episodes of a run's agent on the volumes, with the changes of its configuration that are not None."""
     subject = agent_of_run(tracking, run_id, {})
-    if rx_deg is not None:
-        subject.config.env.transform.rx_deg = rx_deg
+    for key, value in changes.items():
+        if value is not None:
+            OmegaConf.update(subject.config, key, value, force_add=True)
     prepared = apply(subject, data, N_PHANTOMS)
     label = data if data == PHANTOM else TEST
     env = prepared.envs.get(label, list(prepared.envs.values())[-1])
@@ -78,10 +83,12 @@ def main() -> None:
     parser.add_argument("--tracking", default=default_tracking()["uri"])
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--rx", type=float)
+    parser.add_argument("--averaged", type=int)
     given = parser.parse_args()
     run_ids = runs_of(given.tracking, given.run)
     n_each = -(-given.episodes // len(run_ids))
-    episodes = [each for run_id in run_ids for each in played(given.tracking, run_id, given.data, n_each, given.rx)]
+    changes = {"env.transform.rx_deg": given.rx, "agent.n_averaged": given.averaged}
+    episodes = [each for run_id in run_ids for each in played(given.tracking, run_id, given.data, n_each, changes)]
     print("| | episodes | mm, median / p90 | degrees, median / p90 | both < 1.5 mm and < 4 degrees, % | success, % |")
     print("| --- | --- | --- | --- | --- | --- |")
     print_row("all", episodes)

@@ -5,11 +5,15 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
+from hydra.errors import InstantiationException
 
 from armscan.agents import MLP, SAC, Learner, ResidualSAC
 from armscan.agents.policy import batch_of
+from armscan.config.compose import compose
+from armscan.config.error_messages import one_line_message
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError
+from armscan.experiment.build import make_algorithm
 from tests.agents.conftest import SMALL_SAC, setup_for
 from tests.agents.test_plane_finder import NAMES, RULES, SMALL, answers_of, played
 
@@ -49,8 +53,9 @@ def test_teaching_ends_with_its_steps_and_the_rest_is_for_sac(phantom):
     assert learner.n_env_steps == N_TAUGHT + 40
 
 
-def test_corrections_begin_after_the_teaching_and_leave_the_plane_finder_as_it_is(phantom):
-    learner, env = made(phantom)
+@pytest.mark.parametrize("n_averaged", [1, 2])
+def test_corrections_begin_after_the_teaching_and_leave_the_plane_finder_as_it_is(phantom, n_averaged):
+    learner, env = made(phantom, n_averaged=n_averaged)
     learner.learn(N_TAUGHT)
     observation, _ = env.reset(seed=0)
     looks = learner._tensors(batch_of([observation]))
@@ -115,3 +120,12 @@ def test_learner_stops_where_its_plane_finder_does(phantom):
 def test_impossible_parameters_are_refused(phantom, changes, message):
     with pytest.raises(InvalidValueError, match=message):
         made(phantom, **changes)
+
+
+def test_what_sac_refuses_is_named_by_its_keys(phantom):
+    message = r"agent.sac.learning_starts is 900, .* below training.env_steps - agent.taught_env_steps = 176"
+    with pytest.raises(InvalidValueError, match=message):
+        made(phantom, sac=SAC(network=MLP((8,)), **SMALL_SAC | {"learning_starts": 900}))
+    with pytest.raises(InstantiationException) as refused:
+        make_algorithm(compose(["experiment=few_wrists_sac", "agent.sac.lr=-1"]))
+    assert one_line_message(refused.value).startswith("agent.sac.lr is -1, but")
