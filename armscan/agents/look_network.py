@@ -129,9 +129,10 @@ class LookNetwork(nn.Module):
         looks = images[:, -self._n_seen :].flatten(1, 2).float() / 255.0
         planes = geometry.planes(actions)
         features = [self.convolutions(looks.contiguous(memory_format=torch.channels_last)), actions[:, -1], step]
-        for i in range(2, self._n_seen + 1):
-            place = geometry.seen_from(planes[:, -1], planes[:, -i]) / self.places
-            features.append(place.clamp(-MOST_PLACE, MOST_PLACE))
+        if (n_earlier := self._n_seen - 1) > 0:
+            earlier, latest = planes[:, -n_earlier - 1 : -1].flip(1), planes[:, -1:].expand(-1, n_earlier, -1)
+            places = geometry.seen_from(latest.flatten(0, 1), earlier.flatten(0, 1)) / self.places
+            features.append(places.clamp(-MOST_PLACE, MOST_PLACE).unflatten(0, (-1, n_earlier)).flatten(1))
         hidden = self.linear(torch.cat(features, dim=1))
         doubt = nn.functional.softplus(self.doubt(hidden.detach())) + LEAST_DOUBT
         return self.place(hidden) * self.units, doubt, hidden
@@ -184,11 +185,10 @@ class FinderModule(nn.Module):
         actions = observations[ACTION][:, :, :4]
         n_looks = actions.shape[1]
         is_first = (actions == actions[:, :1]).all(2).float()
-        n_first = running = is_first[:, 0]
-        for i in range(1, n_looks):
-            running = running * is_first[:, i]
-            n_first = n_first + running
         latest = torch.arange(n_looks, device=actions.device)
+        # Numbers of looks that equal the first, up to each one: as many as there are up to there, at the beginning.
+        n_equal = is_first @ (latest[:, None] <= latest).float()
+        n_first = (n_equal == latest + 1.0).sum(1)
         step = ((n_looks - n_first)[:, None] == latest).float()
         place, expected, hidden = self.network(observations[IMAGE], actions, step, self.geometry)
         return Estimate(self.geometry.planes(actions[:, -1]), place, expected * self.calibration, step, hidden)

@@ -56,12 +56,14 @@ class PlaneGeometry(nn.Module):
 
     def seen_from(self, planes: Tensor, others: Tensor) -> Tensor:
         """Return where `others` lie in the frames of planes, shape (n, 4)."""
-        matrices, normals, middles = _matrices(planes), self.normals(others), self.middles(others)
+        # Once for each: small operations of torch are most of a decision's time.
+        matrices, matrices_of_others, origins = _matrices(planes), _matrices(others), _origins(planes)
+        normals, middles = matrices_of_others[:, :, 1], matrices_of_others @ self.middle + _origins(others)
         local = _turned_back(matrices, normals)
         sign = torch.where(local[:, 1:2] < 0.0, -1.0, 1.0)
         local = local * sign
-        way = ((middles - self.middles(planes)) * normals).sum(1, keepdim=True) * sign
-        across = _turned_back(matrices, middles - _origins(planes))[:, :1] - self.middle[0]
+        way = ((middles - (matrices @ self.middle + origins)) * normals).sum(1, keepdim=True) * sign
+        across = _turned_back(matrices, middles - origins)[:, :1] - self.middle[0]
         return torch.cat([local[:, :1], local[:, 2:], way, across], dim=1)
 
     def from_frame(self, planes: Tensor, seen: Tensor, beside_mm: Tensor) -> Tensor:
