@@ -132,7 +132,7 @@ class LookNetwork(nn.Module):
         if (n_earlier := self._n_seen - 1) > 0:
             earlier, latest = planes[:, -n_earlier - 1 : -1].flip(1), planes[:, -1:].expand(-1, n_earlier, -1)
             places = geometry.seen_from(latest.flatten(0, 1), earlier.flatten(0, 1)) / self.places
-            features.append(places.clamp(-MOST_PLACE, MOST_PLACE).unflatten(0, (-1, n_earlier)).flatten(1))
+            features.append(places.clamp(-MOST_PLACE, MOST_PLACE).reshape(-1, 4 * n_earlier))
         hidden = self.linear(torch.cat(features, dim=1))
         doubt = nn.functional.softplus(self.doubt(hidden.detach())) + LEAST_DOUBT
         return self.place(hidden) * self.units, doubt, hidden
@@ -199,10 +199,10 @@ class FinderModule(nn.Module):
         if n_averaged == 1:
             return self.estimate(observations)
         every = self.estimate(self._latest(observations))
-        by_look = Estimate(*(part.unflatten(0, (n_averaged, -1)) for part in every))
+        by_look = Estimate(*(part.reshape(n_averaged, -1, part.shape[1]) for part in every))
         latest = Estimate(*(part[0] for part in by_look))
         planes = self.geometry.from_frame(every.plane, every.place, torch.zeros_like(every.place[:, 0]))
-        places = self.geometry.seen_from(latest.plane.repeat(n_averaged, 1), planes).unflatten(0, (n_averaged, -1))
+        places = self.geometry.seen_from(latest.plane.repeat(n_averaged, 1), planes).reshape(n_averaged, -1, 4)
         # Two components are angles, two are in mm.
         weights = by_look.expected[:, :, [1, 1, 0, 0]] ** -2
         return latest._replace(place=(weights * places).sum(0) / weights.sum(0))
