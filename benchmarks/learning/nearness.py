@@ -8,7 +8,7 @@ Medians and 90th percentiles of the distance and the angle, how often both are w
 volumes and for each; and, for an agent that says how far off it expects to be (`agent=plane_finder`), the errors by
 decile of that. Volumes: a folder, or 12 phantoms that no run trains on; default: the run's own test volumes. Of a
 grid (`data.folds`) all runs, each on its own test volumes. `--rx` turns volumes by up to as many degrees about the axis
-across, as `env.transform.rx_deg` does. `--averaged` sets `agent.n_averaged`, which changes no training.
+across, as `env.transform.rx_deg` does. `--averaged` sets `agent.n_averaged`, which changes no gradient step.
 """
 
 from __future__ import annotations
