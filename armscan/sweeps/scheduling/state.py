@@ -19,8 +19,6 @@ LEASE, ENV_STEPS, METRICS, FAILURE = "lease", "env_steps", "figures", "failure"
 RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
 # Of a trial that a study has begun with: where it was run, or what its settings are of.
 TAKEN_FROM, ENQUEUED_FROM = "taken_from", "enqueued_from"
-# Value of ENQUEUED_FROM: the settings of the study's own configuration, which is the control of its final evaluation.
-FROM_DEFAULT = "preset default"
 # Of a final training: the trial whose configuration is trained, and the seed.
 FINALIST, FINAL_SEED = "judged", "judged_seed"
 # In place of a trial's number: the configuration of the study without what it searches.

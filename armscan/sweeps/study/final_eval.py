@@ -22,14 +22,13 @@ from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.race import Race, budget, race
 from armscan.sweeps.scheduling.state import (
     CONTROL,
-    ENQUEUED_FROM,
     FINAL_SEED,
     FINALIST,
-    FROM_DEFAULT,
     RETRIED,
     SCHEDULE,
     PlannedTrial,
 )
+from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.settings import (
@@ -50,10 +49,11 @@ ENDED_WITHOUT_SCORE = (TrialState.FAIL, TrialState.PRUNED)
 
 
 class _Stored(Section):
-    """Settings of the selection, and the largest seed of the search, as the study of the selection keeps them."""
+    """What a final evaluation is made of, as the study of the selection keeps it; see `FinalEvaluation`."""
 
     settings: FinalEvalSettings = Field(description="a section with top_k, min_seeds, max_seeds and judge_seeds")
     search_seed: int = Field(ge=0, le=LARGEST_SEARCH_SEED, description="the largest seed of the search")
+    control: dict[str, Value] | None = Field(default=None, description="the values of the control by their keys")
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,7 @@ class FinalEvaluation:
     Args:
         settings: Its settings.
         search_seed: The largest seed of the search.
+        control: Values of the control by the searched keys; None if they do not lie in the space.
         search: The study of the search.
         selection: The study of the trainings that choose a configuration.
         judgement: The study of the trainings that judge it.
@@ -70,13 +71,16 @@ class FinalEvaluation:
 
     settings: FinalEvalSettings
     search_seed: int
+    control: Mapping[str, Value] | None
     search: optuna.Study
     selection: optuna.Study
     judgement: optuna.Study
 
     @classmethod
-    def opened(cls, storage: Storage, settings: StudySettings, search: optuna.Study) -> Self:
-        """Make the two studies, or find them."""
+    def opened(
+        cls, storage: Storage, settings: StudySettings, search: optuna.Study, control: Mapping[str, Value] | None
+    ) -> Self:
+        """Make the two studies, or find them; the arguments are those of the class."""
 
         def make(suffix: str, directions: Sequence[StudyDirection]) -> optuna.Study:
             study = storage.exclusive(
@@ -91,11 +95,15 @@ class FinalEvaluation:
             return study
 
         selection = make(SELECTION_SUFFIX, search.directions)
-        stored = _Stored(settings=settings.final_eval, search_seed=max(settings.seeds)).model_dump()
+        stored = {
+            "settings": settings.final_eval.model_dump(),
+            "search_seed": max(settings.seeds),
+            "control": None if control is None else dict(control),
+        }
         if selection.user_attrs.get(FINAL_EVAL) != stored:
             selection.set_user_attr(FINAL_EVAL, stored)
         judgement = make(JUDGEMENT_SUFFIX, [StudyDirection.MINIMIZE])
-        return cls(settings.final_eval, max(settings.seeds), search, selection, judgement)
+        return cls(settings.final_eval, max(settings.seeds), control, search, selection, judgement)
 
     @classmethod
     def stored(cls, storage: Storage, search: optuna.Study) -> Self | None:
@@ -110,7 +118,7 @@ class FinalEvaluation:
         if not isinstance(found, Mapping):
             raise StudyError(f"{where} is {found!r}, but it must be the settings of the final evaluation")
         kept = _Stored.read(where, found)
-        return cls(kept.settings, kept.search_seed, search, selection, judgement)
+        return cls(kept.settings, kept.search_seed, kept.control, search, selection, judgement)
 
     @property
     def selection_seeds(self) -> range:
@@ -132,8 +140,8 @@ class FinalEvaluation:
     def candidates(self) -> list[int]:
         """Return the control and the numbers of the best trials; nothing if no trial has finished."""
         best = best_trials(self.search, self.settings.top_k + 1)
-        # A trial with the settings of the control is the control.
-        others = [trial.number for trial in best if trial.user_attrs.get(ENQUEUED_FROM) != FROM_DEFAULT]
+        # A trial with the values of the control is the control, wherever it comes from.
+        others = [trial.number for trial in best if renamed(searched_values(trial)) != self.control]
         # First, so that it wins where it is as good.
         return [CONTROL, *others[: self.settings.top_k]] if best and self.settings.top_k else []
 

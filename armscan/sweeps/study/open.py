@@ -29,6 +29,7 @@ from armscan.sweeps.study.final_eval import FinalEvaluation, training_of
 from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import STUDY_RUN, make_study, name_objectives
+from armscan.sweeps.study.warm_start import values_of
 from armscan.sweeps.tasks.attempt import RUN, STORAGE_TAG, STUDY_TAG, TRIAL_TAG, Attempt, Task, trial_folder
 from armscan.tracking import TrackingStore, abandon, open_store, run_of_study, source
 from armscan.tracking.run import FAILURE_TAG
@@ -206,7 +207,10 @@ def open_for_work(
         run_id=storage.exclusive(tracked_run),
         population=population,
     )
-    final_eval = FinalEvaluation.opened(storage, settings, study) if settings.final_eval.top_k else None
+    final_eval = None
+    if settings.final_eval.top_k:
+        control, misfit = values_of(settings.space, words)
+        final_eval = FinalEvaluation.opened(storage, settings, study, None if misfit else control)
     finals = _final_phases(search, settings, task, final_eval) if final_eval is not None else ()
     return OpenedStudy(settings=settings, config=config, search=search, final_eval=final_eval, finals=finals)
 

@@ -20,7 +20,6 @@ from armscan.sweeps.scheduling.state import (
     ENQUEUED_FROM,
     ENV_STEPS,
     FINISHED,
-    FROM_DEFAULT,
     METRICS,
     SEEDS,
     TAKEN_FROM,
@@ -55,14 +54,12 @@ class Beginning:
         told: Line about the part that is taken, and why the rest is not.
         taken: Finished trials, with their values.
         enqueued: Settings to try first.
-        is_default: Whether these are the settings of the study's own configuration. Default: False.
     """
 
     origin: str
     told: str
     taken: tuple[FrozenTrial, ...] = ()
     enqueued: tuple[dict[str, Value], ...] = ()
-    is_default: bool = False
 
     def add(self, storage: Storage, study: optuna.Study) -> bool:
         """Add the trials to a study, once; returns whether this call has added them."""
@@ -76,9 +73,8 @@ class Beginning:
             for trial in self.taken:
                 if trial.user_attrs[TAKEN_FROM] not in places:
                     study.add_trial(trial)
-            origin = FROM_DEFAULT if self.is_default else self.origin
             for chosen in self.enqueued:
-                study.enqueue_trial(chosen, user_attrs={ENQUEUED_FROM: origin}, skip_if_exists=True)
+                study.enqueue_trial(chosen, user_attrs={ENQUEUED_FROM: self.origin}, skip_if_exists=True)
             study.set_user_attr(BEGUN_WITH, [*begun_with, self.origin])
             return True
 
@@ -114,16 +110,23 @@ def beginnings(
 
 
 def _of_preset(space: Space, name: str, words: Sequence[str]) -> Beginning:
-    chosen, misfit = _settings(space, words if name == DEFAULT else [f"experiment={name}"])
+    chosen, misfit = values_of(space, words if name == DEFAULT else [f"experiment={name}"])
     if misfit:
         return Beginning(PRESET.format(name), f"preset {name} is not tried: {misfit}")
     told = f"preset {name} is tried first: {' '.join(overrides_of(chosen))}"
-    is_default = chosen == _settings(space, words)[0]
-    return Beginning(PRESET.format(name), told, (), (chosen,), is_default)
+    return Beginning(PRESET.format(name), told, (), (chosen,))
 
 
-def _settings(space: Space, words: Sequence[str]) -> tuple[dict[str, Value], str | None]:
-    """Return the settings of a configuration by key, and why they do not fit the space; None if they fit."""
+def values_of(space: Space, words: Sequence[str]) -> tuple[dict[str, Value], str | None]:
+    """Return the values that a configuration has of the keys of a space, and those that do not lie in it.
+
+    Args:
+        space: Space of the keys.
+        words: Overrides that the configuration is composed from.
+
+    Returns:
+        See `Space.fit`.
+    """
     config, choices = compose_run(words)
     # Of a group the name that was chosen, of any other key its value.
     found = {each.name: choices.get(each.name, OmegaConf.select(config, each.name)) for each in space.parameters}

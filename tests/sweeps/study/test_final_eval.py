@@ -15,9 +15,7 @@ from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import (
     CONTROL,
-    ENQUEUED_FROM,
     FINALIST,
-    FROM_DEFAULT,
     GENERATION,
     MEMBER,
     METRICS,
@@ -44,7 +42,7 @@ def storage_uri(tmp_path):
     return str(tmp_path / "a.journal")
 
 
-def searched(uri, objectives=("mean_steps",), defaults=(), **changes):
+def searched(uri, objectives=("mean_steps",), **changes):
     """Make a study whose search has ended; return its storage, settings and study."""
     asked = settings(
         storage=uri,
@@ -57,8 +55,6 @@ def searched(uri, objectives=("mean_steps",), defaults=(), **changes):
         trial = search.ask()
         trial.suggest_float("agent.lr", 1e-4, 1e-2)
         trial.set_user_attr(METRICS, {"mean_steps": luck, "success_rate": 0.5})
-        if number in defaults:
-            trial.set_user_attr(ENQUEUED_FROM, FROM_DEFAULT)
         search.tell(trial, [luck] * len(objectives))
         assert trial.number == number
     return storage, asked, search
@@ -66,7 +62,7 @@ def searched(uri, objectives=("mean_steps",), defaults=(), **changes):
 
 def opened(uri, **changes):
     storage, asked, search = searched(uri, **changes)
-    final = FinalEvaluation.opened(storage, asked, search)
+    final = FinalEvaluation.opened(storage, asked, search, None)
     limits = Limits(n_trials=10**9)
     plans = {final.selection: final.missing_of_selection, final.judgement: final.missing_of_judgement}
     return final, [TrialScheduler(study, storage, limits, plan) for study, plan in plans.items()]
@@ -163,9 +159,12 @@ def test_control_that_is_the_best_is_the_result(storage_uri):
 
 @pytest.mark.parametrize(("top_k", "candidates"), [(0, []), (1, [CONTROL, 1]), (2, [CONTROL, 1, 2])])
 def test_trial_with_the_settings_of_the_control_is_no_candidate_beside_it(storage_uri, top_k, candidates):
-    storage, asked, search = searched(storage_uri, defaults=(0,), top_k=top_k)
-    final = FinalEvaluation.opened(storage, asked, search)
+    storage, asked, search = searched(storage_uri, top_k=top_k)
+    # Neither a sampled nor a taken trial says that it has them.
+    final = FinalEvaluation.opened(storage, asked, search, search.trials[0].params)
     assert final.candidates() == candidates
+    # As a report reads it.
+    assert FinalEvaluation.stored(open_storage(storage_uri), search).candidates() == candidates
 
 
 def test_training_that_failed_leaves_its_candidate_out_and_the_study_has_a_result(storage_uri):
@@ -223,7 +222,7 @@ def test_final_evaluation_is_read_from_the_storage_and_that_of_an_earlier_versio
     assert FinalEvaluation.stored(storage, search) is None
     optuna.create_study(study_name="a-judged", storage=storage.optuna)
     assert FinalEvaluation.stored(storage, search) is None
-    final = FinalEvaluation.opened(storage, asked, search)
+    final = FinalEvaluation.opened(storage, asked, search, None)
     assert FinalEvaluation.stored(open_storage(storage_uri), search).settings == final.settings
 
 
@@ -234,7 +233,7 @@ def test_member_of_the_latest_generation_is_trained_with_its_whole_schedule(stor
     member = search.ask()
     member.suggest_float("agent.lr", 1e-4, 1e-2)
     search.tell(member, 99.0)
-    final = FinalEvaluation.opened(storage, asked, search)
+    final = FinalEvaluation.opened(storage, asked, search, None)
     # Better values of earlier generations are not those of whole trainings.
     assert final.candidates() == [CONTROL, member.number]
     planned = [each for each in final.missing_of_selection() if each.attributes[FINALIST] == member.number]

@@ -101,7 +101,7 @@ def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_
     final_eval = FinalEvalSettings(top_k=1, min_seeds=1, max_seeds=1, judge_seeds=1)
     now = settings(space=Space.read({"agent.utd_ratio": lr}), final_eval=final_eval)
     search = make_study(storage, now, fixed)
-    control, best = FinalEvaluation.opened(storage, now, search).missing_of_selection()
+    control, best = FinalEvaluation.opened(storage, now, search, None).missing_of_selection()
     assert (control.params, best.params) == ({}, {"agent.utd_ratio": ratio})
 
 

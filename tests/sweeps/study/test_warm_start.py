@@ -1,7 +1,5 @@
 """Warm starts: trials of others whose configuration is the same, else their best settings; and presets."""
 
-from dataclasses import replace
-
 import optuna
 import pytest
 from optuna.trial import TrialState
@@ -10,13 +8,15 @@ from armscan.config.defaults import to_plain
 from armscan.config.sources import sweeps_folder
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import ENQUEUED_FROM, FROM_DEFAULT, TAKEN_FROM, Limits, StudyState
+from armscan.sweeps.scheduling.state import CONTROL, TAKEN_FROM, Limits, StudyState
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
 from armscan.sweeps.study.components import read_settings
+from armscan.sweeps.study.final_eval import FinalEvaluation
+from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import best_trials, make_study
-from armscan.sweeps.study.warm_start import N_ENQUEUED, Beginning, beginnings
+from armscan.sweeps.study.warm_start import N_ENQUEUED, Beginning, beginnings, values_of
 from tests.sweeps.study.test_study import settings
 
 LR = {"low": 1e-4, "high": 1e-2, "log": True}
@@ -147,15 +147,16 @@ def test_preset_whose_values_lie_in_the_space_is_tried_first():
     assert best.told.startswith("preset best_zy is tried first: agent.lr=0.001 agent.lr_end_factor=0.1 ")
 
 
-def test_preset_that_has_the_settings_of_the_study_itself_is_marked(study_in):
-    words = ["sweep=sac_y"]
-    asked, _, config = read_settings(words)
-    (best_y,) = beginnings(asked, words, to_plain(config), None)
-    own = Beginning("preset b", "", (), ({"agent.lr": 1e-3},))
-    _, storage, study = study_in("now", {"agent.lr": LR})
-    for each in (replace(best_y, enqueued=({"agent.lr": 2e-3},)), own):
-        each.add(storage, study)
-    assert [trial.user_attrs[ENQUEUED_FROM] for trial in study.trials] == [FROM_DEFAULT, "preset b"]
+def test_taken_trial_with_the_values_of_the_control_is_no_candidate_beside_it(study_in):
+    space, words = {"agent.lr": LR, "stack": STACK}, ["sweep=sac_y", "agent.lr=2e-3"]
+    control, misfit = values_of(Space.read(space), words)
+    assert (control, misfit) == ({"agent.lr": 2e-3, "stack": 1}, None)
+    study_in("before", space, rows=[(control, 1.0), (control | {"stack": 4}, 2.0)])
+    final_eval = FinalEvalSettings(top_k=2, min_seeds=1, max_seeds=1, judge_seeds=1)
+    asked, storage, study = made = study_in("now", space, warm_start=["before"], final_eval=final_eval)
+    begin(made)
+    assert FinalEvaluation.opened(storage, asked, study, None).candidates() == [CONTROL, 0, 1]
+    assert FinalEvaluation.opened(storage, asked, study, control).candidates() == [CONTROL, 1]
 
 
 def test_settings_of_a_taken_trial_are_not_tried_again(study_in):
