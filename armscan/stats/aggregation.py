@@ -22,6 +22,8 @@ from armscan.volumes.plane import FloatArray
 QUARTER = 0.25
 # With fewer seeds an interval is no more than their range.
 FEWEST_SEEDS = 4
+# Steps of a bisection from 0 to 1, to the last digit of a number.
+N_HALVINGS = 53
 # Quantiles at the ends of an interval.
 ENDS = (1 - LEVEL) / 2, (1 + LEVEL) / 2
 
@@ -116,6 +118,33 @@ def probabilities_of_improvement(pairs: Sequence[tuple[FloatArray, FloatArray]])
             for number, low, high in zip(numbers, *np.quantile(drawn, ENDS, axis=-1), strict=True):
                 estimates[number] = estimates[number]._replace(low=float(low), high=float(high))
     return [estimates[number] for number in range(len(pairs))]
+
+
+def improvement_of_few_seeds(ours: FloatArray, theirs: FloatArray) -> Estimate:
+    """Return `probability_of_improvement` with an interval that is wide enough for few seeds, and wide for two.
+
+    The interval holds the probabilities from which the estimate is no further than chance explains, with the variance
+    that the statistic of Mann and Whitney would have there: method 5 of Newcombe 2006, doi:10.1002/sim.2324. The mean
+    over several volumes varies less than that.
+    """
+    value = float(_wins(ours, theirs).mean())
+    if min(len(ours), len(theirs)) < 2:
+        return Estimate(value, np.nan, np.nan)
+    return Estimate(value, *(_furthest(value, end, len(ours), len(theirs)) for end in (0.0, 1.0)))
+
+
+def _furthest(value: float, end: float, n_ours: int, n_theirs: int) -> float:
+    """Return the probability closest to `end` that explains an estimate."""
+    from scipy.special import ndtri
+
+    inside, outside = value, end
+    for _ in range(N_HALVINGS):
+        each = (inside + outside) / 2
+        excess = ((n_ours + n_theirs) / 2 - 1) * ((1 - each) / (2 - each) + each / (1 + each))
+        variance = each * (1 - each) * (1 + excess) / (n_ours * n_theirs)
+        explains = (value - each) ** 2 <= ndtri(ENDS[1]) ** 2 * variance
+        inside, outside = (each, outside) if explains else (inside, each)
+    return inside
 
 
 def _wins(ours: FloatArray, theirs: FloatArray) -> FloatArray:

@@ -3,7 +3,9 @@
 The difference in each cell of a seed and a volume is the sum of an effect of the training, one of the volume, and a
 rest. The variance of the mean over all cells is that of a two-way layout with random effects, its degrees of freedom
 are Satterthwaite's (1946, doi:10.2307/3002019); so are readers and cases crossed in diagnostic studies (Hillis 2014,
-doi:10.1002/sim.5926). Unlike a percentile bootstrap, the interval is wide enough for few seeds and volumes.
+doi:10.1002/sim.5926). With two or three seeds their mean square is often small by chance; the degrees of freedom are
+then those of the volumes, and too many. So the interval is at least as wide as Student's for other seeds alone, and for
+other volumes alone. Unlike a percentile bootstrap, it is then wide enough for few seeds and volumes.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ def paired_difference(ours: FloatArray, theirs: FloatArray) -> Estimate:
         theirs: Their scores of the same seeds and volumes.
 
     Returns:
-        The estimate; without an interval if there are one seed and one volume.
+        The estimate; without an interval if there is one seed, which says nothing of others.
 
     Raises:
         InvalidValueError: If the shapes differ.
@@ -33,6 +35,7 @@ def paired_difference(ours: FloatArray, theirs: FloatArray) -> Estimate:
     if ours.shape != theirs.shape:
         raise InvalidValueError(f"scores have the shapes {ours.shape} and {theirs.shape}, but both must have the same")
     means, halves = crossed_mean(ours - theirs)
+    halves = halves if len(ours) > 1 else np.nan
     return Estimate(float(means), float(means - halves), float(means + halves))
 
 
@@ -64,4 +67,8 @@ def crossed_mean(values: FloatArray) -> tuple[Any, Any]:
     terms = seeds**2 / max(1, n_seeds - 1) + np.where(differ, volumes**2 / max(1, n_volumes - 1), 0.0)
     # Without any spread there is no width, with any degrees of freedom.
     df = np.where(terms > 0.0, variances**2 / np.where(terms > 0.0, terms, 1.0), 1.0)
-    return means, stdtrit(df, (1 + LEVEL) / 2) * np.sqrt(variances / (n_seeds * n_volumes))
+    halves = stdtrit(df, (1 + LEVEL) / 2) * np.sqrt(variances)
+    for mean_square, n in ((seeds, n_seeds), (volumes, n_volumes)):
+        if n > 1:
+            halves = np.maximum(halves, stdtrit(n - 1, (1 + LEVEL) / 2) * np.sqrt(mean_square))
+    return means, halves / np.sqrt(n_seeds * n_volumes)

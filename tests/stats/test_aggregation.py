@@ -8,10 +8,12 @@ from hypothesis.extra.numpy import arrays
 from rliable.library import get_interval_estimates
 from rliable.metrics import aggregate_iqm
 from rliable.metrics import probability_of_improvement as theirs
+from scipy.stats import norm
 
 from armscan.errors import InvalidValueError
 from armscan.stats.aggregation import (
     band_over_seeds,
+    improvement_of_few_seeds,
     interquartile_mean,
     over_seeds,
     probabilities_of_improvement,
@@ -41,6 +43,30 @@ def test_probability_of_improvement_is_that_of_rliable(groups):
     assert opposite.value == pytest.approx(1.0 - estimate.value)
     assert probability_of_improvement(ours + 9.0, others) == (1.0, 1.0, 1.0)
     assert probability_of_improvement(ours, others) == estimate
+
+
+@given(two_groups())
+@settings(max_examples=40)
+def test_interval_for_few_seeds_holds_the_estimate_and_is_mirrored(groups):
+    ours, others = groups
+    estimate, opposite = improvement_of_few_seeds(ours, others), improvement_of_few_seeds(others, ours)
+    assert estimate.value == probability_of_improvement(ours, others).value
+    assert 0.0 <= estimate.low <= estimate.value <= estimate.high <= 1.0
+    assert [estimate.low, estimate.high] == pytest.approx([1.0 - opposite.high, 1.0 - opposite.low])
+
+
+@pytest.mark.parametrize("n_seeds", [2, 3, 5, 10])
+@pytest.mark.parametrize("difference", [0.0, 1.0, 2.0])
+def test_interval_for_few_seeds_holds_the_truth_in_more_than_92_percent_of_studies(n_seeds, difference):
+    rng, n_studies = np.random.default_rng(0), 400
+    # With an effect of each training on all of eight volumes, and a rest.
+    ours, others = (
+        rng.standard_normal((n_studies, n_seeds, 1)) + 0.5 * rng.standard_normal((n_studies, n_seeds, 8))
+        for _ in range(2)
+    )
+    truth = norm.cdf(difference / np.sqrt(2 * 1.25))
+    found = [improvement_of_few_seeds(*each) for each in zip(ours + difference, others, strict=True)]
+    assert np.mean([each.low <= truth <= each.high for each in found]) > 0.92
 
 
 def stratified(scores, statistic, reps=300):
@@ -133,6 +159,7 @@ def test_one_seed_has_no_interval():
     assert np.isnan(band_over_seeds(one).lows).all()
     assert np.isnan(over_seeds(one, np.mean)[1:]).all()
     assert np.isnan(probability_of_improvement(one, one)[1:]).all()
+    assert np.isnan(improvement_of_few_seeds(one, one)[1:]).all()
 
 
 def test_scores_of_other_numbers_of_volumes_are_refused():

@@ -20,10 +20,17 @@ def drawn(rng, n_seeds, n_volumes, of_seeds, of_volumes, of_cells):
 
 
 @pytest.mark.parametrize("spread", [(1.0, 0.3, 1.0), (0.3, 1.0, 1.0), (0.7, 0.7, 0.5), (1.0, 0.0, 0.5)])
-@pytest.mark.parametrize(("n_seeds", "n_volumes"), [(3, 4), (3, 12), (5, 8), (10, 4), (10, 12)])
+@pytest.mark.parametrize(("n_seeds", "n_volumes"), [(3, 8), (3, 12), (5, 4), (5, 8), (10, 4), (10, 12)])
 def test_interval_holds_the_truth_in_92_to_98_percent_of_studies(n_seeds, n_volumes, spread):
     means, halves = crossed_mean(drawn(np.random.default_rng(0), n_seeds, n_volumes, *spread))
     assert 0.92 <= (np.abs(means) <= halves).mean() <= 0.98
+
+
+@pytest.mark.parametrize("spread", [(1.0, 0.4, 0.5), (0.3, 0.4, 0.5), (1.0, 3.0, 0.5), (1.0, 0.0, 0.5)])
+@pytest.mark.parametrize(("n_seeds", "n_volumes"), [(2, 4), (2, 8), (2, 12), (3, 4), (5, 2), (10, 2)])
+def test_interval_of_two_seeds_or_volumes_holds_the_truth_in_94_to_99_percent_of_studies(n_seeds, n_volumes, spread):
+    means, halves = crossed_mean(drawn(np.random.default_rng(0), n_seeds, n_volumes, *spread))
+    assert 0.94 <= (np.abs(means) <= halves).mean() <= 0.99
 
 
 def test_interval_of_one_seed_is_for_other_volumes_and_that_of_one_volume_for_other_seeds():
@@ -35,11 +42,12 @@ def test_interval_of_one_seed_is_for_other_volumes_and_that_of_one_volume_for_ot
     assert (of_volumes[0][0], of_volumes[1][0]) == pytest.approx((mean, half), rel=1e-4)
 
 
-def test_difference_of_equal_trainings_has_no_width_and_one_of_one_cell_no_interval():
+def test_difference_of_equal_trainings_has_no_width_and_that_of_one_seed_no_interval():
     assert paired_difference(np.full((3, 4), 2.0), np.full((3, 4), 1.5)) == (0.5, 0.5, 0.5)
-    value, low, high = paired_difference(np.array([[2.0]]), np.array([[1.5]]))
-    assert value == 0.5
-    assert np.isnan([low, high]).all()
+    for n_volumes in (1, 4):
+        value, low, high = paired_difference(np.arange(n_volumes)[np.newaxis] + 0.5, np.arange(n_volumes)[np.newaxis])
+        assert value == 0.5
+        assert np.isnan([low, high]).all()
 
 
 def test_trainings_of_other_seeds_or_volumes_are_refused():

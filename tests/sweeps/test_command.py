@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -164,6 +165,23 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     with pytest.raises(StudyError, match=r"validation_episodes was 2, is 3; study\.allow_config_changes=true"):
         run_study([*TINY, "study.n_trials=4", "training.validation_episodes=3"], launch=pytest.fail)
     assert len(trials_of(tmp_path)) == 3
+
+
+@pytest.mark.full
+def test_study_ends_by_itself_where_the_noise_between_seeds_is_larger_than_what_may_be_gained(tmp_path):
+    words = [*TINY, "study/terminator=noise", "study.terminator.min_trials=4", "study.seeds=[0,1]", "study.workers=1"]
+    words += ["study.objectives=[maximize mean_return]", "study.n_trials=30", "study.final_eval.top_k=0"]
+    ended = run(*words, cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    trials = trials_of(tmp_path)
+    assert 4 <= len(trials) < 30
+    told = re.search(r"the study has ended by itself: (after \d+ trials, .*); study.n_trials or study", ended.stdout)
+    gain, noise = re.search(r"gain at most (\S+) in mean_return, and .* between seeds is (\S+)$", told[1]).groups()
+    assert float(gain) < float(noise)
+    # The plan gives the same reason, and the same command makes no further trial.
+    assert " ".join(told[1].split()) in " ".join(run(*words, "--plan", cwd=tmp_path).stdout.split())
+    assert run(*words, cwd=tmp_path).returncode == 0
+    assert [trial.number for trial in trials_of(tmp_path)] == [trial.number for trial in trials]
 
 
 @pytest.mark.slow

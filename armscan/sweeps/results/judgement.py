@@ -12,7 +12,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.experiment.results import volume_notes
-from armscan.stats.aggregation import probability_of_improvement
+from armscan.stats.aggregation import improvement_of_few_seeds
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
 from armscan.sweeps.results.summary import OF_TEST, ConfigResult, final_results, final_table, scores_of
@@ -126,6 +126,8 @@ class Judgement:
         if not self.differences:
             return f"{name} was chosen; it has not been judged beside the control yet."
         first = self.differences[0]
+        if math.isnan(first.paired.low):
+            return f"{name} was chosen; one seed does not show whether it is better than the default configuration."
         if first.verdict:
             return f"{name} is {first.verdict} than the default configuration: {title_of(first.metric)}."
         return (
@@ -213,5 +215,5 @@ def _differences(
         ours, theirs = scores[: len(chosen)], scores[len(chosen) :]
         is_higher_better = objectives[name] == MAXIMIZE if name in objectives else is_rate(name)
         sign = 1.0 if is_higher_better else -1.0
-        probability = probability_of_improvement(sign * ours, sign * theirs)
+        probability = improvement_of_few_seeds(sign * ours, sign * theirs)
         yield Difference(name, is_higher_better, paired_difference(ours, theirs), probability)

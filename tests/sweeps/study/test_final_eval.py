@@ -213,6 +213,15 @@ def test_note_on_a_study_says_which_settings_how_sure_and_what_helps(storage_uri
     assert rest[-1].startswith("Note: 3 test volumes, fewer than 8")
 
 
+def test_one_judge_seed_gives_a_difference_without_interval_and_the_result_says_so(storage_uri):
+    final = run(storage_uri, judge_seeds=1)
+    said, *_, table, _, _ = result_note(final).split("\n\n")
+    assert said == "**Trial 1 was chosen; one seed does not show whether it is better than the default configuration.**"
+    first = table.splitlines()[2].split("|")
+    assert float(first[2]) < 0.0
+    assert first[3].strip() == first[5].strip() == ""
+
+
 def test_note_on_a_study_that_has_no_result_is_empty(storage_uri):
     assert result_note(None) == result_note(opened(storage_uri)[0]) == ""
 
