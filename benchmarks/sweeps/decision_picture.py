@@ -20,7 +20,7 @@ from armscan.stats.paired import paired_difference
 from armscan.sweeps.scheduling.race import Race, race
 
 PICTURE = Path(__file__).parents[2] / "docs" / "images" / "how_a_study_decides.svg"
-N_TRIALS, N_VALIDATION, N_TEST, MAX_SEEDS, N_JUDGING = 30, 8, 12, 6, 5
+N_TRIALS, N_VALIDATION, N_TEST, MAX_SEEDS, N_JUDGING = 30, 8, 12, 8, 5
 CONTROL, CONTROL_STEPS = -1, 2.6
 # Of trainings, of volumes, and of the luck of a single look, in steps.
 OF_SEEDS, OF_VOLUMES, LUCK = 0.35, 0.4, 0.5
@@ -41,7 +41,7 @@ def main() -> None:
         return np.maximum(1.0, steps[number] + of_seeds + OF_VOLUMES * rng.standard_normal((n_seeds, n_volumes)))
 
     scores = {number: dict(enumerate(-trained(number, MAX_SEEDS, N_VALIDATION).mean(axis=1))) for number in steps}
-    raced = race(scores, range(MAX_SEEDS), min_seeds=2)
+    raced = race(scores, range(MAX_SEEDS), min_seeds=3)
     assert raced.chosen is not None
     ours, theirs = (trained(number, N_JUDGING, N_TEST) for number in (raced.chosen, CONTROL))
     mpl.rcParams |= {

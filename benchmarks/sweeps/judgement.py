@@ -25,7 +25,7 @@ from armscan.stats.aggregation import band_over_seeds, improvement_of_few_seeds
 from armscan.stats.paired import crossed_mean
 from armscan.sweeps.scheduling.race import race
 
-N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MAX_SEEDS = 4, 8, 2, 6
+N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MAX_SEEDS = 4, 8, 3, 8
 # Standard deviations of the effects of trainings, of volumes for each configuration, and of the rest.
 OF_SEEDS, OF_VOLUMES, REST = 1.0, 0.4, 0.5
 # Of the difference of two trainings on a volume.

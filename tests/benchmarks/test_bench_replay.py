@@ -3,9 +3,10 @@ import pytest
 
 from benchmarks.sweeps.bench.design import places_of, sobol, values_at
 from benchmarks.sweeps.bench.importance import keys_of
-from benchmarks.sweeps.bench.races import FIXED, Choices, candidates_of, choices_of, compare, needed_for
+from benchmarks.sweeps.bench.races import N_SEEDS, Choices, candidates_of, choices_of, compare, needed_for
 from benchmarks.sweeps.bench.ranking import REFERENCE, ranked, studies_of
 from benchmarks.sweeps.bench.replay import Rule, choose, search
+from benchmarks.sweeps.bench.seed_rules import fixed
 from benchmarks.sweeps.bench.seeds import needed_seeds, power_of
 from benchmarks.sweeps.bench.surrogate import Surrogate, fit_of
 from tests.benchmarks.conftest import synthetic_curves, true_log
@@ -81,10 +82,10 @@ def test_a_sampler_that_learns_beats_chance_on_a_smooth_function(surrogate):
 
 def test_a_choice_with_equal_seeds_drops_nobody_and_a_race_does():
     scores = np.array([[-9.0], [-1.0], [-8.0]]) + np.random.default_rng(0).normal(0.0, 0.1, (3, 10))
-    fixed = choose(scores, min_seeds=5, max_seeds=5)
+    all_alike = choose(scores, min_seeds=5, max_seeds=5)
     race = choose(scores, min_seeds=2, max_seeds=10)
-    assert fixed.place == race.place == 1
-    assert fixed.n_trainings == 15
+    assert all_alike.place == race.place == 1
+    assert all_alike.n_trainings == 15
     assert race.n_trainings == 6
 
 
@@ -99,15 +100,15 @@ def test_trainings_that_a_regret_needs_are_interpolated():
 
 def test_a_race_that_chooses_as_well_with_half_the_trainings_has_a_share_of_half():
     regret = np.random.default_rng(0).random(50)
-    fixed = [Choices(regret / n, np.full(50, 3.0 * n)) for n in FIXED]
-    (race,) = compare(fixed, {(2, 6): Choices(regret / 4, np.full(50, 6.0))})
+    of_fixed = [Choices(regret / n, np.full(50, 3.0 * n)) for n in N_SEEDS]
+    (race,) = compare(of_fixed, {"a": Choices(regret / 4, np.full(50, 6.0))})
     assert race.share == pytest.approx((0.5, 0.5, 0.5))
     assert race.n_fixed == pytest.approx(12.0)
 
 
 def test_more_seeds_choose_better(surrogate):
     candidates = candidates_of(surrogate, "sac_y", Rule("random", "none"), n_studies=20, n_trainings=10, top_k=3)
-    few, many = choices_of(candidates, [(1, 1), (12, 12)]).values()
+    few, many = choices_of(candidates, {"few": fixed(1), "many": fixed(12)}).values()
     assert many.regret.mean() < few.regret.mean()
     assert many.n_trainings == pytest.approx(np.full(20, 36.0))
 

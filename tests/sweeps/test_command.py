@@ -306,7 +306,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
         ),
         (
             ["-m", "sweep=sac_y", "study.final_eval.max_seeds=1"],
-            "study.final_eval.min_seeds is 2, but it must be at most study.final_eval.max_seeds, which is 1",
+            "study.final_eval.min_seeds is 3, but it must be at most study.final_eval.max_seeds, which is 1",
         ),
         (
             ["-m", "sweep=sac_y", "study.final_eval.judge_seeds=0"],

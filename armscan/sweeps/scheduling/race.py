@@ -17,7 +17,7 @@ from scipy.special import stdtrit
 from armscan.stats.bootstrap import LEVEL, Estimate
 
 # Confidence, one-sided, at which a configuration that is behind the leader is dropped.
-DROP_LEVEL = 0.8
+DROP_LEVEL = 0.9
 # Degrees of freedom that the variance of all configurations has in that of each: two or three seeds say little of it.
 PRIOR_DF = 4.0
 
@@ -82,7 +82,7 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, drop_level: fl
             too.
         seeds: All seeds of the race, in the order in which they are used.
         min_seeds: Number of seeds that all configurations get, from 1 to the number of seeds.
-        drop_level: Confidence at which a configuration is dropped, from 0.5 to below 1. Default: 0.8.
+        drop_level: Confidence at which a configuration is dropped, from 0.5 to below 1. Default: 0.9.
     """
     left, standings = list(scores), {configuration: Standing() for configuration in scores}
     for n_seeds in range(min_seeds, len(seeds) + 1):

@@ -15,7 +15,8 @@ from benchmarks.sweeps.bench.importance import Key
 from benchmarks.sweeps.bench.races import Choices
 from benchmarks.sweeps.bench.ranking import PRUNERS, curve_of
 
-Races = tuple[Sequence[Choices], Mapping[tuple[int, int], Choices]]
+MARKERS = "os^Dv<>pPX*hHd"
+Races = tuple[Sequence[Choices], Mapping[str, Choices]]
 
 
 def draw(ranks: pd.DataFrame, races: Mapping[int, Races], keys: Mapping[str, Key], path: Path, *, title: str) -> None:
@@ -33,7 +34,7 @@ def draw(ranks: pd.DataFrame, races: Mapping[int, Races], keys: Mapping[str, Key
     left, middle, right = figure.subplots(1, 3)
     _draw_ranks(left, ranks)
     top_k = list(races)[-1]
-    _draw_races(middle, *races[top_k], title=f"choosing among {top_k} candidates")
+    _draw_races(middle, *races[top_k], title=f"choosing among {top_k} candidates and the control")
     _draw_keys(right, keys)
     figure.suptitle(title)
     figure.savefig(path, dpi=110)
@@ -56,15 +57,15 @@ def _draw_ranks(axes: Axes, ranks: pd.DataFrame) -> None:
     axes.legend()
 
 
-def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[tuple[int, int], Choices], *, title: str) -> None:
+def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[str, Choices], *, title: str) -> None:
     curve = curve_of([each.regret for each in fixed])
     n_trainings = [each.n_trainings.mean() for each in fixed]
     axes.plot(n_trainings, curve[:, 0], marker=".", color="tab:grey", label="the same seeds for all")
     axes.fill_between(n_trainings, curve[:, 1], curve[:, 2], color="tab:grey", alpha=0.2)
-    for ((low, high), race), marker in zip(races.items(), "os^D", strict=True):
+    for (name, race), marker in zip(races.items(), MARKERS, strict=True):
         ((value, *ends),) = curve_of([race.regret])
         lengths = [[abs(end - value)] for end in ends]
-        look = {"fmt": marker, "capsize": 2, "label": f"a race, {low} to {high} seeds"}
+        look = {"fmt": marker, "capsize": 2, "label": name}
         axes.errorbar(race.n_trainings.mean(), value, yerr=lengths, **look)
     axes.set_xscale("log")
     axes.set_xlabel("trainings of the choice")
@@ -72,7 +73,7 @@ def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[tuple[int, 
     axes.set_ylim(bottom=0)
     axes.set_title(title)
     axes.grid(alpha=0.3, which="both")
-    axes.legend()
+    axes.legend(fontsize=7)
 
 
 def _draw_keys(axes: Axes, keys: Mapping[str, Key]) -> None:

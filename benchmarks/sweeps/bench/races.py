@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from armscan.stats.bootstrap import Estimate
 from armscan.volumes.plane import FloatArray
-from benchmarks.sweeps.bench.replay import Rule, choose, scores_of, search
+from benchmarks.sweeps.bench.replay import Rule, scores_of, search
+from benchmarks.sweeps.bench.seed_rules import MOST_SEEDS, SeedRule, allocation, fixed, friedman_race, halving, t_race
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
-# Seeds of all candidates, and the fewest and most of a race; the first race is armscan's default.
-FIXED = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24)
-RACES = ((2, 6), (2, 16), (5, 10), (5, 16))
-N_REPEATS, N_RESAMPLES = 10, 2000
+N_SEEDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24)
+FIXED: Mapping[str, SeedRule] = {f"{n_seeds} seeds each": fixed(n_seeds) for n_seeds in N_SEEDS}
+# Fewest and most seeds, and the confidence at which a configuration is dropped; the first is armscan's default.
+T_RACES = ((3, 8, 0.9), (2, 6, 0.8), (2, 6, 0.9), (3, 10, 0.9), (5, 10, 0.8), (5, 10, 0.9), (4, 16, 0.95))
+RACES: Mapping[str, SeedRule] = {
+    **{f"t test at {level:.0%}, {low} to {high} seeds": t_race(low, high, level) for low, high, level in T_RACES},
+    **{f"Friedman's test, {low} to 16 seeds": friedman_race(low, 16) for low in (3, 5)},
+    **{f"halving, from {low} seeds": halving(low) for low in (2, 3, 5)},
+    **{
+        f"optimal allocation, {low} seeds, then {mean:g} on average": allocation(low, mean)
+        for low, mean in ((3, 5), (4, 8))
+    },
+}
+N_REPEATS, N_RESAMPLES = 20, 2000
 
 
 class Choices(NamedTuple):
@@ -34,14 +45,14 @@ class Comparison(NamedTuple):
     """A race beside fixed seeds.
 
     Args:
-        seeds: Fewest and most seeds of the race.
+        rule: Name of its rule.
         regret: Its mean regret.
         n_trainings: Its mean number of trainings.
         n_fixed: Trainings that fixed seeds need for the same regret; infinite where none of `FIXED` reaches it.
         share: Share of those that the race needs.
     """
 
-    seeds: tuple[int, int]
+    rule: str
     regret: Estimate
     n_trainings: float
     n_fixed: float
@@ -56,32 +67,35 @@ def candidates_of(
     return [[each.config for each in of_study.candidates[:top_k]] for of_study in found]
 
 
-def choices_of(
-    candidates: Sequence[Sequence[SimulatedConfig]], seeds: Iterable[tuple[int, int]]
-) -> dict[tuple[int, int], Choices]:
-    """Return what races choose in each study, all of them of the same simulated trainings.
+def choices_of(candidates: Sequence[Sequence[SimulatedConfig]], rules: Mapping[str, SeedRule]) -> dict[str, Choices]:
+    """Return what rules choose in each study, all of them of the same simulated trainings.
 
     Args:
-        candidates: Configurations of each study.
-        seeds: Fewest and most seeds of each race; where these are equal, nobody is dropped.
+        candidates: Configurations of each study, as many in each.
+        rules: The rules by their names.
     """
-    seeds = tuple(seeds)
-    found = np.empty((len(seeds), 2, len(candidates), N_REPEATS))
-    for number, of_study in enumerate(candidates):
-        truths = [each.truth for each in of_study]
-        for repeat in range(N_REPEATS):
-            scores = scores_of(of_study, max(high for _, high in seeds), np.random.default_rng([number, repeat]))
-            for place, (low, high) in enumerate(seeds):
-                chosen = choose(scores, min_seeds=low, max_seeds=high)
-                found[place, :, number, repeat] = truths[chosen.place] - min(truths), chosen.n_trainings
-    return {each: Choices(*found[place].mean(axis=-1)) for place, each in enumerate(seeds)}
+    truths = np.array([[each.truth for each in of_study] for of_study in candidates])
+    regrets = np.repeat(truths - truths.min(axis=1, keepdims=True), N_REPEATS, axis=0)
+    scores = np.array(
+        [
+            scores_of(of_study, MOST_SEEDS, np.random.default_rng([number, repeat]))
+            for number, of_study in enumerate(candidates)
+            for repeat in range(N_REPEATS)
+        ]
+    )
+    found = {}
+    for name, rule in rules.items():
+        chosen = rule(scores)
+        of_choices = np.take_along_axis(regrets, chosen.place[:, np.newaxis], axis=1)[:, 0], chosen.n_trainings
+        found[name] = Choices(*(each.reshape(len(candidates), N_REPEATS).mean(axis=1) for each in of_choices))
+    return found
 
 
-def compare(fixed: Sequence[Choices], races: dict[tuple[int, int], Choices]) -> list[Comparison]:
+def compare(fixed: Sequence[Choices], races: Mapping[str, Choices]) -> list[Comparison]:
     """Return each race beside the fixed seeds that choose as well, with intervals that draw studies.
 
     Args:
-        fixed: Choices with the numbers of seeds of `FIXED`, fewest first.
+        fixed: Choices of the rules of `FIXED`, fewest seeds first.
         races: Choices of each race, of the same studies.
     """
     n_studies = len(fixed[0].regret)
@@ -90,13 +104,11 @@ def compare(fixed: Sequence[Choices], races: dict[tuple[int, int], Choices]) -> 
     of_fixed = np.array([each.regret[drawn].mean(axis=1) for each in fixed]).T
     n_of_fixed = np.array([each.n_trainings.mean() for each in fixed])
     compared = []
-    for seeds, race in races.items():
+    for rule, race in races.items():
         regrets, n_trainings = race.regret[drawn].mean(axis=1), race.n_trainings[drawn].mean(axis=1)
         needed = np.array([needed_for(*pair, n_of_fixed) for pair in zip(regrets, of_fixed, strict=True)])
         share = n_trainings / needed
-        compared.append(
-            Comparison(seeds, _estimate(regrets), float(n_trainings[0]), float(needed[0]), _estimate(share))
-        )
+        compared.append(Comparison(rule, _estimate(regrets), float(n_trainings[0]), float(needed[0]), _estimate(share)))
     return compared
 
 

@@ -21,7 +21,7 @@ SLOW, FEWEST_STUDIES = ("gp",), 10
 REFERENCE = Rule("random", "none")
 # Candidates of the final evaluation, and the fewest and most seeds of each.
 TOP_K = 3
-FINALS = {"fixed": (5, 5), "race": (2, 6)}
+FINALS = {"fixed": (5, 5), "race": (3, 8)}
 
 
 def rules() -> Iterator[Rule]:

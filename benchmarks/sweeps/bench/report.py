@@ -10,7 +10,7 @@ import pandas as pd
 
 from benchmarks.sweeps.bench.importance import Key, keys_of
 from benchmarks.sweeps.bench.picture import draw
-from benchmarks.sweeps.bench.races import FIXED, RACES, Choices, Comparison, candidates_of, choices_of, compare
+from benchmarks.sweeps.bench.races import FIXED, N_SEEDS, RACES, Choices, Comparison, candidates_of, choices_of, compare
 from benchmarks.sweeps.bench.ranking import ranked, rules, studies_of
 from benchmarks.sweeps.bench.replay import Rule
 from benchmarks.sweeps.bench.seeds import chance_of_good, needed_seeds, power_of
@@ -19,7 +19,7 @@ from benchmarks.sweeps.bench.table import Curves
 
 # What a study of armscan does by default.
 DEFAULT = Rule("tpe", "median")
-# Candidates of the races: those of the default study, and more.
+# Candidates of the races, beside the control: those of the default study, and more.
 TOP_KS = (3, 8)
 
 
@@ -41,12 +41,11 @@ def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, pi
     keys = keys_of(curves, n_resamples)
     _print_keys(keys)
     found = candidates_of(surrogate, sweep, DEFAULT, n_studies=n_studies, n_trainings=n_trainings, top_k=max(TOP_KS))
-    races = {}
+    control, races = surrogate.config(curves.configs[0]), {}
     for top_k in TOP_KS:
-        seeds = [*((n_seeds, n_seeds) for n_seeds in FIXED), *RACES]
-        chosen = choices_of([of_study[:top_k] for of_study in found], seeds)
-        fixed = [chosen[n_seeds, n_seeds] for n_seeds in FIXED]
-        raced = {each: chosen[each] for each in RACES}
+        candidates = [[control, *of_study[:top_k]] for of_study in found]
+        fixed = list(choices_of(candidates, FIXED).values())
+        raced = choices_of(candidates, RACES)
         races[top_k] = fixed, raced
         _print_races(top_k, fixed, compare(fixed, raced))
     studies = studies_of(surrogate, sweep, rules(), n_studies=n_studies, n_trainings=n_trainings)
@@ -112,12 +111,12 @@ def _print_keys(keys: dict[str, Key]) -> None:
 def _print_races(top_k: int, fixed: Sequence[Choices], compared: Sequence[Comparison]) -> None:
     rows = [
         (n_seeds, f"{each.n_trainings.mean():.0f}", f"{each.regret.mean():.4f}")
-        for n_seeds, each in zip(FIXED, fixed, strict=True)
+        for n_seeds, each in zip(N_SEEDS, fixed, strict=True)
     ]
-    print(f"\n{top_k} candidates\n\n{markdown(['seeds of each', 'trainings', 'regret'], rows)}")
+    print(f"\n{top_k} candidates and the control\n\n{markdown(['seeds of each', 'trainings', 'regret'], rows)}")
     rows = [
         (
-            f"{each.seeds[0]} to {each.seeds[1]}",
+            each.rule,
             f"{each.n_trainings:.1f}",
             with_interval(each.regret, ".4f"),
             f"{each.n_fixed:.1f}",
@@ -125,7 +124,7 @@ def _print_races(top_k: int, fixed: Sequence[Choices], compared: Sequence[Compar
         )
         for each in compared
     ]
-    head = ["seeds of a race", "trainings", "regret", "fixed seeds need", "share"]
+    head = ["rule", "trainings", "regret", "fixed seeds need", "share"]
     print(f"\n{markdown(head, rows)}", flush=True)
 
 

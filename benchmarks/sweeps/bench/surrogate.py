@@ -151,9 +151,14 @@ class SimulatedConfig:
 
     def train(self, rng: np.random.Generator) -> Training:
         """Return a training with a fresh seed."""
-        drawn = int(np.searchsorted(self.shares.cumsum(), rng.random() * self.shares.sum(), side="right"))
-        steps = np.exp((self.mean + self.surrogate.chance[drawn]).clip(*self.surrogate.bounds))
+        (steps,) = self.draw(rng, 1)
         return Training(steps[:-1], float(steps[-1]))
+
+    def draw(self, rng: np.random.Generator, n_seeds: int) -> FloatArray:
+        """Return the epochs and the test of trainings with fresh seeds, shape (seeds, epochs + 1)."""
+        places = rng.random(n_seeds) * self.shares.sum()
+        drawn = np.searchsorted(self.shares.cumsum(), places, side="right")
+        return np.asarray(np.exp((self.mean + self.surrogate.chance[drawn]).clip(*self.surrogate.bounds)))
 
     @property
     def truth(self) -> float:

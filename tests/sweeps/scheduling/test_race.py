@@ -86,7 +86,7 @@ def test_unsteady_configuration_loses_against_a_steady_one_that_is_hardly_worse(
 def test_race_needs_fewer_trainings_than_the_same_seeds_for_all_at_no_more_regret(n_configurations):
     rng = np.random.default_rng(0)
     n_trained, regret, regret_of_all = 0, 0.0, 0.0
-    n_studies, n_fixed = 300, 5
+    n_studies, n_fixed = 300, 6
     for _ in range(n_studies):
         true = 0.7 * rng.standard_normal(n_configurations)
         table = true[:, None] + 0.6 * rng.standard_normal((n_configurations, 10))

@@ -1,0 +1,159 @@
+"""Rules of seeds: how many trainings each configuration gets before one is chosen, for many choices at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri, stdtrit
+from scipy.stats import rankdata
+
+from armscan.stats.bootstrap import LEVEL
+from armscan.sweeps.scheduling.race import DROP_LEVEL, PRIOR_DF
+from armscan.volumes.plane import FloatArray
+
+# Seeds that are simulated for each configuration: no rule takes more.
+MOST_SEEDS = 24
+# Confidence of Friedman's test, as irace has it.
+FRIEDMAN_LEVEL = 0.95
+Mask = NDArray[np.bool_]
+
+
+class Chosen(NamedTuple):
+    """Outcome of a rule.
+
+    Args:
+        place: Place of each choice's configuration, shape (choices,).
+        n_trainings: Trainings of each choice, shape (choices,).
+    """
+
+    place: NDArray[np.intp]
+    n_trainings: NDArray[np.intp]
+
+
+# Scores of shape (choices, configurations, seeds), greater is better.
+SeedRule = Callable[[FloatArray], Chosen]
+# Scores of the seeds so far and the configurations that are in, to those that stay in.
+Drop = Callable[[FloatArray, Mask], Mask]
+
+
+def fixed(n_seeds: int) -> SeedRule:
+    """Return the rule that gives the same number of seeds to all."""
+    return partial(_raced, rounds=[n_seeds], drop=lambda _, is_in: is_in)
+
+
+def t_race(min_seeds: int, max_seeds: int, level: float = DROP_LEVEL) -> SeedRule:
+    """Return the race of armscan, see `armscan.sweeps.scheduling.race.race`; the arguments are its own."""
+    return partial(_raced, rounds=range(min_seeds, max_seeds + 1), drop=partial(_behind_by_t, level=level))
+
+
+def friedman_race(min_seeds: int, max_seeds: int) -> SeedRule:
+    """Return the race of irace (López-Ibáñez et al. 2016): Friedman's test, then Conover's (1999) against the best."""
+    return partial(_raced, rounds=range(min_seeds, max_seeds + 1), drop=_behind_by_ranks)
+
+
+def halving(min_seeds: int) -> SeedRule:
+    """Return successive halving over seeds (Karnin et al. 2013): the better half gets twice as many, until one is left.
+
+    Args:
+        min_seeds: Seeds of all configurations.
+    """
+    rounds = [n for power in range(MOST_SEEDS) if (n := min_seeds * 2**power) < MOST_SEEDS]
+    return partial(_raced, rounds=[*rounds, MOST_SEEDS], drop=_worse_half)
+
+
+def allocation(min_seeds: int, mean_seeds: float) -> SeedRule:
+    """Return the optimal allocation of a computing budget (Chen et al. 2000): most seeds to those close to the best.
+
+    Args:
+        min_seeds: Seeds of all configurations.
+        mean_seeds: Seeds of a configuration on average, which are the budget.
+    """
+
+    def choose(scores: FloatArray) -> Chosen:
+        n_choices, n_configs, n_most = scores.shape
+        n_seeds, every = np.full((n_choices, n_configs), min_seeds), np.arange(n_choices)
+        for _ in range(round(mean_seeds * n_configs) - min_seeds * n_configs):
+            means, own = _moments(scores, n_seeds)
+            df = PRIOR_DF + n_seeds - 1
+            variances = (PRIOR_DF * own.mean(axis=1, keepdims=True) + (n_seeds - 1) * own) / df + 1e-12
+            best = means.argmax(axis=1)
+            shares = variances / np.maximum(means[every, best][:, np.newaxis] - means, 1e-6) ** 2
+            shares[every, best] = 0.0
+            of_best = variances[every, best] * (shares**2 / variances).sum(axis=1)
+            shares[every, best] = np.sqrt(of_best)
+            wanted = shares / shares.sum(axis=1, keepdims=True) * (n_seeds.sum(axis=1, keepdims=True) + 1) - n_seeds
+            n_seeds[every, np.where(n_seeds < n_most, wanted, -np.inf).argmax(axis=1)] += 1
+        return Chosen(_moments(scores, n_seeds)[0].argmax(axis=1), n_seeds.sum(axis=1))
+
+    return choose
+
+
+def _raced(scores: FloatArray, *, rounds: Sequence[int], drop: Drop) -> Chosen:
+    """Run rounds with so many seeds until one configuration is left; that with the highest lower end is chosen."""
+    is_in, n_seeds = np.ones(scores.shape[:2], bool), np.zeros(scores.shape[:2], np.intp)
+    lower = np.zeros(scores.shape[:2])
+    for n_now in rounds:
+        runs = is_in & (is_in.sum(axis=1, keepdims=True) > 1)
+        if not runs.any():
+            break
+        n_seeds[runs] = n_now
+        seen = scores[..., :n_now]
+        means, variances = _standing(seen, is_in)
+        low = means - stdtrit(PRIOR_DF + n_now - 1, (1 + LEVEL) / 2) * np.sqrt(variances)
+        lower = np.where(runs, low, lower)
+        is_in = np.where(runs.any(axis=1, keepdims=True), drop(seen, is_in), is_in)
+    return Chosen(np.where(is_in, lower, -np.inf).argmax(axis=1), n_seeds.sum(axis=1))
+
+
+def _standing(seen: FloatArray, is_in: Mask) -> tuple[FloatArray, FloatArray]:
+    """Return the means of configurations and the variances of these, shrunk as in a race of armscan."""
+    n_seeds = seen.shape[-1]
+    means = seen.mean(axis=-1)
+    if n_seeds == 1:
+        return means, np.zeros_like(means)
+    own = seen.var(axis=-1, ddof=1)
+    pooled = np.where(is_in, own, 0.0).sum(axis=1, keepdims=True) / is_in.sum(axis=1, keepdims=True)
+    return means, (PRIOR_DF * pooled + (n_seeds - 1) * own) / (PRIOR_DF + n_seeds - 1) / n_seeds
+
+
+def _behind_by_t(seen: FloatArray, is_in: Mask, *, level: float) -> Mask:
+    n_seeds = seen.shape[-1]
+    means, variances = _standing(seen, is_in)
+    leader = np.where(is_in, means, -np.inf).argmax(axis=1)[:, np.newaxis]
+    behind = np.take_along_axis(means, leader, axis=1) - means
+    spread = np.sqrt(variances + np.take_along_axis(variances, leader, axis=1))
+    return is_in & ((behind <= stdtrit(PRIOR_DF + n_seeds - 1, level) * spread) | (n_seeds == 1))
+
+
+def _behind_by_ranks(seen: FloatArray, is_in: Mask) -> Mask:
+    n_seeds, n_left = seen.shape[-1], is_in.sum(axis=1, keepdims=True)
+    # The best has rank 1; those that are out come last, so that they change no other rank.
+    ranks = np.where(is_in[..., np.newaxis], rankdata(np.where(is_in[..., np.newaxis], -seen, np.inf), axis=1), 0.0)
+    sums, squares = ranks.sum(axis=-1), (ranks**2).sum(axis=(1, 2))[:, np.newaxis]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        of_sums = np.where(is_in, (sums - n_seeds * (n_left + 1) / 2) ** 2, 0.0).sum(axis=1, keepdims=True)
+        statistic = (n_left - 1) * of_sums / (squares - n_seeds * n_left * (n_left + 1) ** 2 / 4)
+        df = (n_seeds - 1) * (n_left - 1)
+        rest = np.maximum(n_seeds * squares - (sums**2).sum(axis=1, keepdims=True), 0.0)
+        allowed = stdtrit(df, (1 + FRIEDMAN_LEVEL) / 2) * np.sqrt(2 * rest / df)
+        differ = statistic > chdtri(n_left - 1, 1 - FRIEDMAN_LEVEL)
+    best = np.where(is_in, sums, np.inf).min(axis=1, keepdims=True)
+    return is_in & (~differ | (sums - best <= allowed))
+
+
+def _worse_half(seen: FloatArray, is_in: Mask) -> Mask:
+    means = np.where(is_in, seen.mean(axis=-1), -np.inf)
+    n_kept = np.ceil(is_in.sum(axis=1, keepdims=True) / 2)
+    return is_in & (rankdata(-means, method="ordinal", axis=1) <= n_kept)
+
+
+def _moments(scores: FloatArray, n_seeds: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    """Return means and variances of configurations with other numbers of seeds each."""
+    is_seen = np.arange(scores.shape[-1]) < n_seeds[..., np.newaxis]
+    means = np.where(is_seen, scores, 0.0).sum(axis=-1) / n_seeds
+    squares = np.where(is_seen, (scores - means[..., np.newaxis]) ** 2, 0.0).sum(axis=-1)
+    return means, squares / np.maximum(1, n_seeds - 1)

@@ -1,0 +1,57 @@
+"""Rules of seeds for many choices at once: those of armscan are its race, the others are what they are named after."""
+
+import numpy as np
+import pytest
+
+from benchmarks.sweeps.bench.replay import choose
+from benchmarks.sweeps.bench.seed_rules import MOST_SEEDS, allocation, fixed, friedman_race, halving, t_race
+
+
+def scores_of(means, n_choices=50, spread=1.0):
+    """Return scores of configurations with these means, shape (choices, configurations, seeds)."""
+    noise = np.random.default_rng(0).standard_normal((n_choices, len(means), MOST_SEEDS))
+    return np.array(means)[:, np.newaxis] + spread * noise
+
+
+@pytest.mark.parametrize(("min_seeds", "max_seeds"), [(1, 5), (2, 6), (5, 5), (3, 8)])
+def test_race_by_t_tests_is_that_of_armscan(min_seeds, max_seeds):
+    scores = scores_of([0.0, 0.3, 0.6, -2.0])
+    found = t_race(min_seeds, max_seeds)(scores)
+    assert list(zip(found.place, found.n_trainings, strict=True)) == [
+        (each.place, each.n_trainings)
+        for each in (choose(one, min_seeds=min_seeds, max_seeds=max_seeds) for one in scores)
+    ]
+
+
+def test_same_number_of_seeds_drops_nobody():
+    found = fixed(4)(scores_of([0.0, 9.0, 0.0]))
+    assert set(found.n_trainings) == {12}
+    assert set(found.place) == {1}
+
+
+def test_halving_gives_the_better_half_twice_as_many_seeds():
+    found = halving(3)(scores_of([0.0, 20.0, 10.0, 0.0, 0.0]))
+    # Of five three go on, then two, then one.
+    assert set(found.n_trainings) == {5 * 3 + 3 * 3 + 2 * 6}
+    assert set(found.place) == {1}
+
+
+def test_friedmans_test_drops_what_is_always_behind_and_nothing_without_a_difference():
+    apart, alike = (friedman_race(5, 12)(scores_of(means)) for means in ([0.0, 9.0, 0.0], [0.0, 0.0, 0.0]))
+    assert set(apart.place) == {1}
+    assert apart.n_trainings.max() < 3 * 12
+    assert np.median(alike.n_trainings) == 3 * 12
+
+
+def test_ranks_of_equal_scores_drop_nobody():
+    assert set(friedman_race(3, 5)(np.zeros((2, 3, MOST_SEEDS))).n_trainings) == {15}
+
+
+def test_budget_is_allocated_to_those_close_to_the_best():
+    scores = scores_of([0.0, 0.2, -9.0])
+    found = allocation(2, 6)(scores)
+    assert set(found.n_trainings) == {18}
+    close = (found.place < 2).mean()
+    assert close == 1.0
+    # It tells the two better apart than the same seeds for all do.
+    assert (found.place == 1).mean() > (fixed(6)(scores).place == 1).mean() - 0.1
