@@ -6,6 +6,9 @@ Each message is one line that names the value received, what is allowed, and whe
 from __future__ import annotations
 
 import re
+import shutil
+import sys
+import textwrap
 from collections.abc import Iterable
 
 # What steers a terminal, turns the direction of a text, or is only half a character.
@@ -18,6 +21,15 @@ class ArmscanError(Exception):
     def __str__(self) -> str:
         """Return the message in one line, even if a received value, such as an array, has several."""
         return printable(" ".join(line.strip() for line in super().__str__().splitlines()))
+
+
+def print_error(message: str) -> None:
+    """Print a mistake as an error; its lines break between words on a terminal, and nowhere in a file or pipe."""
+    line = f"error: {message}"
+    if sys.stderr.isatty():
+        width = shutil.get_terminal_size().columns
+        line = textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
+    print(line, file=sys.stderr)
 
 
 class InvalidValueError(ArmscanError, ValueError):

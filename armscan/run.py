@@ -26,7 +26,7 @@ from armscan.config.credentials import check_words
 from armscan.config.defaults import MULTIRUN, PLAN, RESUME
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
-from armscan.errors import is_interruption
+from armscan.errors import is_interruption, print_error
 from armscan.experiment.job import INTERRUPTED, Invocation, remove_if_untracked
 from armscan.launch.folds_grid import with_folds
 from armscan.launch.grid_plan import check_grid, print_grid_plan
@@ -75,7 +75,7 @@ def raise_or_exit(error: BaseException) -> NoReturn:
     line = one_line_message(error)
     if line is None or os.environ.get(WANTS_TRACEBACKS):
         raise error
-    print(f"error: {line}", file=sys.stderr)
+    print_error(line)
     raise SystemExit(2)
 
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba.core.event import Event, Listener, install_listener
 from threadpoolctl import ThreadpoolController
 from tianshou.algorithm.modelfree import sac
 from tianshou.data import ReplayBuffer
@@ -23,10 +22,11 @@ from armscan.agents import sac_kernels as kernels
 from armscan.agents.adam_vectors import AdamVectors, flattened
 from armscan.agents.compute import Compute
 from armscan.agents.replay import Replay
-from armscan.utils.log import log
+from armscan.utils.compilation import compilation_told
 
 # Gradient steps of one call: enough that calling costs little, few enough that an interrupt is heeded soon.
 N_AT_ONCE = 16
+COMPILING = "compiling SAC's update for this machine, which takes ten seconds; later runs find it in the cache"
 
 
 @dataclass(kw_only=True)
@@ -85,7 +85,7 @@ class CompiledSAC(sac.SAC[Any]):
         transitions = kernels.Transitions(buffer.obs, buffer.obs_next, buffer.act, buffer.rew, buffer.terminated)
         losses = np.empty((n_updates, 5))
         agent, (actor_layers, critic_layers) = self._agent(), self._layers_for(sample_size)
-        with _blas().limit(limits=1), install_listener("numba:compile", _CompilationNote()):
+        with _blas().limit(limits=1), compilation_told(COMPILING, lambda dispatcher: dispatcher is kernels.update):
             for start in range(0, n_updates, N_AT_ONCE):
                 part = losses[start : start + N_AT_ONCE]
                 indices = np.stack([buffer.sample_indices(sample_size) for _ in part])
@@ -173,17 +173,6 @@ def _blas() -> ThreadpoolController:
     # Its BLAS is the one that numba calls.
     importlib.import_module("scipy.linalg.cython_blas")
     return ThreadpoolController().select(user_api="blas")
-
-
-class _CompilationNote(Listener):
-    """Tells when the update begins to be compiled; once it has been, numba finds it in its cache."""
-
-    def on_start(self, event: Event) -> None:
-        if event.data["dispatcher"] is kernels.update:
-            log("compiling SAC's update for this machine, which takes ten seconds; later runs find it in the cache")
-
-    def on_end(self, event: Event) -> None:
-        pass
 
 
 def _is_plain(optimiser: Any) -> bool:

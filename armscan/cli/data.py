@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,8 +11,8 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from armscan.cli.options import FILE_PATH, CommaSeparated, clustering_option, examples
-from armscan.errors import InvalidValueError
-from armscan.utils.console import WHOLE_CHARS, print_table, wide_console
+from armscan.errors import InvalidValueError, print_error
+from armscan.utils.console import WHOLE_CHARS, print_sentence, print_table, wide_console
 
 if TYPE_CHECKING:
     from armscan.anatomy import FoundPlane
@@ -104,7 +103,7 @@ def label(
         if markups:
             print(f"their planes as files for 3D Slicer are in {options.pictures}")
     for failure in failures:
-        print(f"error: {failure}", file=sys.stderr)
+        print_error(str(failure))
     return 2 if failures else 0
 
 
@@ -139,6 +138,14 @@ def _print_dataset(dataset: Dataset) -> None:
         console.print(_tissue_table(report))
     for name, reason in dataset.excluded.items():
         console.print(Text(f"{name}: excluded" + ("" if reason == "True" else f" ({reason})")))
+    n_volumes, n_subjects = len(dataset.reports), len(set(dataset.subjects.values()))
+    n_labelled = sum(dataset.volumes[name].optimal_action is not None for name in dataset.reports)
+    console.print(
+        f"{n_volumes} volume{'s' if n_volumes != 1 else ''} of {n_subjects} subject{'s' if n_subjects != 1 else ''}, "
+        f"{n_labelled} with a labelled plane",
+        style="bold",
+        highlight=False,
+    )
 
 
 def _tissue_table(report: VolumeReport) -> Table:
@@ -181,7 +188,7 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolum
     from armscan.config.command_hints import armscan_command
     from armscan.volumes.markups import MARKUP_SUFFIX
 
-    headings = ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "as good over\n°, °, mm")
+    headings = ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "as good\nover °, °, mm")
     rows = []
     for _, plane in labelled:
         rz, rx, tx, ty = plane.action.to_array()
@@ -194,20 +201,20 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolum
                 "-" if plane.spread is None else "{:.0f}, {:.0f}, {:.0f}".format(*plane.spread),
             ]
         )
-    print("planes written into the manifest")
+    print_sentence(f"planes written into the manifest of {options.data}")
     names = [volume.name for volume, _ in labelled]
     print_table("volume", names, [Column(heading, justify="right") for heading in headings], rows)
     for volume, plane in labelled:
         if plane.score <= -SUCCESS_THRESHOLD:
             wanted = f"an environment wants more than {-SUCCESS_THRESHOLD:g}"
-            print(f"note: {volume.name} scores {plane.score:.3f}, and {wanted}")
+            print_sentence(f"note: {volume.name} scores {plane.score:.3f}, and {wanted}")
     print(f"look at   {options.pictures}")
     print("accept    nothing is left to do")
-    print(
-        "reject    take rotation, translation and score out of the volume's entry, or give the entry an exclude: REASON"
-    )
+    print("reject    in the manifest, take rotation, translation and score out of the")
+    print("          volume's entry, or give the entry an exclude: REASON")
     if not options.markups:
         print("          (--markups writes the planes as files for 3D Slicer)")
     words = ("data", "label", str(options.data), "--volume", "NAME", "--markup", f"FILE{MARKUP_SUFFIX}")
     print("correct   move the plane in 3D Slicer, save it, and read it back:")
     print(f"          {armscan_command(*words)}")
+    print(f"check     {armscan_command('data', 'inspect', str(options.data))}")

@@ -15,7 +15,7 @@ from armscan.cli.policy import policy
 from armscan.cli.report import report
 from armscan.cli.runs import runs
 from armscan.cli.ui import ui
-from armscan.errors import is_interruption
+from armscan.errors import is_interruption, print_error
 from armscan.utils.log import silence_libraries
 from armscan.utils.processes import collect_garbage_rarely
 
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(error.format_message(), file=sys.stderr)
         return error.exit_code
     except click.ClickException as error:
-        print(f"error: {' '.join(error.format_message().split())}", file=sys.stderr)
+        print_error(" ".join(error.format_message().split()))
         return error.exit_code
     except Exception as error:
         if is_interruption(error):
@@ -89,5 +89,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
         line = one_line_message(error)
         if line is None or os.environ.get(TRACEBACKS):
             raise
-        print(f"error: {line}", file=sys.stderr)
+        print_error(line)
         return 2

@@ -12,8 +12,11 @@ from pathlib import Path
 
 from armscan.config.defaults import RESUME, TRACKING_URI, default_storage, default_tracking
 from armscan.config.trust import TRUST
+from armscan.utils.files import SQLITE_PREFIX
 
 RUN = ("python", "-m", "armscan.run")
+# Where commands are typed; a resumed run enters another folder.
+STARTED_IN = Path.cwd()
 # `uv run` says so to the programs that it starts.
 UV_RUN = "UV_RUN_RECURSION_DEPTH"
 
@@ -47,7 +50,7 @@ def resume_command(run_id: str, tracking_uri: str, *, trust: bool = False) -> st
         tracking_uri: MLflow tracking URI of its store.
         trust: Whether the command needs `--trust`. Default: False.
     """
-    where = () if tracking_uri == default_tracking()["uri"] else (f"{TRACKING_URI}={tracking_uri}",)
+    where = () if _is_default_store(tracking_uri) else (f"{TRACKING_URI}={tracking_uri}",)
     return run_command([f"{RESUME}={run_id}", *where, *((TRUST,) if trust else ())])
 
 
@@ -61,5 +64,12 @@ def armscan_command(*words: str, tracking: str | None = None, storage: str | Non
         trust: Whether the command needs `--trust`. Default: False.
     """
     stores = ["--storage", storage] if storage is not None and storage != default_storage() else []
-    stores += ["--tracking", tracking] if tracking is not None and tracking != default_tracking()["uri"] else []
+    stores += ["--tracking", tracking] if tracking is not None and not _is_default_store(tracking) else []
     return shlex.join([*typed("armscan"), *words, *stores, *((TRUST,) if trust else ())])
+
+
+def _is_default_store(uri: str) -> bool:
+    """Return whether a command that is typed here uses this tracking store by default."""
+    default = str(default_tracking()["uri"])
+    file = default.removeprefix(SQLITE_PREFIX)
+    return uri == default or (file != default and uri == f"{SQLITE_PREFIX}{STARTED_IN / file}")

@@ -15,6 +15,8 @@ from rich.text import Text
 
 from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
 from armscan.training import Evaluation, MetricEstimates, ResultTable
+from armscan.training.baselines import RANDOM
+from armscan.training.headline import beside_random, headline
 from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
 from armscan.training.result_table import interval_text
 
@@ -58,29 +60,34 @@ class EvaluationReport:
     @cached_property
     def by_split(self) -> dict[str, MetricEstimates]:
         """Return the metrics by the name of the volumes, and those of all together under `all volumes`."""
-        return self._by_split(self.evaluations)
+        played, randoms = self._played(self.evaluations), self._played(self.baselines.get(RANDOM, {}))
+        return {
+            label: beside_random(MetricEstimates.of(each), [each], randoms.get(label)) for label, each in played.items()
+        }
 
     @cached_property
     def baselines_by_split(self) -> dict[str, dict[str, MetricEstimates]]:
         """Those of the baselines, by their names, then as `by_split`."""
-        return {name: self._by_split(evaluations) for name, evaluations in self.baselines.items()}
+        return {
+            name: {label: MetricEstimates.of(each) for label, each in self._played(evaluations).items()}
+            for name, evaluations in self.baselines.items()
+        }
 
     def tables(self) -> dict[str, ResultTable]:
         """Return the agent beside the baselines, by the name of the volumes."""
-        return {
-            label: ResultTable(
-                {AGENT: figures, **{name: each[label] for name, each in self.baselines_by_split.items()}}
-            )
-            for label, figures in self.by_split.items()
-        }
+        tables = {}
+        for label, figures in self.by_split.items():
+            baselines = {name: each[label] for name, each in self.baselines_by_split.items()}
+            random = {AGENT: baselines[RANDOM]} if RANDOM in baselines else {}
+            tables[label] = ResultTable({AGENT: figures, **baselines}, headline=headline({AGENT: figures}, random))
+        return tables
 
-    def _by_split(self, evaluations: Mapping[str, Evaluation]) -> dict[str, MetricEstimates]:
-        metrics = {label: MetricEstimates.of(evaluation) for label, evaluation in evaluations.items()}
-        if self.has_total and len(metrics) > 1:
-            everything = tuple(episode for each in evaluations.values() for episode in each.episodes)
-            first = next(iter(evaluations.values()))
-            metrics[TOTAL] = MetricEstimates.of(Evaluation(everything, first.on_plane))
-        return metrics
+    def _played(self, evaluations: Mapping[str, Evaluation]) -> dict[str, Evaluation]:
+        """Return evaluations by the name of their volumes, with all of them together if they are to be added up."""
+        if not self.has_total or len(evaluations) < 2:
+            return dict(evaluations)
+        everything = tuple(episode for each in evaluations.values() for episode in each.episodes)
+        return {**evaluations, TOTAL: Evaluation(everything, next(iter(evaluations.values())).on_plane)}
 
     @cached_property
     def by_volume(self) -> dict[str, dict[str, MetricEstimates]]:

@@ -11,6 +11,8 @@ from armscan.config.command_hints import armscan_command
 from armscan.experiment.job import INTERRUPTED, JobOutcome
 from armscan.experiment.results import TITLES, RunResult
 from armscan.training import TEST, MetricEstimates, ResultTable
+from armscan.training.baselines import RANDOM
+from armscan.training.headline import headline
 from armscan.training.result_table import HOW, with_baselines
 from armscan.utils.console import print_sentence, wide_console
 from armscan.utils.files import ID_CHARS
@@ -33,6 +35,8 @@ def print_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, ho
         console.print(Text(HOW, style="dim"))
     for note in notes:
         print_sentence(f"note: {note}")
+    if table.headline:
+        print_sentence(f"result: {table.headline}")
 
 
 def print_results(title: str, reached: RunResult) -> None:
@@ -72,7 +76,13 @@ def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -
         "outcome": [ended.get(outcome.failure, "failed") for outcome in outcomes.values()],
     }
     n_baselines = len(results) - len(outcomes)
-    return ResultTable(results, {heading: [*values, *[""] * n_baselines] for heading, values in facts.items()})
+    names = {number: f"{number} ({outcome.varied})" for number, outcome in outcomes.items()}
+    randoms = {names[number]: each[RANDOM] for number, each in baselines.items() if RANDOM in each}
+    return ResultTable(
+        results,
+        {heading: [*values, *[""] * n_baselines] for heading, values in facts.items()},
+        headline({names[number]: each for number, each in tested.items()}, randoms),
+    )
 
 
 def print_where_to_look(

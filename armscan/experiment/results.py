@@ -25,11 +25,13 @@ from armscan.training import (
     evaluate_baselines,
 )
 from armscan.training.baselines import RANDOM
+from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE, atomic_write
 
 # First seeds of the final evaluations' episodes; those of the baselines do not depend on the seed of the run.
 TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED = 2 * 10**6, 3 * 10**6
 LAST_VALIDATION = "last validation"
+AGENT = "agent"
 TITLES = {
     TEST: "agent, test",
     VALIDATION: "agent, validation",
@@ -86,7 +88,9 @@ class RunResult:
         """Figures with their intervals, by the names of the agent's volumes and of the baselines."""
         played = {**self.baselines, **self.evaluations}
         played |= {VALIDATION: self.validation} if self.validation else {}
-        return {name: MetricEstimates.of(evaluation) for name, evaluation in played.items()}
+        figures = {name: MetricEstimates.of(evaluation) for name, evaluation in played.items()}
+        random = None if self.own_baseline == RANDOM else self.baselines.get(RANDOM)
+        return figures | {TEST: beside_random(figures[TEST], [self.evaluations[TEST]], random)}
 
     def table(self) -> ResultTable:
         """Return the agent on the test volumes, the baselines there, then the agent on its other volumes."""
@@ -95,7 +99,10 @@ class RunResult:
     def metrics(self) -> dict[str, dict[str, float]]:
         """Return the numbers of the table, and all means, by the names of the volumes and of the baselines."""
         shown = [column.metric for column in self.table().quantities]
-        metrics = {name: figures.shown_metrics(shown) for name, figures in self.figures.items()}
+        metrics = {
+            name: figures.shown_metrics([*shown, *figures.estimates.keys() & {ABOVE_RANDOM}])
+            for name, figures in self.figures.items()
+        }
         for name, evaluation in self.evaluations.items():
             metrics[name] |= evaluation.metrics()
         return metrics
@@ -131,7 +138,9 @@ def result_table(figures: Mapping[str, MetricEstimates]) -> ResultTable:
     of_agent = [name for name in TITLES if name in figures and name != TEST]
     baselines = [name for name in figures if name not in TITLES]
     ordered = [*([TEST] if TEST in figures else []), *baselines, *of_agent]
-    return ResultTable({TITLES.get(name, f"{name}, test"): figures[name] for name in ordered})
+    tested, random = ({AGENT: figures[name]} if name in figures else {} for name in (TEST, RANDOM))
+    titled = {TITLES.get(name, f"{name}, test"): figures[name] for name in ordered}
+    return ResultTable(titled, headline=headline(tested, random))
 
 
 def figures_of(metrics: Mapping[str, float]) -> dict[str, MetricEstimates]:

@@ -32,6 +32,8 @@ from armscan.training import (
     train,
 )
 from armscan.training.progress import progress_reporter
+from armscan.utils.compilation import compilation_told
+from armscan.utils.console import print_sentence
 from armscan.utils.files import (
     LAST_CHECKPOINT,
     LEARNING_CURVE_FILE,
@@ -44,6 +46,8 @@ from armscan.utils.files import (
 
 # First seeds of the episodes that are played for each purpose, so that none is played for two; see also `results`.
 VALIDATION_SEED, VIDEO_SEED = 10**6, 4 * 10**6
+OF_ENVIRONMENT = ("armscan.volumes", "armscan.anatomy", "armscan.envs")
+COMPILING = "compiling the environment for this machine, which takes half a minute; later runs find it in the cache"
 
 
 def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict[str, float]]:
@@ -56,7 +60,8 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     job = invocation.job
     with folder_lock(invocation.folder):
         check_free(invocation.folder)
-        setup = set_up(config)
+        with compilation_told(COMPILING, lambda dispatcher: dispatcher.py_func.__module__.startswith(OF_ENVIRONMENT)):
+            setup = set_up(config)
         tracked = start_tracking(config, invocation, setup)
         return run_tracked(setup, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
 
@@ -83,7 +88,11 @@ def run_tracked(
     Returns:
         The metrics of the final evaluations, by the name of their volumes.
     """
-    tell = partial(print, *([f"[{job_label}]"] if job_label else []), flush=True)
+    before = f"[{job_label}] " if job_label else ""
+
+    def tell(text: str) -> None:
+        print_sentence(f"{before}{text}")
+
     tell(f"run {tracked.run_id}: {tracked.name}")
     trust = setup.needs_trust
     again = resume_command(tracked.run_id, tracking_uri, trust=trust)
@@ -110,6 +119,7 @@ def run_tracked(
         if job_label is None:
             how = f"as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
             print_results(f"results ({'deterministic policy, ' if result else ''}{how})", reached)
+        tell("keeping the results, the video of an episode, and the policy")
         record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)
         keep_results(tracked, result, reached, folder)
         if isinstance(setup.agent, Learner):

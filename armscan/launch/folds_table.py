@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 from armscan.launch.folds_grid import FOLD
 from armscan.reports.html import page
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
+from armscan.training.baselines import RANDOM
+from armscan.training.headline import beside_random, headline
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE, atomic_write
 
 if TYPE_CHECKING:
@@ -42,8 +44,16 @@ def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
         for name, evaluation in _evaluations(folder).items():
             title = ", ".join(filter(None, (name, others)))
             tested.setdefault(title, {}).setdefault(training, []).append(evaluation)
-    figures = {title: MetricEstimates.of_trainings(_joined(each)) for title, each in tested.items()}
-    return ResultTable(figures) if figures else None
+    joined = {title: _joined(each) for title, each in tested.items()}
+    figures = {title: MetricEstimates.of_trainings(each) for title, each in joined.items()}
+    ours: dict[str, MetricEstimates] = {}
+    randoms: dict[str, MetricEstimates] = {}
+    for title in (title for title in figures if title.startswith(AGENT)):
+        of_random = title.replace(AGENT, f"{RANDOM}{ALL_FOLDS}", 1)
+        random = next(iter(joined[of_random].values())) if of_random in joined else None
+        ours[title] = beside_random(figures[title], [*joined[title].values()], random)
+        randoms |= {title: figures[of_random]} if random else {}
+    return ResultTable(figures | ours, headline=headline(ours, randoms)) if figures else None
 
 
 def _evaluations(folder: Path) -> dict[str, Evaluation]:

@@ -12,7 +12,7 @@ from plotly.colors import hex_to_rgb, qualitative
 from plotly.graph_objects import Figure
 from plotly.subplots import make_subplots
 
-from armscan.reports.chart_style import RATE_AXIS, mode
+from armscan.reports.chart_style import GREY, RATE_AXIS, mode
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
 from armscan.training import MetricEstimates
@@ -104,22 +104,34 @@ def learning_curves(
     return figure
 
 
-def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Figure:
-    """Return a chart of each group's final figures, with the interval and the single seeds."""
+def final_chart(
+    groups: Sequence[Group], reached: Sequence[MetricEstimates | None], baselines: Mapping[str, MetricEstimates]
+) -> Figure:
+    """Return a chart of each group's final figures, with the interval and the single seeds, and of the baselines.
+
+    Args:
+        groups: Groups that are drawn.
+        reached: Final figures of each; None without a final evaluation.
+        baselines: Figures of the baselines, by their names.
+    """
     limits = next(figures.on_plane[0] for figures in reached if figures is not None)
     titles = {limits.metric: limits.title} | {name: title_of(name) for name in FINAL}
+    rows: list[tuple[str, str, MetricEstimates | None, dict[str, dict[str, float]]]] = []
+    for group, colour, figures in zip(groups, colours(len(groups)), reached, strict=True):
+        of_seeds = {each.label: each.evaluation.metrics() for each in group.trainings if each.evaluation}
+        rows.append((_wrapped(group.label), colour, figures, of_seeds))
+    rows += [(_wrapped(name), GREY, figures, {}) for name, figures in baselines.items()]
     figure = make_subplots(rows=1, cols=len(titles), shared_yaxes=True, horizontal_spacing=0.04)
     for column, (name, title) in enumerate(titles.items(), start=1):
         here = {"mode": "markers", "showlegend": False, "row": 1, "col": column}
-        for group, colour, figures in zip(groups, colours(len(groups)), reached, strict=True):
+        for label, colour, figures, metrics in rows:
             if figures is None or name not in figures.estimates:
                 continue
             value, low, high = figures.estimate(name)
-            metrics = {each.label: each.evaluation.metrics() for each in group.trainings if each.evaluation}
-            seeds = {label: of_seed[name] for label, of_seed in metrics.items() if name in of_seed}
+            seeds = {seed: of_seed[name] for seed, of_seed in metrics.items() if name in of_seed}
             figure.add_scatter(
                 x=list(seeds.values()),
-                y=[_wrapped(group.label)] * len(seeds),
+                y=[label] * len(seeds),
                 text=list(seeds),
                 hovertemplate="%{text}: %{x}<extra></extra>",
                 marker={"color": colour, "opacity": 0.45, "size": 8},
@@ -127,7 +139,7 @@ def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
             )
             figure.add_scatter(
                 x=[value],
-                y=[_wrapped(group.label)],
+                y=[label],
                 hovertemplate=f"%{{x}} ({low:.3g} to {high:.3g})<extra></extra>",
                 error_x={"type": "data", "symmetric": False, "array": [high - value], "arrayminus": [value - low]},
                 marker={"color": colour, "size": 11, "symbol": "diamond"},
@@ -135,7 +147,7 @@ def final_chart(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
             )
         figure.update_xaxes(title=title, row=1, col=column, **(RATE_AXIS if is_rate(name) else {}))
     figure.update_yaxes(autorange="reversed", automargin=True)
-    height = AROUND_PX + GROUP_PX * len(groups)
+    height = AROUND_PX + GROUP_PX * len(rows)
     return figure.update_layout(height=height, margin={"t": 20, "b": 50, "l": 10, "r": 20})
 
 

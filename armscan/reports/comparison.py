@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from armscan.reports.charts import MANY, Curves, colours, final_chart, learning_curves
@@ -27,6 +28,8 @@ from armscan.reports.videos import videos
 from armscan.stats.aggregation import FEWEST_SEEDS
 from armscan.stats.bootstrap import Estimate
 from armscan.training import MetricEstimates, ResultTable
+from armscan.training.baselines import RANDOM
+from armscan.training.headline import headline
 from armscan.training.result_table import with_baselines
 from armscan.training.titles import title_of
 
@@ -80,11 +83,13 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     }
     reached = [final_metrics(group) for group in groups]
     pairs = compare_groups(groups)
+    final = final_table(groups, reached)
     parts = [
+        f"<p><strong>{html.escape(final.headline)}</strong></p>" if final.headline else "",
         _summary(groups),
         notes_on(groups, left_out, has_other_volumes=any(each.probability is None for each in pairs["on_plane_rate"])),
         *_learning(groups, curves),
-        *_final(groups, reached),
+        *_final(groups, reached, replace(final, headline="")),
         *_better(groups, pairs),
         videos(groups),
         *_of_the_training(groups, curves, [figure for figure in figures if figure not in validation_titles(figures)]),
@@ -149,13 +154,15 @@ def _title_of_training(metric: str) -> str:
     return metric.partition("/")[2].replace("_per_s", ", 1/s").replace("_", " ").replace("env ", "environment ")
 
 
-def _final(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Iterator[str]:
+def _final(groups: Sequence[Group], reached: Sequence[MetricEstimates | None], final: ResultTable) -> Iterator[str]:
     yield "<h2>On the test volumes</h2>"
     if not any(reached):
         yield "<p>None of these runs has kept a final evaluation.</p>"
         return
-    drawn = chart(final_chart(groups, reached), is_wide=True)
-    yield f"<p>{HOW_FINAL}</p>{final_table(groups, reached).html()}{drawn}"
+    labels = {group.label for group in groups}
+    baselines = {name: each for name, each in final.results.items() if name not in labels}
+    drawn = chart(final_chart(groups, reached, baselines), is_wide=True)
+    yield f"<p>{HOW_FINAL}</p>{final.html()}{drawn}"
 
 
 def final_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> ResultTable:
@@ -164,7 +171,9 @@ def final_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
     figures = {group.label: each or nothing for group, each in zip(groups, reached, strict=True)}
     evaluated = [group for group in groups if evaluations_by_seed(group)]
     labels = [group.label for group in evaluated]
-    return ResultTable(with_baselines(figures, dict(zip(labels, baseline_metrics(evaluated), strict=True))))
+    baselines = dict(zip(labels, baseline_metrics(evaluated), strict=True))
+    randoms = {label: each[RANDOM] for label, each in baselines.items() if RANDOM in each}
+    return ResultTable(with_baselines(figures, baselines), headline=headline(figures, randoms))
 
 
 def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[str]:

@@ -28,6 +28,7 @@ h2 {{ margin: 2.2rem 0 .4rem; }}
 table {{ border-collapse: collapse; margin: .5rem 0; }}
 td, th {{ border-bottom: 1px solid #ddd; padding: .25rem .6rem; text-align: left; vertical-align: top; }}
 th {{ border-bottom: 2px solid #999; vertical-align: bottom; overflow-wrap: normal; }}
+td.word {{ overflow-wrap: normal; }}
 td.number {{ text-align: right; white-space: nowrap; }}
 small {{ color: #555; }}
 .results td, .results th {{ text-align: right; min-width: 7.5rem; }}
@@ -82,6 +83,8 @@ CHART_CONFIG = {"displaylogo": False, "showSendToCloud": False, "plotlyServerURL
 FITTED = "this.querySelectorAll('.js-plotly-plot').forEach((chart) => Plotly.Plots.resize(chart))"
 # A longer table is folded.
 MOST_ROWS = 25
+# A short text is not broken, such as the ID of a run or how it ended.
+MOST_WORD_CHARS = 12
 Row = Mapping[str, Any]
 
 
@@ -203,7 +206,9 @@ def _cell(key: str, value: Any) -> str:
     contents = value if isinstance(value, Markup) else html.escape(shown)
     label = f' data-label="{html.escape(key)}"'
     # A cell of nothing is not shown on a phone.
-    return f"<td{' class=number' if is_number else ''}{label}>{f'<div>{contents}</div>' if contents else ''}</td>"
+    is_word = len(shown) <= MOST_WORD_CHARS and not isinstance(value, Markup)
+    kind = " class=number" if is_number else " class=word" if is_word else ""
+    return f"<td{kind}{label}>{f'<div>{contents}</div>' if contents else ''}</td>"
 
 
 def _write_csv(file: Path, rows: Sequence[Row]) -> None:

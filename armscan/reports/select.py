@@ -17,7 +17,7 @@ from armscan.tracking.store import store_errors
 EXPERIMENT = "experiment:"
 # Only a run of `armscan run` or a training of a study has it, not its parents.
 OF_A_TRAINING = "choice.agent"
-PRUNED_TAG, TRIAL_TAG = "pruned", "trial"
+PRUNED_TAG, TRIAL_TAG, JOB_TAG = "pruned", "trial", "job"
 # A loaded server takes longer for more than it is waited for.
 PAGE_SIZE = 100
 N_SHOWN = 6
@@ -89,7 +89,10 @@ def _below(store: TrackingStore, run: Run, depth: int = 0) -> Iterator[Run]:
         yield run
     if OF_A_TRAINING in run.data.tags or depth > MAX_DEPTH:
         return
-    for child in _runs(store, run.info.experiment_id, f"tags.`{PARENT_TAG}` = '{run.info.run_id}'"):
+    children = [*_runs(store, run.info.experiment_id, f"tags.`{PARENT_TAG}` = '{run.info.run_id}'")]
+    # Jobs of a grid start side by side: by their numbers, so that they stand as the grid's own table has them.
+    numbers = {child.info.run_id: child.data.tags.get(JOB_TAG, "") for child in children}
+    for child in sorted(children, key=lambda each: (len(numbers[each.info.run_id]), numbers[each.info.run_id])):
         yield from _below(store, child, depth + 1)
 
 

@@ -15,6 +15,8 @@ from armscan.reports.load import TrackedTraining
 from armscan.stats.aggregation import probabilities_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.training import Evaluation, MetricEstimates
+from armscan.training.baselines import RANDOM
+from armscan.training.headline import beside_random
 from armscan.volumes.plane import FloatArray
 
 # Rate of the leading limits, and metrics of `Evaluation.metrics`, that groups are compared by; true where higher is
@@ -49,8 +51,10 @@ def evaluations_by_seed(group: Group) -> dict[str, Evaluation]:
 
 def final_metrics(group: Group) -> MetricEstimates | None:
     """Return the final metrics of a group, with intervals over seeds, volumes and episodes; None if not evaluated."""
-    played = evaluations_by_seed(group)
-    return MetricEstimates.of_trainings(played) if played else None
+    played, random = evaluations_by_seed(group), _baselines(group).get(RANDOM)
+    if not played:
+        return None
+    return beside_random(MetricEstimates.of_trainings(played), [*played.values()], _joined(random) if random else None)
 
 
 def compare_groups(groups: Sequence[Group]) -> dict[str, list[Pair]]:

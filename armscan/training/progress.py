@@ -6,11 +6,14 @@ import sys
 import time
 from collections.abc import Sequence
 
+from rich.console import RenderableType
+from rich.constrain import Constrain
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column
 from rich.text import Text
 
 from armscan.training.callbacks import Callback, EpochReport
+from armscan.utils.console import print_sentence
 
 
 def progress_reporter(label: str | None = None, measured: str = "validation") -> Callback:
@@ -21,6 +24,14 @@ def progress_reporter(label: str | None = None, measured: str = "validation") ->
         measured: Origin of the figures, such as `validation, 48 episodes, deterministic`. Default: `validation`.
     """
     return ProgressBar(measured) if label is None and sys.stdout.isatty() else ProgressLines(label, measured)
+
+
+class _Narrower(Progress):
+    """A bar that leaves the terminal's last columns free: the echo of a Ctrl-C would begin another line there."""
+
+    def get_renderable(self) -> RenderableType:
+        """Return the bar, narrower than the terminal."""
+        return Constrain(super().get_renderable(), self.console.width - len("^C"))
 
 
 class ProgressBar:
@@ -34,7 +45,7 @@ class ProgressBar:
         self._measured = measured
         # On a narrow terminal the numbers keep their width; the bar shrinks.
         fixed = Column(no_wrap=True)
-        self._progress = Progress(
+        self._progress = _Narrower(
             BarColumn(bar_width=None, table_column=Column(ratio=1, min_width=4)),
             *(MofNCompleteColumn(table_column=fixed), TextColumn("{task.fields[metrics]}", table_column=fixed)),
             TimeRemainingColumn(table_column=fixed),
@@ -70,7 +81,7 @@ class ProgressLines:
         self._start_s = time.perf_counter() - (earlier[-1].wall_s if earlier else 0.0)
         after = f", {earlier[-1].n_env_steps} of them taken" if earlier else ""
         at_most = f"training for at most {total_env_steps} environment steps{after}"
-        print(f"{self._label}{at_most}; figures: {self._measured}", flush=True)
+        print_sentence(f"{self._label}{at_most}; figures: {self._measured}")
 
     def on_epoch(self, report: EpochReport) -> None:
         """Print the epoch's line."""
@@ -78,7 +89,7 @@ class ProgressLines:
         left_s = elapsed_s * (self._total / report.n_env_steps - 1)
         minutes, seconds = divmod(round(max(0.0, left_s)), 60)
         line = f"{report.n_env_steps:>{len(str(self._total))}}/{self._total} steps  {_summary(report)}"
-        print(f"{self._label}{line}  {minutes}:{seconds:02d} left", flush=True)
+        print_sentence(f"{self._label}{line}  {minutes}:{seconds:02d} left")
 
     def on_end(self) -> None:
         """Do nothing."""

@@ -89,10 +89,13 @@ class ResultTable:
         results: Metrics of each result, by its name, such as `random, test`; the on-plane limits are those of the
             first.
         facts: Further columns, shown first: a text for each result, by heading.
+        headline: Result in a few sentences, shown above the table on pages and below it in a terminal; see `headline`.
+            Default: none.
     """
 
     results: Mapping[str, MetricEstimates]
     facts: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    headline: str = ""
 
     @property
     def quantities(self) -> list[Quantity]:
@@ -135,7 +138,8 @@ class ResultTable:
         body = "".join(f"<tr>{''.join(map(_labelled, labels, line))}</tr>" for line in lines)
         drawn = f'<table class="rows"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
         kind = "results" if is_few else "results lines"
-        return f'<div class="{kind}"><div class="table">{drawn}</div><p><small>{HOW}</small></p></div>'
+        said = f"<p><strong>{html.escape(self.headline)}</strong></p>" if self.headline else ""
+        return f'{said}<div class="{kind}"><div class="table">{drawn}</div><p><small>{HOW}</small></p></div>'
 
     def markdown(self) -> str:
         """Return the table in Markdown, a column for each result."""
@@ -145,7 +149,8 @@ class ResultTable:
             rows.append([column.title, *cells])
         for title, count in COUNTS.items():
             rows.append([title, *(_count(each, count) for each in self.results.values())])
-        return markdown_table(["with 95 % intervals", *self.results], rows)
+        table = markdown_table(["with 95 % intervals", *self.results], rows)
+        return f"**{self.headline}**\n\n{table}" if self.headline else table
 
     def _abreast(self, width: int) -> list[Table]:
         """Return tables with a column for each result, as many beside each other as fit."""

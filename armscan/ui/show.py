@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Collection
+from operator import itemgetter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from armscan.config.credentials import TRACKING_PASSWORD, database_url
-from armscan.errors import InvalidValueError, TrackingError
+from armscan.errors import InvalidValueError, TrackingError, printable
 from armscan.ui.servers import HOST, check_port, mlflow_server, start_dashboard
 from armscan.utils.files import SQLITE_PREFIX, sqlite_file
+
+if TYPE_CHECKING:
+    from armscan.sweeps.storage.storage import Storage
 
 # One of the tables of MLflow.
 RUNS_TABLE = "experiments"
@@ -54,11 +59,18 @@ def show(
         check_port("--mlflow-port", mlflow_port)
     for option, contents, uri in missing:
         print(f"note: there are no {contents} in {uri!r} yet; {option} URI names others")
+    servers = [name for name, is_there in (("Optuna's dashboard", studies), ("MLflow's UI", has_runs)) if is_there]
+    if servers:
+        print(f"starting  {' and '.join(servers)}, which takes some seconds", flush=True)
     if is_server:
         print(f"runs      {tracking}")
     if studies is not None:
         runs_at = f"http://{HOST}:{mlflow_port}" if has_runs else None
-        print(f"studies   {start_dashboard(studies, artifacts, dashboard_port, mlflow=runs_at)}", flush=True)
+        dashboard = start_dashboard(studies, artifacts, dashboard_port, mlflow=runs_at)
+        print(f"studies   {dashboard}", flush=True)
+        if (judged := _last_judged(studies)) is not None:
+            name, number = judged
+            print(f"result    {dashboard}/dashboard/studies/{number}/note (study {printable(name)})", flush=True)
     if has_runs:
         with mlflow_server(tracking, mlflow_port) as process:
             # Deferred: it loads what knows of runs.
@@ -70,6 +82,16 @@ def show(
     elif studies is not None:
         print("Ctrl-C ends it", flush=True)
         threading.Event().wait()
+
+
+def _last_judged(storage: Storage) -> tuple[str, int] | None:
+    """Return the name and the number of the last study that has a result; None if none has."""
+    # Deferred, as above.
+    from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
+
+    numbers = {study.study_name: study._study_id for study in storage.optuna.get_all_studies()}
+    judged = [name for name in numbers if f"{name}{JUDGEMENT_SUFFIX}" in numbers]
+    return max(((name, numbers[name]) for name in judged), key=itemgetter(1), default=None)
 
 
 def _has_runs(uri: str) -> bool:

@@ -76,7 +76,7 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
     files = volume_files(folder)
     found = find_manifest(folder)
     if found is None and require_manifest:
-        raise ManifestError(f"{folder}: the folder has no manifest ({listed(MANIFEST_NAMES)})")
+        raise _without_manifest(folder)
     manifest = read_manifest(found) if found else Manifest()
     entries = volume_entries(manifest, files, found)
     used = {name: entry for name, entry in entries.items() if not entry.exclude}
@@ -118,7 +118,7 @@ def subjects_in(path: str | Path, n_volumes: int | None = None) -> list[str]:
     found = find_manifest(folder)
     files = volume_files(folder)
     if found is None:
-        raise ManifestError(f"{folder}: the folder has no manifest ({listed(MANIFEST_NAMES)})")
+        raise _without_manifest(folder)
     entries = volume_entries(read_manifest(found), files, found)
     used = {name: entry.subject or name for name, entry in entries.items() if not entry.exclude}
     return [used[name] for name in sorted(used)[:n_volumes]]
@@ -137,3 +137,8 @@ def _split_of(splits: Splits, subjects: Mapping[str, str], used: Mapping[str, ob
             "in one split (or its volumes excluded)"
         )
     return {name: split_of[subjects[name]] for name in used}
+
+
+def _without_manifest(folder: Path) -> ManifestError:
+    names = listed(MANIFEST_NAMES)
+    return ManifestError(f"{folder}: the folder has no manifest ({names}); armscan data label {folder} writes one")

@@ -261,7 +261,8 @@ def test_ui_shows_the_one_that_is_there_and_says_that_the_other_is_not(both, tmp
     looked = look(tmp_path)
     lines = looked.printed.splitlines()
     assert lines[0] == f"note: {note}"
-    assert len(lines) == 3
+    assert lines[1].startswith("starting  ")
+    assert len(lines) == 4
     assert lines[-1] == "Ctrl-C ends it"
     assert looked.end() == 130
     assert not (tmp_path / missing).exists()
@@ -284,6 +285,7 @@ def test_ui_leaves_runs_to_the_server_that_keeps_them(both, look):
     # Told by a word; what the environment says beside it is the password.
     looked = look(both, "--tracking=http://127.0.0.1:1", MLFLOW_TRACKING_PASSWORD=PASSWORD)
     assert looked.printed.splitlines() == [
+        "starting  Optuna's dashboard, which takes some seconds",
         "runs      http://127.0.0.1:1",
         f"studies   {looked.dashboard}",
         "Ctrl-C ends it",

@@ -21,6 +21,7 @@ from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, name_of, settings_of, training_of
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, best_trials
 from armscan.training.baselines import RANDOM
+from armscan.training.headline import headline
 from armscan.training.metrics import ENDS
 from armscan.training.titles import is_rate, leading_among, title_of, value_text
 from armscan.utils.markdown import markdown_table
@@ -115,8 +116,15 @@ class Judgement:
         return f"{name_of(self.chosen).capitalize()} and the control, {self.n_seeds} other seeds each"
 
     @property
+    def result(self) -> str:
+        """The result: the statement, and the chosen configuration beside random planes."""
+        ours = {name_of(each.number): each for each in self.results if each.number == self.chosen}
+        randoms = {name: each.baselines[RANDOM] for name, each in ours.items() if RANDOM in each.baselines}
+        return f"{self.statement} {headline({name: each.figures for name, each in ours.items()}, randoms)}".strip()
+
+    @property
     def statement(self) -> str:
-        """The result in a sentence."""
+        """The comparison with the control in a sentence."""
         if self.chosen == CONTROL:
             return (
                 "No setting beat the default configuration: of all candidates, the control was the best on the "
@@ -193,7 +201,7 @@ def result_note(final: FinalEvaluation | None) -> str:
     if judgement is None or not judgement.results:
         return ""
     settings = (f"{name}: {f'`{words}`' if words else NOTHING_SEARCHED}" for name, words in judgement.settings.items())
-    parts = [f"**{judgement.statement}**", *settings, "The test volumes:", final_table(judgement.results).markdown()]
+    parts = [f"**{judgement.result}**", *settings, "The test volumes:", final_table(judgement.results).markdown()]
     if rows := [each.row() for each in judgement.differences]:
         parts += [f"{judgement.compared}:", markdown_table([*rows[0]], [[*row.values()] for row in rows]), HOW]
     return "\n\n".join([*parts, *(f"Note: {note}." for note in judgement.notes)])

@@ -33,7 +33,7 @@ from armscan.sweeps.scheduling.state import (
     StudyState,
     is_feasible,
 )
-from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.space.parameter import overrides_of, rounded_overrides
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX, check_trials
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, n_trainings, name_of
 from armscan.sweeps.study.open import OpenedStudy, Phase
@@ -61,7 +61,7 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
         for key, trial, phase in _ended(opened):
             if key not in shown:
                 shown.add(key)
-                print(printable(_describe(trial, phase)), flush=True)
+                print_sentence(printable(_describe(trial, phase)))
 
     def show() -> None:
         # Nothing that is shown is worth waiting for: who leaves would wait for it, too.
@@ -69,12 +69,13 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
             if not sys.stdout.isatty():
                 repeat(print_new, stopped)
                 return
-            with Live(refresh_per_second=1) as live:
+            # The end is told below it.
+            with Live(refresh_per_second=1, transient=True) as live:
                 repeat(lambda: live.update(_table(opened)), stopped)
 
     search = opened.search
-    print(f"study {search.name} in {search.scheduler.storage.uri}, run {search.run_id}", flush=True)
-    print(f"the workers write into {folder}", flush=True)
+    print_sentence(f"study {search.name} in {search.scheduler.storage.uri}, run {search.run_id}")
+    print_sentence(f"the workers write into {folder}")
     thread = threading.Thread(target=show, daemon=True)
     thread.start()
     try:
@@ -155,7 +156,7 @@ def _summary(opened: OpenedStudy, state: StudyState) -> str:
     durations = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
     if durations and opened.search.scheduler.end(state) is None:
         left_s = (settings.n_trials - len(state.finished)) * fmean(durations) / settings.workers
-        parts.append(f"{left_s // 60:.0f} min left")
+        parts.append(f"{left_s // 60:.0f} min of trials left")
     return "; ".join(parts)
 
 
@@ -179,7 +180,7 @@ def print_result(opened: OpenedStudy) -> int:
     """Print the result of a study; return the exit code."""
     scheduler, settings = opened.search.scheduler, opened.settings
     state = scheduler.state()
-    print(_summary(opened, state))
+    print_sentence(_summary(opened, state))
     if stopped := scheduler.look_for_stop():
         print_sentence(printable(f"the study was stopped {stopped}; the same command resumes it"))
         return 0
@@ -198,12 +199,13 @@ def print_result(opened: OpenedStudy) -> int:
     if settings.constraints and state.finished and not best_trials(scheduler.study, 1):
         print(f"no trial keeps all constraints: {', '.join(map(str, settings.constraints))}")
     titles = map(title_of, settings.objectives)
-    table = Table("trial", *titles, "values", title="best while searching", title_justify="left")
+    table = Table("trial", *titles, title="best while searching", title_justify="left")
+    table.add_column("values, to four digits", overflow="fold")
     for trial in best_trials(scheduler.study, max(1, settings.final_eval.top_k)):
         table.add_row(
             str(trial.number),
             *map(value_text, settings.objectives, trial.values),
-            " ".join(overrides_of(searched_values(trial))),
+            Text("\n".join(rounded_overrides(searched_values(trial)))),
         )
     wide_console(WHOLE_CHARS).print(table)
     is_judged = opened.final_eval is None or _print_final_results(opened, opened.final_eval)
@@ -235,7 +237,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
     candidates = candidates_of(final)
     if candidates:
         objective = objective_of(final)
-        title = f"selection, on the validation volumes by {title_of(objective)}"
+        title = f"selection on the validation volumes, by: {title_of(objective)}"
         _print_rows(title, [each.row(objective) for each in candidates])
     judgement = judge(final)
     if judgement is None or not judgement.results:
@@ -244,13 +246,13 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
             reason = "trainings are missing; the same command resumes the study"
         print(f"error: no final evaluation, because {reason}", file=sys.stderr)
         return False
-    print_sentence(f"result: {judgement.statement}")
     if judgement.differences:
         _print_rows(judgement.compared, [each.row() for each in judgement.differences])
         print_sentence(HOW)
     print_table("the test volumes", final_table(judgement.results), judgement.notes)
     for name, settings in judgement.settings.items():
         print_sentence(f"{name}: {settings or NOTHING_SEARCHED}")
+    print_sentence(f"result: {judgement.result}")
     return True
 
 

@@ -192,7 +192,7 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
 def _judgement(judgement: Judgement) -> str:
     """Return the result in a sentence, and the differences to the control."""
     notes = "".join(f"<p>Note: {html.escape(note)}.</p>" for note in judgement.notes)
-    said = f"<p><strong>{html.escape(judgement.statement)}</strong></p>{notes}"
+    said = f"<p><strong>{html.escape(judgement.result)}</strong></p>{notes}"
     if not judgement.differences:
         return said
     seeds = f"Both were trained with the same {judgement.n_seeds} seeds, which nothing before has used."

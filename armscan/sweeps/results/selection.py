@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from optuna.trial import TrialState
 from plotly.graph_objects import Figure
 
@@ -75,6 +76,9 @@ def candidates_of(final: FinalEvaluation) -> list[Candidate]:
         standing = race.standings[number]
         value, *ends = (sign * each for each in standing.estimate)
         low, high = sorted(ends)
+        if is_rate(objective_of(final)):
+            # Student's interval knows no bounds.
+            low, high = np.clip((low, high), 0.0, 1.0).tolist()
         found.append(
             Candidate(
                 number,

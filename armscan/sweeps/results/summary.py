@@ -16,6 +16,8 @@ from armscan.stats.on_plane import limits_among
 from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
 from armscan.sweeps.study.final_eval import name_of
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
+from armscan.training.baselines import RANDOM
+from armscan.training.headline import beside_random
 from armscan.training.metrics import COUNTS
 from armscan.training.result_table import with_baselines
 
@@ -78,7 +80,7 @@ def _config_result(number: int, of_seeds: Sequence[FrozenTrial]) -> ConfigResult
     figures = MetricEstimates.of_trainings(dict(zip(seeds, (each[TEST] for each in kept), strict=True)))
     # The baselines have no part in the training: each seed has met the same.
     baselines = {name: MetricEstimates.of(each) for name, each in kept[0].items() if name != TEST}
-    return ConfigResult(number, figures, baselines)
+    return ConfigResult(number, beside_random(figures, [each[TEST] for each in kept], kept[0].get(RANDOM)), baselines)
 
 
 def _episodes(trial: FrozenTrial) -> dict[str, Evaluation]:

@@ -147,6 +147,13 @@ def overrides_of(chosen: Mapping[str, Value]) -> list[str]:
     return [f"{name}={written(value)}" for name, value in renamed(chosen).items()]
 
 
+def rounded_overrides(chosen: Mapping[str, Value]) -> list[str]:
+    """Return values likewise, with four digits, for tables."""
+    return overrides_of(
+        {key: float(f"{each:.4g}") if isinstance(each, float) else each for key, each in chosen.items()}
+    )
+
+
 def written(value: Any) -> str:
     """Return a value as Hydra reads it on the command line."""
     if value is None:

@@ -77,10 +77,12 @@ def _final(settings: FinalEvalSettings) -> str:
     fewest, most = n_trainings(settings)
     if not most:
         return "no final evaluation"
+    candidates = f"{settings.top_k} candidate{'s' if settings.top_k > 1 else ''}"
+    least, seeds = settings.min_seeds, settings.max_seeds
     return (
-        f"at least {fewest} and at most {most} final trainings: {settings.top_k} candidates and the control with "
-        f"{settings.min_seeds} to {settings.max_seeds} seeds each to select one, then it and the control with "
-        f"{settings.judge_seeds} others on the test volumes"
+        f"at least {fewest} and at most {most} final trainings: {candidates} and the control with "
+        f"{f'{least} to ' if least < seeds else ''}{seeds} seed{'s' if seeds > 1 else ''} each to select one, then it "
+        f"and the control with {settings.judge_seeds} others on the test volumes"
     )
 
 

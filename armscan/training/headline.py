@@ -1,0 +1,100 @@
+"""A result in two sentences: on the plane or not, better than random planes or not, and how far off.
+
+The difference to the random agent is paired: the rates of each volume are compared, so that a volume which is easy for
+both does not hide what the agent adds. Its interval is for other seeds and other volumes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from armscan.stats.bootstrap import Estimate
+from armscan.stats.paired import paired_difference
+from armscan.training.episode_results import Evaluation
+from armscan.training.metrics import MetricEstimates
+from armscan.training.result_table import interval_text
+
+# Difference of the leading on-plane rates, among the figures of an agent.
+ABOVE_RANDOM = "on_plane_above_random"
+DISTANCES = (("median_distance_mm", "{:.1f} mm"), ("median_distance_deg", "{:.1f}°"))
+
+
+def beside_random(
+    figures: MetricEstimates, trainings: Sequence[Evaluation], random: Evaluation | None
+) -> MetricEstimates:
+    """Return figures with the paired difference of the leading on-plane rate to that of random planes.
+
+    Args:
+        figures: Figures of an agent.
+        trainings: Episodes of each of its trainings, on the same volumes.
+        random: Episodes of random planes; None if there are none.
+
+    Returns:
+        The figures; as they were if `random` is None or has other volumes.
+    """
+    theirs = _rates(random) if random is not None else {}
+    ours = [_rates(each) for each in trainings]
+    if not theirs or any(each.keys() != theirs.keys() for each in ours):
+        return figures
+    scores = np.array([[each[name] for name in theirs] for each in ours])
+    difference = paired_difference(scores, np.tile([*theirs.values()], (len(ours), 1)))
+    # No difference of rates is larger.
+    above = Estimate(*map(float, np.clip(difference, -1.0, 1.0)))
+    return replace(figures, estimates={**figures.estimates, ABOVE_RANDOM: above})
+
+
+def headline(results: Mapping[str, MetricEstimates], randoms: Mapping[str, MetricEstimates]) -> str:
+    """Return the leading figures of a result; of several, of the one with the highest on-plane rate.
+
+    Args:
+        results: Figures of agents, by their names.
+        randoms: Figures of random planes on the same volumes, by the names of `results`; of some there may be none.
+
+    Returns:
+        Sentences such as `On plane, 5 mm 10°: agent 73.5% (61.0–85.0), random 56.5% (46.0–66.5). Better than random:
+        +17.0 points (+2.3 to +31.7). Median distance 2.7 mm (2.0–3.4), 0.0°.`; empty if no result has the rate.
+    """
+    limits = next((each.on_plane[0] for each in results.values() if each.on_plane), None)
+    known = {name: each for name, each in results.items() if limits and limits.metric in each.estimates}
+    if limits is None or not known:
+        return ""
+    name = max(known, key=lambda each: known[each].estimates[limits.metric].value)
+    best, random = known[name], randoms.get(name)
+    which = f"best of {len(known)}, {name}," if len(known) > 1 else name
+    beside = "" if random is None else f", random {_text(random.estimate(limits.metric), '{:.1%}')}"
+    far = ", ".join(_text(best.estimates[metric], form) for metric, form in DISTANCES if metric in best.estimates)
+    sentences = (
+        f"{limits.title.capitalize()}: {which} {_text(best.estimate(limits.metric), '{:.1%}')}{beside}.",
+        _verdict(best.estimates.get(ABOVE_RANDOM)),
+        f"Median distance {far}." if far else "",
+    )
+    return " ".join(filter(None, sentences))
+
+
+def _rates(evaluation: Evaluation) -> dict[str, float]:
+    return {name: each.on_plane_rate for name, each in evaluation.by_volume().items()}
+
+
+def _verdict(above: Estimate | None) -> str:
+    """Return whether an agent is better than random planes, as the interval of the difference says."""
+    if above is None or math.isnan(above.value):
+        return ""
+    points = Estimate(*(100 * each for each in above))
+    size = f"{points.value:+.1f} points"
+    if math.isnan(points.low):
+        return f"Difference {size}, one volume and one seed: nothing follows for others."
+    interval = f"{size} ({points.low:+.1f} to {points.high:+.1f})"
+    if points.low > 0:
+        return f"Better than random: {interval}."
+    return f"Worse than random: {interval}." if points.high < 0 else f"Not shown to be better than random: {interval}."
+
+
+def _text(estimate: Estimate, form: str) -> str:
+    """Return a figure and its interval, such as `2.7 mm (2.0–3.4)`."""
+    number = form.replace(" mm", "").replace("°", "")
+    interval = interval_text(estimate, number) if estimate.low < estimate.high else ""
+    return form.format(estimate.value) + (f" ({interval})" if interval else "")

@@ -1,0 +1,83 @@
+"""The result in a few sentences: its difference to random planes recomputed by the test, and what it claims."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from armscan.training import Evaluation, MetricEstimates, ResultTable
+from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
+from tests.training.test_train import evaluation_of
+
+
+def evaluation(rates, n=20):
+    """Return episodes on volumes `v0`, `v1` and so on, of which these shares end on the plane."""
+    (one,) = evaluation_of(1).episodes
+    return Evaluation(
+        tuple(
+            dataclasses.replace(one, volume=f"v{k}", distance_mm=1.0 if i < round(rate * n) else 9.0, distance_deg=0.0)
+            for k, rate in enumerate(rates)
+            for i in range(n)
+        )
+    )
+
+
+def said_of(rates, random_rates):
+    ours, random = evaluation(rates), evaluation(random_rates)
+    figures = beside_random(MetricEstimates.of(ours), [ours], random)
+    return headline({"agent": figures}, {"agent": MetricEstimates.of(random)})
+
+
+def test_difference_is_that_of_a_paired_t_test_over_the_volumes():
+    rates, random_rates = [0.9, 0.6, 0.8, 0.55], [0.5, 0.35, 0.6, 0.2]
+    ours = evaluation(rates)
+    above = beside_random(MetricEstimates.of(ours), [ours], evaluation(random_rates)).estimates[ABOVE_RANDOM]
+    interval = stats.ttest_rel(rates, random_rates).confidence_interval()
+    assert above == pytest.approx((np.subtract(rates, random_rates).mean(), *interval))
+
+
+@pytest.mark.parametrize(
+    ("rates", "random_rates", "verdict"),
+    [
+        ([0.9, 0.8, 0.85, 0.9], [0.5, 0.45, 0.4, 0.5], "Better than random: +40.0 points ("),
+        ([0.1, 0.2, 0.1, 0.15], [0.5, 0.45, 0.4, 0.5], "Worse than random: -32.5 points ("),
+        ([0.9, 0.1, 0.5, 0.55], [0.5, 0.45, 0.4, 0.5], "Not shown to be better than random: +5.0 points ("),
+        ([0.9], [0.5], "Difference +40.0 points, one volume and one seed: nothing follows for others."),
+    ],
+)
+def test_verdict_follows_the_interval_of_the_difference(rates, random_rates, verdict):
+    assert verdict in said_of(rates, random_rates)
+
+
+def test_interval_of_a_difference_of_rates_ends_at_100_points():
+    assert "(-100.0 to +100.0)" in said_of([0.0, 1.0, 0.5], [1.0, 0.0, 0.5])
+
+
+def test_without_random_planes_on_the_same_volumes_nothing_is_said_of_them():
+    ours = evaluation([0.9, 0.8])
+    figures = MetricEstimates.of(ours)
+    assert beside_random(figures, [ours], evaluation([0.5])) is figures
+    assert beside_random(figures, [ours], None) is figures
+    said = headline({"agent": figures}, {})
+    assert said.startswith("On plane, 5 mm 10°: agent 85.0% (")
+    assert "random" not in said
+    assert said.endswith("Median distance 1.0 mm, 0.0°.")
+
+
+def test_best_of_several_results_is_named():
+    figures = {
+        name: MetricEstimates.of(evaluation([rate, rate])) for name, rate in (("0 (a=1)", 0.3), ("1 (a=2)", 0.7))
+    }
+    assert headline(figures, {}).startswith("On plane, 5 mm 10°: best of 2, 1 (a=2), 70.0% (")
+
+
+def test_results_without_the_rate_have_no_headline():
+    assert headline({"agent": MetricEstimates.of_metrics({"success_rate": 0.5})}, {}) == ""
+    assert headline({}, {}) == ""
+
+
+def test_pages_have_the_headline_above_the_table():
+    table = ResultTable({"agent": MetricEstimates.of(evaluation([0.9, 0.8]))}, headline="On <plane>.")
+    assert table.html().startswith("<p><strong>On &lt;plane&gt;.</strong></p>")
+    assert table.markdown().startswith("**On <plane>.**\n\n")
