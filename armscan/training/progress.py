@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Sequence
 
+from rich import get_console
 from rich.console import RenderableType
 from rich.constrain import Constrain
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -31,7 +32,7 @@ class _Narrower(Progress):
 
     def get_renderable(self) -> RenderableType:
         """Return the bar, narrower than the terminal."""
-        return Constrain(super().get_renderable(), self.console.width - len("^C"))
+        return Constrain(super().get_renderable(), get_console().width - len("^C"))
 
 
 class ProgressBar:

@@ -112,8 +112,8 @@ def test_groups_have_the_ids_of_their_runs_and_rounded_times(written, make_train
     page, _ = written(make_training(0, series=long, run_id="abcdef01" * 4), make_training(1, run_id="12345678" * 4))
     summary = page.partition("<h2>")[0]
     assert "abcdef01 (0), 12345678 (1)" in summary
-    assert '<td data-label="training, s"><div>4 (4–4)</div></td>' in summary
-    assert '<td data-label="environment steps"><div>200</div></td>' in summary
+    assert '<td class=word data-label="training, s"><div>4 (4–4)</div></td>' in summary
+    assert '<td class=word data-label="environment steps"><div>200</div></td>' in summary
 
 
 def test_curves_have_markers_and_videos_come_after_charts(written, make_training):
@@ -126,7 +126,7 @@ def test_long_tables_are_folded_and_name_their_cells_for_a_phone(written, make_t
     page, _ = written(*(make_training(seed) for seed in range(30)))
     assert "<summary>All 30 runs</summary>" in page
     assert '<td data-label="1. ' in page
-    assert '<td data-label="status"><div>finished</div></td>' in page
+    assert '<td class=word data-label="status"><div>finished</div></td>' in page
 
 
 def test_many_groups_are_compared_below_a_line_that_opens_them(written, make_training):
