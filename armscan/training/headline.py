@@ -96,5 +96,6 @@ def _verdict(above: Estimate | None) -> str:
 def _text(estimate: Estimate, form: str) -> str:
     """Return a figure and its interval, such as `2.7 mm (2.0–3.4)`."""
     number = form.replace(" mm", "").replace("°", "")
-    interval = interval_text(estimate, number) if estimate.low < estimate.high else ""
+    low, high = map(number.format, estimate[1:])
+    interval = interval_text(estimate, number) if low != high else ""
     return form.format(estimate.value) + (f" ({interval})" if interval else "")

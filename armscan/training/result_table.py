@@ -87,7 +87,7 @@ class ResultTable:
 
     Args:
         results: Metrics of each result, by its name, such as `random, test`; the on-plane limits are those of the
-            first.
+            first that has any.
         facts: Further columns, shown first: a text for each result, by heading.
         headline: Result in a few sentences, shown above the table on pages and below it in a terminal; see `headline`.
             Default: none.
@@ -103,7 +103,7 @@ class ResultTable:
         known = {
             name for each in self.results.values() for name, estimate in each.estimates.items() if is_known(estimate)
         }
-        limits = next((each.on_plane for each in self.results.values()), ())
+        limits = next((each.on_plane for each in self.results.values() if each.on_plane), ())
         older = [column for column, better in OLDER.items() if better not in known]
         columns = [*(Quantity(each.metric, each.title, "{:.1%}") for each in limits), *QUANTITIES, *older]
         shown = [column for column in columns if column.metric in known]

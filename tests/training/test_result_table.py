@@ -35,6 +35,12 @@ def made_episodes(seed, n=24, n_volumes=4):
     )
 
 
+def test_rates_are_shown_if_the_first_result_has_none():
+    figures = MetricEstimates.of(Evaluation(made_episodes(0)))
+    table = ResultTable({"0": MetricEstimates.of_metrics({}), "1": figures})
+    assert [column.metric for column in table.quantities][:2] == [PLANE, STRICT]
+
+
 def recomputed(episodes):
     """Return the figures of episodes by numpy alone."""
 
