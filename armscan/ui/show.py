@@ -68,7 +68,7 @@ def show(
         runs_at = f"http://{HOST}:{mlflow_port}" if has_runs else None
         dashboard = start_dashboard(studies, artifacts, dashboard_port, mlflow=runs_at)
         print(f"studies   {dashboard}", flush=True)
-        if (judged := _last_judged(studies)) is not None:
+        if (judged := last_judged(studies)) is not None:
             name, number = judged
             print(f"result    {dashboard}/dashboard/studies/{number}/note (study {printable(name)})", flush=True)
     if has_runs:
@@ -84,7 +84,7 @@ def show(
         threading.Event().wait()
 
 
-def _last_judged(storage: Storage) -> tuple[str, int] | None:
+def last_judged(storage: Storage) -> tuple[str, int] | None:
     """Return the name and the number of the last study that has a result; None if none has."""
     # Deferred, as above.
     from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX

@@ -31,6 +31,7 @@ def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, mon
         "c.nrrd: excluded ([bold] motion)",
         "bones",
         "1 (231)",
+        "2 volumes of 2 subjects, 1 with a labelled plane",
     ):
         assert part in printed
 

@@ -39,3 +39,5 @@ def test_progress_bar_shows_all_of_its_figures_in_80_columns(narrow):
     for figure in ("120000/240000", "on plane, 5 mm 10° 100%", "success 100%", "steps 50.00", "-:--:--"):
         assert figure in line
     assert "━" in line
+    # Drawn at the start and at the end, with room for the echo of a Ctrl-C.
+    assert len(line) == 2 * (80 - len("^C"))

@@ -23,6 +23,7 @@ from armscan.sweeps.storage.database import tables_in
 from armscan.sweeps.storage.storage import open_storage
 from armscan.ui import servers
 from armscan.ui.servers import HOST
+from armscan.ui.show import last_judged
 from tests.support.postgres import PASSWORD
 from tests.support.processes import processes_in
 
@@ -192,6 +193,15 @@ def test_ui_names_a_port_that_is_taken_and_starts_nothing(both, monkeypatch, cap
     assert printed.err == f"error: {option} is {port}, but {HOST}:{port} cannot be used (address already in use)\n"
     assert printed.out == ""
     assert processes_in(both) == [os.getpid()]
+
+
+def test_page_of_the_last_study_with_a_result_is_found(tmp_path):
+    storage = open_storage(str(tmp_path / "optuna.journal"))
+    for name in ("a", "a-selection", "a-judged", "b", "b-selection", "b-judged", "c", "c-selection"):
+        optuna.create_study(study_name=name, storage=storage.optuna)
+        if name == "a":
+            assert last_judged(storage) is None
+    assert last_judged(storage) == ("b", 3)
 
 
 def test_ui_shows_what_is_there_until_it_is_interrupted(both, look):

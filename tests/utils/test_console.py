@@ -3,6 +3,7 @@
 import pytest
 from rich.table import Column
 
+from armscan.errors import print_error
 from armscan.utils.console import print_table, wide_console
 
 COLUMNS = [Column("size", justify="right"), Column("what")]
@@ -29,3 +30,13 @@ def test_log_takes_all_in_one_line(capsys, monkeypatch):
     print_table("name", [LONG * 3], COLUMNS, [["1", "a"]])
     assert capsys.readouterr().out.splitlines()[1].split() == [LONG * 3, "1", "a"]
     assert wide_console().width == 160
+
+
+@pytest.mark.parametrize(("is_terminal", "n_lines"), [(True, 2), (False, 1)])
+def test_error_breaks_between_words_on_a_terminal_and_nowhere_in_a_log(capsys, monkeypatch, is_terminal, n_lines):
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("sys.stderr.isatty", lambda: is_terminal, raising=False)
+    print_error(f"{LONG}, but it must be one of those")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == n_lines + is_terminal
+    assert " ".join(lines) == f"error: {LONG}, but it must be one of those"
