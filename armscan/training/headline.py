@@ -1,7 +1,7 @@
 """A result in two sentences: on the plane or not, better than random planes or not, and how far off.
 
 The difference to the random agent is paired: the rates of each volume are compared, so that a volume which is easy for
-both does not hide what the agent adds. Its interval is for other seeds and other volumes.
+both does not hide what the agent adds. Its interval is for other volumes; with several trainings for other seeds, too.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from armscan.stats.bootstrap import Estimate
-from armscan.stats.paired import paired_difference
+from armscan.stats.paired import crossed_mean
 from armscan.training.episode_results import Evaluation
 from armscan.training.metrics import MetricEstimates
 from armscan.training.result_table import interval_text
@@ -41,9 +41,10 @@ def beside_random(
     if not theirs or any(each.keys() != theirs.keys() for each in ours):
         return figures
     scores = np.array([[each[name] for name in theirs] for each in ours])
-    difference = paired_difference(scores, np.tile([*theirs.values()], (len(ours), 1)))
+    mean, half = crossed_mean(scores - np.array([*theirs.values()]))
     # No difference of rates is larger.
-    above = Estimate(*map(float, np.clip(difference, -1.0, 1.0)))
+    low, high = np.clip((mean - half, mean + half), -1.0, 1.0)
+    above = Estimate(float(mean), float(low), float(high))
     return replace(figures, estimates={**figures.estimates, ABOVE_RANDOM: above})
 
 

@@ -53,3 +53,9 @@ def test_difference_of_equal_trainings_has_no_width_and_that_of_one_seed_no_inte
 def test_trainings_of_other_seeds_or_volumes_are_refused():
     with pytest.raises(InvalidValueError, match=r"the shapes \(2, 3\) and \(3, 3\)"):
         paired_difference(np.zeros((2, 3)), np.zeros((3, 3)))
+
+
+def test_interval_ends_at_the_largest_difference_that_there_can_be():
+    ours, theirs = np.array([[0.0, 1.0, 0.5], [0.0, 1.0, 0.5]]), np.array([[1.0, 0.0, 0.5], [1.0, 0.0, 0.5]])
+    assert paired_difference(ours, theirs, most=1.0) == (0.0, -1.0, 1.0)
+    assert paired_difference(ours, theirs).high > 1.0

@@ -224,4 +224,5 @@ def _differences(
         is_higher_better = objectives[name] == MAXIMIZE if name in objectives else is_rate(name)
         sign = 1.0 if is_higher_better else -1.0
         probability = improvement_of_few_seeds(sign * ours, sign * theirs)
-        yield Difference(name, is_higher_better, paired_difference(ours, theirs), probability)
+        paired = paired_difference(ours, theirs, most=1.0 if is_rate(name) else math.inf)
+        yield Difference(name, is_higher_better, paired, probability)

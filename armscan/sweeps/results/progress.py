@@ -200,14 +200,12 @@ def print_result(opened: OpenedStudy) -> int:
         print(f"no trial keeps all constraints: {', '.join(map(str, settings.constraints))}")
     titles = map(title_of, settings.objectives)
     table = Table("trial", *titles, title="best while searching", title_justify="left")
-    table.add_column("values, to four digits", overflow="fold")
-    for trial in best_trials(scheduler.study, max(1, settings.final_eval.top_k)):
-        table.add_row(
-            str(trial.number),
-            *map(value_text, settings.objectives, trial.values),
-            Text("\n".join(rounded_overrides(searched_values(trial)))),
-        )
+    best = best_trials(scheduler.study, max(1, settings.final_eval.top_k))
+    for trial in best:
+        table.add_row(str(trial.number), *map(value_text, settings.objectives, trial.values))
     wide_console(WHOLE_CHARS).print(table)
+    for trial in best:
+        print_sentence(f"trial {trial.number}: {' '.join(rounded_overrides(searched_values(trial)))}")
     is_judged = opened.final_eval is None or _print_final_results(opened, opened.final_eval)
     print_where_to_look(opened.folder, opened.config.tracking.uri, storage=settings.storage)
     _print_replay(opened)
