@@ -150,7 +150,7 @@ class LabelVolume:
 
     @cached_property
     def labelled_clearance(self) -> float:
-        """How far the labelled plane's matrix and offset may be off without changing its slice; see `clearance`."""
+        """Allowed error of the labelled plane's matrix and offset that leaves its slice unchanged; see `clearance`."""
         plane = self.optimal_action
         assert plane is not None
         return clearance(self.spacing, plane.matrix, plane.offset_mm, self.slice_shape)

@@ -49,7 +49,7 @@ ENDED_WITHOUT_SCORE = (TrialState.FAIL, TrialState.PRUNED)
 
 
 class _Stored(Section):
-    """What a final evaluation is made of, as the study of the selection keeps it; see `FinalEvaluation`."""
+    """Settings of a final evaluation, as the study of the selection keeps them; see `FinalEvaluation`."""
 
     settings: FinalEvalSettings = Field(description="a section with top_k, min_seeds, max_seeds and judge_seeds")
     search_seed: int = Field(ge=0, le=LARGEST_SEARCH_SEED, description="the largest seed of the search")
@@ -140,7 +140,7 @@ class FinalEvaluation:
     def candidates(self) -> list[int]:
         """Return the control and the numbers of the best trials; nothing if no trial has finished."""
         best = best_trials(self.search, self.settings.top_k + 1)
-        # A trial with the values of the control is the control, wherever it comes from.
+        # A trial with the values of the control is the control, also of another study or preset.
         others = [trial.number for trial in best if renamed(searched_values(trial)) != self.control]
         # First, so that it wins where it is as good.
         return [CONTROL, *others[: self.settings.top_k]] if best and self.settings.top_k else []
