@@ -118,7 +118,7 @@ class StepCollector(Collector[CollectStats]):
         return (torch.tanh(actions) if is_sac else actions).cpu().numpy(), chosen_from.stddev.cpu().numpy()
 
     def _means_and_spreads(self, observations: Observed) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return what the actor answers, to the bit; plain layers without their modules take a third of the time."""
+        """Return the means and spreads of the actor, bit for bit; without its modules in a third of the time."""
         if self._layers is None:
             policy: Any = self.policy
             means_and_spreads: tuple[torch.Tensor, torch.Tensor] = policy.actor(observations)[0]

@@ -119,7 +119,7 @@ def run_tracked(
         if job_label is None:
             how = f"as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
             print_results(f"results ({'deterministic policy, ' if result else ''}{how})", reached)
-        tell("keeping the results, the video of an episode, and the policy")
+        tell("writing the results, the video of an episode, and the policy")
         record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)
         keep_results(tracked, result, reached, folder)
         if isinstance(setup.agent, Learner):
