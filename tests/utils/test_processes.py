@@ -1,0 +1,26 @@
+"""Processes that armscan starts."""
+
+import gc
+import subprocess
+from pathlib import Path
+
+from armscan.utils.processes import child_command
+
+ROOT = Path(__file__).parents[2]
+
+
+def print_threshold():
+    print("threshold", gc.get_threshold()[0])
+
+
+def test_child_runs_its_function_and_collects_garbage_rarely():
+    command = child_command("tests.utils.test_processes", print_threshold.__name__)
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert ended.stdout == "threshold 50000\n"
+
+
+def test_child_that_is_interrupted_while_it_imports_ends_as_interrupted(tmp_path):
+    (tmp_path / "slow_import.py").write_text("raise KeyboardInterrupt\n")
+    ended = subprocess.run(child_command("slow_import", "run"), cwd=tmp_path, capture_output=True, text=True)
+    assert ended.returncode == 130
+    assert not ended.stderr
