@@ -92,7 +92,7 @@ def reporting(attempt: Attempt) -> dict[str, float]:
     return {"mean_steps": 1.0}
 
 
-def composed(words: object) -> tuple[DictConfig, dict[str, str]]:
+def compose_run(words: object) -> tuple[DictConfig, dict[str, str]]:
     """Return a configuration without composing one."""
     return OmegaConf.create({"seed": 0}), {}
 
@@ -149,7 +149,7 @@ def work(phase: Phase, name: str) -> None:
 
 def work_in_threads(n_threads: int, number: int, barrier: Any, opened: partial[Phase]) -> None:
     """Run some of the workers in this process, once those of all processes are there."""
-    worker_module.composed = composed
+    worker_module.compose_run = compose_run
     worker_module.log = lambda text: None
     phases = [opened() for _ in range(n_threads)]
     threads = [threading.Thread(target=work, args=(phase, f"{number}-{i}")) for i, phase in enumerate(phases)]

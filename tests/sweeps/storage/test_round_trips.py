@@ -3,11 +3,11 @@
 import threading
 
 from armscan.sweeps.workers import worker as worker_module
-from benchmarks.sweeps.scaling import composed, phase_of, round_trips_counted, work
+from benchmarks.sweeps.scaling import compose_run, phase_of, round_trips_counted, work
 
 
 def test_worker_goes_to_the_storage_twelve_times_for_a_trial_with_ten_reports(postgres, tmp_path, monkeypatch):
-    monkeypatch.setattr(worker_module, "composed", composed)
+    monkeypatch.setattr(worker_module, "compose_run", compose_run)
     uri, here, counts = postgres.make_database(), threading.get_ident(), []
     for n_trials in (3, 8):
         phase = phase_of(uri, None, tmp_path, n_trials)
