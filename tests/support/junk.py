@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from tests.volumes.test_damaged import anything, refuses
+from tests.volumes.test_damaged import anything, is_answered, refuses
 
-__all__ = ["SETTINGS", "junk", "refuses"]
+__all__ = ["SETTINGS", "is_answered", "junk", "refuses"]
 
 SETTINGS = settings(
     max_examples=40,
