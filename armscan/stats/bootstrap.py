@@ -39,6 +39,11 @@ class Estimate(NamedTuple):
     low: float
     high: float
 
+    def clipped(self, least: float, most: float) -> Estimate:
+        """Return it with an interval that ends at the bounds of the figure, of which Student's knows nothing."""
+        low, high = np.clip((self.low, self.high), least, most)
+        return Estimate(self.value, float(low), float(high))
+
 
 def mean(samples: FloatArray) -> FloatArray:
     """Return the mean over the last axis, ignoring NaN; NaN: all values are NaN."""

@@ -19,14 +19,12 @@ from armscan.stats.bootstrap import LEVEL, Estimate
 from armscan.volumes.plane import FloatArray
 
 
-def paired_difference(ours: FloatArray, theirs: FloatArray, *, most: float = np.inf) -> Estimate:
+def paired_difference(ours: FloatArray, theirs: FloatArray) -> Estimate:
     """Return the mean difference, ours less theirs, with its 95 % interval for other seeds and other volumes.
 
     Args:
         ours: Our scores, shape (seeds, volumes), all finite.
         theirs: Their scores of the same seeds and volumes.
-        most: Largest difference that there can be, such as 1 for rates; Student's interval, which knows none, ends
-            there. Default: there is none.
 
     Returns:
         The estimate; without an interval if there is one seed, which says nothing of others.
@@ -38,8 +36,7 @@ def paired_difference(ours: FloatArray, theirs: FloatArray, *, most: float = np.
         raise InvalidValueError(f"scores have the shapes {ours.shape} and {theirs.shape}, but both must have the same")
     means, halves = crossed_mean(ours - theirs)
     halves = halves if len(ours) > 1 else np.nan
-    low, high = np.clip((means - halves, means + halves), -most, most)
-    return Estimate(float(means), float(low), float(high))
+    return Estimate(float(means), float(means - halves), float(means + halves))
 
 
 def crossed_mean(values: FloatArray) -> tuple[Any, Any]:

@@ -42,9 +42,7 @@ def beside_random(
         return figures
     scores = np.array([[each[name] for name in theirs] for each in ours])
     mean, half = crossed_mean(scores - np.array([*theirs.values()]))
-    # No difference of rates is larger.
-    low, high = np.clip((mean - half, mean + half), -1.0, 1.0)
-    above = Estimate(float(mean), float(low), float(high))
+    above = Estimate(float(mean), float(mean - half), float(mean + half)).clipped(-1.0, 1.0)
     return replace(figures, estimates={**figures.estimates, ABOVE_RANDOM: above})
 
 

@@ -57,5 +57,5 @@ def test_trainings_of_other_seeds_or_volumes_are_refused():
 
 def test_interval_ends_at_the_largest_difference_that_there_can_be():
     ours, theirs = np.array([[0.0, 1.0, 0.5], [0.0, 1.0, 0.5]]), np.array([[1.0, 0.0, 0.5], [1.0, 0.0, 0.5]])
-    assert paired_difference(ours, theirs, most=1.0) == (0.0, -1.0, 1.0)
+    assert paired_difference(ours, theirs).clipped(-1.0, 1.0) == (0.0, -1.0, 1.0)
     assert paired_difference(ours, theirs).high > 1.0

@@ -224,5 +224,6 @@ def _differences(
         is_higher_better = objectives[name] == MAXIMIZE if name in objectives else is_rate(name)
         sign = 1.0 if is_higher_better else -1.0
         probability = improvement_of_few_seeds(sign * ours, sign * theirs)
-        paired = paired_difference(ours, theirs, most=1.0 if is_rate(name) else math.inf)
+        paired = paired_difference(ours, theirs)
+        paired = paired.clipped(-1.0, 1.0) if is_rate(name) else paired
         yield Difference(name, is_higher_better, paired, probability)

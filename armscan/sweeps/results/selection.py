@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 from optuna.trial import TrialState
 from plotly.graph_objects import Figure
 
@@ -75,15 +74,12 @@ def candidates_of(final: FinalEvaluation) -> list[Candidate]:
     for number, scores in final.scores().items():
         standing = race.standings[number]
         value, *ends = (sign * each for each in standing.estimate)
-        low, high = sorted(ends)
-        if is_rate(objective_of(final)):
-            # Student's interval knows no bounds.
-            low, high = np.clip((low, high), 0.0, 1.0).tolist()
+        estimate = Estimate(value, *sorted(ends))
         found.append(
             Candidate(
                 number,
                 {seed: sign * score for seed, score in sorted(scores.items())},
-                Estimate(value, low, high),
+                estimate.clipped(0.0, 1.0) if is_rate(objective_of(final)) else estimate,
                 standing.n_seeds,
                 _outcome(race, number, scores),
                 "" if number == CONTROL else " ".join(overrides_of(searched[number].params)),
