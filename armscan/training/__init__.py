@@ -3,8 +3,8 @@
 from armscan.stats.on_plane import ON_PLANE, OnPlane, check_on_plane
 from armscan.training.baselines import evaluate_baselines
 from armscan.training.callbacks import Callback, EpochReport
-from armscan.training.checkpoint import load_checkpoint, load_weights, save_checkpoint
-from armscan.training.checkpointing import CheckpointProvenance, resume_from_checkpoint, take_over_checkpoints
+from armscan.training.checkpoint_file import load_checkpoint, load_weights, save_checkpoint
+from armscan.training.checkpoints import CheckpointProvenance, resume_from_checkpoint, take_over_checkpoints
 from armscan.training.domain import TrainingDomain
 from armscan.training.episode_results import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation
 from armscan.training.episodes import evaluate

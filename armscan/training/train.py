@@ -12,8 +12,8 @@ from armscan.agents.protocols import Learner
 from armscan.agents.schedule import Segment, read_schedule
 from armscan.errors import InvalidValueError
 from armscan.training.callbacks import Callback, EpochReport
-from armscan.training.checkpoint import load_checkpoint
-from armscan.training.checkpointing import CheckpointProvenance, save_checkpoints
+from armscan.training.checkpoint_file import load_checkpoint
+from armscan.training.checkpoints import CheckpointProvenance, save_checkpoints
 from armscan.training.episode_results import BEST_BY, SUCCESS, Evaluation
 from armscan.utils.files import BEST_CHECKPOINT
 from armscan.utils.validation import check_choice, check_float, check_int

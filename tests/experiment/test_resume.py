@@ -176,10 +176,10 @@ def moments(drawn):
         Moment("torch:save", 1, drawn.uniform(0.0, 0.003)),
         Moment("os:fsync", drawn.randrange(3, 5)),
         Moment("pathlib:Path.replace", 4),
-        Moment("armscan.training.checkpointing:save_checkpoint", 1, 900.0),
+        Moment("armscan.training.checkpoints:save_checkpoint", 1, 900.0),
         # Resumed, the best is written again; then the next epoch's.
         Moment("torch:save", 1, drawn.uniform(0.0, 0.003)),
-        Moment("armscan.training.checkpointing:save_checkpoint", 2, 900.0),
+        Moment("armscan.training.checkpoints:save_checkpoint", 2, 900.0),
         Moment(collecting, drawn.randrange(1, 13), soon()),
         # Between a checkpoint and its entry, and around the delivery of an entry.
         Moment("armscan.tracking.run:TrackedRun.on_epoch"),

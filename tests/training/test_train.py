@@ -14,7 +14,7 @@ from armscan.training import (
     EpisodeResult,
     Evaluation,
     SolvedCriterion,
-    checkpointing,
+    checkpoints,
     load_checkpoint,
     resume_from_checkpoint,
     take_over_checkpoints,
@@ -169,7 +169,7 @@ class Killed(BaseException):
 
 def cut_off(folder, monkeypatch, n_writes):
     """Train until so many checkpoints were written, then kill the process."""
-    save, written = checkpointing.save_checkpoint, []
+    save, written = checkpoints.save_checkpoint, []
 
     def save_or_die(*arguments):
         if len(written) == n_writes:
@@ -177,11 +177,11 @@ def cut_off(folder, monkeypatch, n_writes):
         written.append(arguments)
         save(*arguments)
 
-    monkeypatch.setattr(checkpointing, "save_checkpoint", save_or_die)
+    monkeypatch.setattr(checkpoints, "save_checkpoint", save_or_die)
     recorder, script = Recorder(), iter(SCRIPT)
     with pytest.raises(Killed):
         train(ScriptedLearner(), BUDGET, lambda: next(script), folder, [recorder], provenance=PROVENANCE)
-    monkeypatch.setattr(checkpointing, "save_checkpoint", save)
+    monkeypatch.setattr(checkpoints, "save_checkpoint", save)
     return recorder
 
 
@@ -274,7 +274,7 @@ def test_take_up_refuses_a_best_checkpoint_that_is_missing_or_not_the_best(tmp_p
 
 @pytest.mark.parametrize("text", [None, "", "[]", "[1]", '[{"epoch": 1}]', '{"a": 1}'])
 def test_take_up_refuses_a_checkpoint_without_its_course(tmp_path, text):
-    checkpointing.save_checkpoint(tmp_path / LAST_CHECKPOINT, {}, PROVENANCE.facts() | {"reports": text})
+    checkpoints.save_checkpoint(tmp_path / LAST_CHECKPOINT, {}, PROVENANCE.facts() | {"reports": text})
     with pytest.raises(CheckpointError, match="holds no reports of the epochs so far"):
         resume_from_checkpoint(ScriptedLearner(), tmp_path, PROVENANCE)
 

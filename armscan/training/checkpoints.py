@@ -1,4 +1,4 @@
-"""Checkpointing: save the training after each epoch, resume it from the last checkpoint.
+"""Checkpoints of a training: saved after each epoch, and resumed from.
 
 `last.pt` holds the learner's full state and the reports of all epochs. It is written first, then `best.pt`, then the
 callbacks are called. After a kill at any moment `last.pt` is therefore complete, and the rest is restored from it: if
@@ -17,7 +17,7 @@ from armscan.agents.protocols import Learner
 from armscan.errors import CheckpointError
 from armscan.stats.on_plane import ON_PLANE
 from armscan.training.callbacks import EpochReport
-from armscan.training.checkpoint import load_checkpoint, save_checkpoint
+from armscan.training.checkpoint_file import load_checkpoint, save_checkpoint
 from armscan.training.episode_results import Evaluation
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprints_in
 from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
