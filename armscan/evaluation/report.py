@@ -18,7 +18,7 @@ from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import beside_random, headline
 from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
-from armscan.training.result_table import interval_text
+from armscan.training.titles import interval_text
 
 TOTAL = "all volumes"
 # What MLflow takes in the name of a metric.

@@ -16,7 +16,7 @@ from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import crossed_mean
 from armscan.training.episode_results import Evaluation
 from armscan.training.metrics import MetricEstimates
-from armscan.training.result_table import interval_text
+from armscan.training.titles import interval_text
 
 # Difference of the leading on-plane rates, among the figures of an agent.
 ABOVE_RANDOM = "on_plane_above_random"

@@ -10,7 +10,6 @@ import html
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -18,6 +17,7 @@ from rich.text import Text
 
 from armscan.stats.bootstrap import Estimate
 from armscan.training.metrics import MetricEstimates
+from armscan.training.titles import LEADING, OLDER, QUANTITIES, Quantity, interval_text
 from armscan.utils.markdown import markdown_table
 
 # The most results that stand side by side; more of them are lines of their own.
@@ -31,54 +31,9 @@ HOW = (
     "of them. On plane: the last plane is this close to the labelled one. Success: the reward accepts the last plane, "
     "which may be another."
 )
-
-
+COUNTS = {"episodes": "n_episodes", "started solved": "n_started_solved", "seeds": "n_seeds", "volumes": "n_volumes"}
 # A heading, and a cell for each line.
 Column = tuple[str, Sequence[str]]
-
-
-class Quantity(NamedTuple):
-    """A column of the table.
-
-    Args:
-        metric: Name of the metric.
-        title: Heading of the column, the statistic last, such as `steps, mean`.
-        form: Format of its value.
-    """
-
-    metric: str
-    title: str
-    form: str
-
-    @property
-    def heading(self) -> str:
-        """The title in two lines, as the cells are."""
-        return self.title.replace(", ", ",\n", 1)
-
-
-QUANTITIES = (
-    Quantity("median_distance_mm", "distance mm, median", "{:.1f}"),
-    Quantity("p90_distance_mm", "distance mm, 90th percentile", "{:.1f}"),
-    Quantity("median_distance_deg", "angle °, median", "{:.1f}"),
-    Quantity("p90_distance_deg", "angle °, 90th percentile", "{:.1f}"),
-    Quantity("median_expected_mm", "expected mm, median", "{:.1f}"),
-    Quantity("median_expected_deg", "expected °, median", "{:.1f}"),
-    Quantity("median_nerve_area_error_mm2", "nerve area off mm², median", "{:.2f}"),
-    Quantity("median_nerve_area_error_percent", "nerve area off %, median", "{:.1f}"),
-    Quantity("success_rate", "success, by reward", "{:.1%}"),
-    Quantity("mean_steps", "steps, mean", "{:.2f}"),
-    Quantity("iqm_steps", "steps, IQM", "{:.2f}"),
-    *(Quantity(f"mean_dice_{name}", f"Dice {name}, mean", "{:.2f}") for name in ("bones", "tendons", "artery")),
-)
-# Of runs by older versions, which have kept nothing better.
-OLDER = {
-    Quantity("mean_distance_mm", "distance mm, mean", "{:.1f}"): "median_distance_mm",
-    Quantity("mean_distance_deg", "angle °, mean", "{:.1f}"): "median_distance_deg",
-    Quantity("mean_dice", "Dice, mean", "{:.2f}"): "mean_dice_bones",
-}
-# What a line has place for first, after the leading rate.
-MOST_WANTED = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
-COUNTS = {"episodes": "n_episodes", "started solved": "n_started_solved", "seeds": "n_seeds", "volumes": "n_volumes"}
 
 
 @dataclass(frozen=True)
@@ -177,7 +132,7 @@ class ResultTable:
         for title, count in COUNTS.items():
             columns[count] = title.replace(" ", "\n"), [_count(each, count) for each in self.results.values()]
         # Those that matter most first; sorting leaves the others in their order.
-        leading = (next(iter(columns)), *MOST_WANTED)
+        leading = (next(iter(columns)), *LEADING)
         by_need = sorted(columns, key=lambda name: leading.index(name) if name in leading else len(leading))
         wanted = [columns[name] for name in by_need]
         legend: list[Text] = []
@@ -220,15 +175,6 @@ def with_baselines(
 def is_known(estimate: Estimate) -> bool:
     """Return whether a figure was measured."""
     return not math.isnan(estimate.value)
-
-
-def interval_text(estimate: Estimate, form: str) -> str:
-    """Return an interval such as `1.5–2.0`; empty if there is none."""
-    if math.isnan(estimate.low):
-        return ""
-    low, high = (form.format(end).removesuffix("%") for end in estimate[1:])
-    # A dash between numbers below zero would be read as another minus.
-    return f"{low}{' to ' if estimate.low < 0 else '–'}{high}"
 
 
 def _cell(result: MetricEstimates, column: Quantity, around: str = "{}") -> tuple[str, str]:

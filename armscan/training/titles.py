@@ -1,25 +1,64 @@
-"""Titles of metrics, and formats of their values."""
+"""Titles of metrics, and their values and intervals as texts."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from typing import NamedTuple
 
+from armscan.stats.bootstrap import Estimate
 from armscan.stats.on_plane import limits_among
-from armscan.training.result_table import QUANTITIES
 
+
+class Quantity(NamedTuple):
+    """A metric as tables show it.
+
+    Args:
+        metric: Name of the metric.
+        title: Title, the statistic last, such as `steps, mean`.
+        form: Format of its value.
+    """
+
+    metric: str
+    title: str
+    form: str
+
+    @property
+    def heading(self) -> str:
+        """The title in two lines, as the cells of a table are."""
+        return self.title.replace(", ", ",\n", 1)
+
+
+QUANTITIES = (
+    Quantity("median_distance_mm", "distance mm, median", "{:.1f}"),
+    Quantity("p90_distance_mm", "distance mm, 90th percentile", "{:.1f}"),
+    Quantity("median_distance_deg", "angle °, median", "{:.1f}"),
+    Quantity("p90_distance_deg", "angle °, 90th percentile", "{:.1f}"),
+    Quantity("median_expected_mm", "expected mm, median", "{:.1f}"),
+    Quantity("median_expected_deg", "expected °, median", "{:.1f}"),
+    Quantity("median_nerve_area_error_mm2", "nerve area off mm², median", "{:.2f}"),
+    Quantity("median_nerve_area_error_percent", "nerve area off %, median", "{:.1f}"),
+    Quantity("success_rate", "success, by reward", "{:.1%}"),
+    Quantity("mean_steps", "steps, mean", "{:.2f}"),
+    Quantity("iqm_steps", "steps, IQM", "{:.2f}"),
+    *(Quantity(f"mean_dice_{name}", f"Dice {name}, mean", "{:.2f}") for name in ("bones", "tendons", "artery")),
+)
+# Of runs by older versions, which have kept nothing better.
+OLDER = {
+    Quantity("mean_distance_mm", "distance mm, mean", "{:.1f}"): "median_distance_mm",
+    Quantity("mean_distance_deg", "angle °, mean", "{:.1f}"): "median_distance_deg",
+    Quantity("mean_dice", "Dice, mean", "{:.2f}"): "mean_dice_bones",
+}
 TITLES = {
-    **{each.metric: each.title for each in QUANTITIES},
+    **{each.metric: each.title for each in (*QUANTITIES, *OLDER)},
     "mean_return": "return, mean",
     "mean_final_reward": "reward of the last plane, mean",
     "mean_best_reward": "best reward, mean",
-    "mean_distance_mm": "distance mm, mean",
-    "mean_distance_deg": "angle °, mean",
-    "mean_dice": "Dice, mean",
     "env_steps": "environment steps",
     "training_s": "training, s",
     "solved": "solved, share of seeds",
 }
-# What a few lines have place for, beside the on-plane rates.
+# Shown where space is short, after the on-plane rates.
 LEADING = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
 COSTS = ("env_steps", "training_s")
 FORMS = {each.metric: each.form for each in QUANTITIES} | {"mean_return": "{:.2f}", "training_s": "{:.1f}"}
@@ -46,3 +85,12 @@ def value_text(metric: str, value: float) -> str:
     """Return a value of a metric as tables show it: a share in percent, distances with one digit after the point."""
     form = "{:.1%}" if is_rate(metric) else "{:,.0f}" if abs(value) >= 1000 else FORMS.get(metric, "{:.4g}")
     return form.format(value)
+
+
+def interval_text(estimate: Estimate, form: str) -> str:
+    """Return an interval such as `1.5–2.0`; empty if there is none."""
+    if math.isnan(estimate.low):
+        return ""
+    low, high = (form.format(end).removesuffix("%") for end in estimate[1:])
+    # A dash between numbers below zero would be read as another minus.
+    return f"{low}{' to ' if estimate.low < 0 else '–'}{high}"
