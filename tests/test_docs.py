@@ -207,7 +207,7 @@ def test_commands_of_pages_about_a_run_succeed(page, words, trained, data_folder
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("page", ["first-study", "studies", "extending"])
+@pytest.mark.parametrize("page", ["first-study", "write-study", "extending"])
 def test_studies_of_pages_can_be_planned(page, tmp_path):
     write_files(DOCS / f"{page}.md", tmp_path)
     (sweep,) = (tmp_path / "sweeps").glob("*.yaml")
