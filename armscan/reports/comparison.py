@@ -25,7 +25,6 @@ from armscan.reports.significance import (
     final_metrics,
 )
 from armscan.reports.videos import videos
-from armscan.stats.aggregation import FEWEST_SEEDS
 from armscan.stats.bootstrap import Estimate
 from armscan.training import MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
@@ -48,9 +47,9 @@ HOW_FINAL = (
 HOW_BETTER = (
     "How likely a training of the row's group is better than one of the column's group: the share of pairs of seeds, "
     "ties counting half, averaged over the test volumes "
-    '(<a href="https://arxiv.org/abs/2108.13264">Agarwal et al. 2021</a>), with a 95 % interval by a bootstrap of the '
-    "seeds of both groups (of many groups shown under the pointer). 0.5 is no difference; in bold where the interval "
-    "leaves it out and both groups have four seeds or more. Columns are numbered as the rows."
+    '(<a href="https://arxiv.org/abs/2108.13264">Agarwal et al. 2021</a>), with a 95 % interval for other seeds '
+    '(<a href="https://doi.org/10.1002/sim.2324">Newcombe 2006</a>; of many groups shown under the pointer). 0.5 is no '
+    "difference; in bold where the interval leaves it out. Columns are numbered as the rows."
 )
 
 
@@ -198,10 +197,8 @@ def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
     is_few = len(groups) <= MANY
     for pair in pairs:
         theirs = complement(pair.probability) if pair.probability else None
-        n_seeds = min(len(evaluations_by_seed(groups[number])) for number in (pair.ours, pair.theirs))
-        how = {"is_few": is_few, "is_sure": n_seeds >= FEWEST_SEEDS}
-        cells[pair.ours, pair.theirs] = _cell(pair.probability, **how)
-        cells[pair.theirs, pair.ours] = _cell(theirs, **how)
+        cells[pair.ours, pair.theirs] = _cell(pair.probability, is_few=is_few)
+        cells[pair.theirs, pair.ours] = _cell(theirs, is_few=is_few)
     numbers = range(len(groups))
     rows = [
         {"": groups[row].label}
@@ -214,8 +211,8 @@ def _matrix(groups: Sequence[Group], pairs: Sequence[Pair]) -> str:
     return table(rows, what="groups", kind="matrix")
 
 
-def _cell(probability: Estimate | None, *, is_few: bool, is_sure: bool) -> Markup:
-    """Return a cell of the matrix, in bold if there are seeds enough and the interval leaves out 0.5."""
+def _cell(probability: Estimate | None, *, is_few: bool) -> Markup:
+    """Return a cell of the matrix, in bold if the interval leaves out 0.5."""
     if probability is None:
         return Markup("<div><small>other volumes</small></div>")
     value, low, high = probability
@@ -223,7 +220,7 @@ def _cell(probability: Estimate | None, *, is_few: bool, is_sure: bool) -> Marku
     strength = abs(value - 0.5)
     shade = f"rgba({'44, 160, 44' if value >= 0.5 else '214, 39, 40'}, {strength:.2f})"
     ends = "one seed" if math.isnan(low) else f"{low:.2f} to {high:.2f}"
-    shown = f"<b>{value:.2f}</b>" if is_sure and not low <= 0.5 <= high else f"{value:.2f}"
+    shown = f"<b>{value:.2f}</b>" if low > 0.5 or high < 0.5 else f"{value:.2f}"
     below = f"<br><small>{ends}</small>" if is_few else ""
     return Markup(f'<div style="background: {shade}" title="{ends}">{shown}{below}</div>')
 

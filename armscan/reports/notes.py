@@ -44,8 +44,8 @@ def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
     if few := [group.number for group in groups if 1 < group.n_seeds < FEWEST_SEEDS]:
         yield (
             f"{_numbered(few, groups)}: of two or three seeds the 95 % interval of a curve is only the range from the "
-            "lowest to the highest, which holds the median of all seeds in 50 % or 75 % of cases. The other intervals "
-            "of so few seeds are as little to be relied on."
+            "lowest to the highest, which holds the median of all seeds in 50 % or 75 % of cases. Intervals of the "
+            "final figures are too narrow, too; those of the probabilities below are not."
         )
 
 

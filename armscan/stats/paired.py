@@ -34,9 +34,21 @@ def paired_difference(ours: FloatArray, theirs: FloatArray) -> Estimate:
     """
     if ours.shape != theirs.shape:
         raise InvalidValueError(f"scores have the shapes {ours.shape} and {theirs.shape}, but both must have the same")
-    means, halves = crossed_mean(ours - theirs)
-    halves = halves if len(ours) > 1 else np.nan
-    return Estimate(float(means), float(means - halves), float(means + halves))
+    return mean_over_seeds(ours - theirs)
+
+
+def mean_over_seeds(scores: FloatArray) -> Estimate:
+    """Return the mean score with its 95 % interval for other seeds and other volumes.
+
+    Args:
+        scores: Scores, shape (seeds, volumes).
+
+    Returns:
+        The estimate; without an interval if there is one seed, or a score is NaN.
+    """
+    mean, half = crossed_mean(scores)
+    half = half if len(scores) > 1 else np.nan
+    return Estimate(float(mean), float(mean - half), float(mean + half))
 
 
 def crossed_mean(values: FloatArray) -> tuple[Any, Any]:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from armscan.stats.aggregation import band_over_seeds, improvement_of_few_seeds
+from armscan.stats.aggregation import band_over_seeds, probability_of_improvement
 from armscan.stats.paired import crossed_mean
 from armscan.sweeps.scheduling.race import race
 
@@ -80,7 +80,7 @@ def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float, *, see
         differences = own[study, chosen] - own[study, 0]
         of_seeds = differences.mean(axis=-1, keepdims=True)
         band = band_over_seeds(of_seeds)
-        improvement = improvement_of_few_seeds(own[study, chosen], own[study, 0])
+        improvement = probability_of_improvement(own[study, chosen], own[study, 0])
         held.append(
             (
                 holds(differences, truth),

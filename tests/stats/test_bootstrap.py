@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from armscan.errors import InvalidValueError
-from armscan.stats.bootstrap import estimates, mean, quantile, wilson
+from armscan.stats.bootstrap import estimates, interquartile_mean, mean, quantile, wilson
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 0.95, 1.0])
@@ -22,6 +22,11 @@ def test_statistics_leave_out_what_is_not_there(share):
         warnings.simplefilter("ignore", RuntimeWarning)
         np.testing.assert_allclose(mean(samples), np.nanmean(samples, axis=1))
         np.testing.assert_allclose(quantile(share)(samples), np.nanquantile(samples, share, axis=1))
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30))
+def test_interquartile_mean_is_the_trimmed_mean_of_what_is_there(values):
+    assert interquartile_mean(np.array([math.nan, *values])) == pytest.approx(stats.trim_mean(values, 0.25), abs=1e-6)
 
 
 def test_interval_of_one_volume_is_the_usual_bootstrap_of_its_episodes():

@@ -12,7 +12,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.experiment.results import volume_notes
-from armscan.stats.aggregation import improvement_of_few_seeds
+from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
 from armscan.sweeps.results.summary import OF_TEST, ConfigResult, final_results, final_table, scores_of
@@ -223,7 +223,7 @@ def _differences(
         ours, theirs = scores[: len(chosen)], scores[len(chosen) :]
         is_higher_better = objectives[name] == MAXIMIZE if name in objectives else is_rate(name)
         sign = 1.0 if is_higher_better else -1.0
-        probability = improvement_of_few_seeds(sign * ours, sign * theirs)
+        probability = probability_of_improvement(sign * ours, sign * theirs)
         paired = paired_difference(ours, theirs)
         paired = paired.clipped(-1.0, 1.0) if is_rate(name) else paired
         yield Difference(name, is_higher_better, paired, probability)

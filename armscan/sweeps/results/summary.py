@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.errors import StudyError
-from armscan.stats.aggregation import over_seeds
 from armscan.stats.on_plane import limits_among
+from armscan.stats.paired import mean_over_seeds
 from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
 from armscan.sweeps.study.final_eval import name_of
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
@@ -95,11 +95,11 @@ def _episodes(trial: FrozenTrial) -> dict[str, Evaluation]:
 
 
 def _of_means(of_seeds: Sequence[Mapping[str, float]]) -> MetricEstimates:
-    """Return the means of the metrics that all seeds have, with intervals that draw seeds."""
+    """Return the means of the metrics that all seeds have, with intervals for other seeds and volumes."""
     common = set.intersection(*map(set, of_seeds))
     of_seeds = [{name: value for name, value in metrics.items() if name in common} for metrics in of_seeds]
     names = [name for name in of_seeds[0] if name.startswith(OF_TEST) and not OF_VOLUME.fullmatch(name)]
-    means = {name.removeprefix(OF_TEST): over_seeds(scores_of(name, of_seeds), np.mean) for name in names}
+    means = {name.removeprefix(OF_TEST): mean_over_seeds(scores_of(name, of_seeds)) for name in names}
     volumes = {match[1] for name in common if (match := OF_VOLUME.fullmatch(name))}
     episodes, solved = (sum(int(each.get(OF_TEST + name, 0)) for each in of_seeds) for name in COUNTS[1:])
     return MetricEstimates(len(of_seeds), len(volumes), episodes, solved, means, limits_among(means))

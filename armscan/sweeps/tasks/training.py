@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import optuna
 from omegaconf import DictConfig
 
@@ -20,7 +21,7 @@ from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
 from armscan.experiment.results import RunResult
 from armscan.experiment.runner import VIDEO_SEED, log_result, train_agent
-from armscan.stats.aggregation import interquartile_mean
+from armscan.stats.bootstrap import interquartile_mean
 from armscan.sweeps.scheduling.state import ENV_STEPS
 from armscan.sweeps.tasks.attempt import STUDY_TAG, Attempt, volumes_of
 from armscan.sweeps.tasks.generation import begin_generation, best_of_generation, inherited
@@ -117,7 +118,8 @@ class TrainingTask:
             if seed not in attempt.seeds_done:
                 attempt.keep_seed(seed, _trained(attempt, seed))
         of_seeds = [attempt.seeds_done[seed] for seed in attempt.seeds]
-        return {name: float(interquartile_mean([metrics[name] for metrics in of_seeds])) for name in of_seeds[0]}
+        scores = {name: np.array([metrics[name] for metrics in of_seeds]) for name in of_seeds[0]}
+        return {name: float(interquartile_mean(of_name)) for name, of_name in scores.items()}
 
     def validate(self, attempt: Attempt) -> dict[str, float]:
         """Train, and play episodes on the validation volumes that chose no weights; returns their metrics."""

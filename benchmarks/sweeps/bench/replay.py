@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from optuna.trial import Trial, TrialState
 
 from armscan.config.compose import compose
-from armscan.stats.aggregation import interquartile_mean
+from armscan.stats.bootstrap import interquartile_mean
 from armscan.sweeps.scheduling.race import race
 from armscan.volumes.plane import FloatArray
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
