@@ -15,6 +15,7 @@ from plotly.subplots import make_subplots
 from armscan.reports.chart_style import GREY, RATE_AXIS, mode
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
+from armscan.stats.aggregation import FEWEST_SEEDS
 from armscan.training import MetricEstimates
 from armscan.training.titles import is_rate, title_of
 
@@ -155,11 +156,12 @@ def _traces(of_axes: Sequence[Curve], colour: str, *, is_detailed: bool) -> Iter
     """Yield the band, the lines of the seeds, and the line of all of them together."""
     curve = of_axes[0]
     if curve.n_seeds > 1 and is_detailed:
-        unseen = {"mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
-        faint = "rgba({}, {}, {}, 0.2)".format(*hex_to_rgb(colour))
-        yield Trace(BANDS, unseen, [_points(each.places, each.band.lows) for each in of_axes])
-        filled = unseen | {"fill": "tonexty", "fillcolor": faint}
-        yield Trace(BANDS, filled, [_points(each.places, each.band.highs) for each in of_axes])
+        if curve.n_seeds >= FEWEST_SEEDS:
+            unseen = {"mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
+            faint = "rgba({}, {}, {}, 0.2)".format(*hex_to_rgb(colour))
+            yield Trace(BANDS, unseen, [_points(each.places, each.band.lows) for each in of_axes])
+            filled = unseen | {"fill": "tonexty", "fillcolor": faint}
+            yield Trace(BANDS, filled, [_points(each.places, each.band.highs) for each in of_axes])
         thin = {"line": {"color": colour, "width": 1}, "opacity": 0.5}
         for label, (places, _) in curve.lines.items():
             said = {"mode": "lines" if len(places) > 1 else "lines+markers", "hovertemplate": f"%{{y:.3g}} ({label})"}
@@ -180,8 +182,9 @@ def _points(places: Iterable[float], values: Iterable[float]) -> Points:
 
 def _said(curve: Curve) -> list[str]:
     """Return the hover text of each point of a curve."""
-    if curve.n_seeds == 1:
-        return [f"{value:.3g} (one seed)" for value in curve.band.values]
+    if curve.n_seeds < FEWEST_SEEDS:
+        n_seeds = f"{curve.n_seeds} seed{'s' if curve.n_seeds > 1 else ''}"
+        return [f"{value:.3g} ({n_seeds})" for value in curve.band.values]
     return [f"{value:.3g} ({low:.3g} to {high:.3g})" for value, low, high in zip(*curve.band, strict=True)]
 
 

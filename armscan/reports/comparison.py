@@ -33,11 +33,10 @@ from armscan.training.result_table import with_baselines
 from armscan.training.titles import title_of
 
 HOW_CURVES = (
-    "On the validation volumes, after each epoch. Thick: the mean of the seeds of a group. Band: its 95 % interval by "
-    "a bootstrap of the seeds; a group of one seed has none. Thin: each seed. A training that ran to its end before "
+    "On the validation volumes, after each epoch. Thick: the mean of the seeds of a group. Band: its 95 % interval "
+    "for other seeds (Student's), if there are three or more. Thin: each seed. A training that ran to its end before "
     "others of its group is carried on with its last value; where one was cut off or is still running, the curve of "
-    "its group ends. "
-    "Seconds are wall time of training and validation, on the machine of the run."
+    "its group ends. Seconds are wall time of training and validation, on the machine of the run."
 )
 MEANS_ALONE = "Of so many groups only the means are drawn: curves.csv has the bands, seed_curves.csv the seeds."
 HOW_FINAL = (

@@ -9,6 +9,9 @@ from armscan.reports.groups import Group, differing_rules
 from armscan.reports.load import TrackedTraining
 from armscan.stats.aggregation import FEWEST_SEEDS
 
+# With as many seeds or more, the intervals of final figures are nearly as wide as they should be.
+MANY_SEEDS = 5
+
 
 def notes_on(groups: Sequence[Group], left_out: Sequence[TrackedTraining], *, has_other_volumes: bool) -> str:
     """Return the notes as a list, nothing if there are none; `left_out` are trainings that repeat another one."""
@@ -41,11 +44,10 @@ def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
             f"{_numbered(single, groups)}: one seed says nothing of how others would go; intervals are of volumes and "
             "episodes alone."
         )
-    if few := [group.number for group in groups if 1 < group.n_seeds < FEWEST_SEEDS]:
+    if few := [group.number for group in groups if 1 < group.n_seeds < MANY_SEEDS]:
         yield (
-            f"{_numbered(few, groups)}: of two or three seeds the 95 % interval of a curve is only the range from the "
-            "lowest to the highest, which holds the median of all seeds in 50 % or 75 % of cases. Intervals of the "
-            "final figures are too narrow, too; those of the probabilities below are not."
+            f"{_numbered(few, groups)}: of few seeds the intervals of the final figures are too narrow; those of "
+            f"curves (from {FEWEST_SEEDS} seeds on) and of the probabilities below are not."
         )
 
 

@@ -1,8 +1,7 @@
-"""Aggregate trainings with several seeds, as Agarwal et al. 2021 (arXiv:2108.13264) recommend.
+"""Aggregate trainings with several seeds: bands of curves, and how likely one group is better than another.
 
-Bands of curves are percentile bootstraps of the seeds, with generators of their own: the same numbers give the same
-band. With two or three seeds a band is just the range from the lowest to the highest; with four or more it is an
-interval, though somewhat too narrow for few.
+Agarwal et al. 2021 (arXiv:2108.13264) recommend both figures, with intervals by bootstraps of the seeds. With fewer
+than ten seeds these are too narrow, so the intervals here are Student's and Newcombe's.
 """
 
 from __future__ import annotations
@@ -13,15 +12,15 @@ from typing import NamedTuple
 import numpy as np
 
 from armscan.errors import InvalidValueError
-from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
+from armscan.stats.bootstrap import LEVEL, Estimate
 from armscan.volumes.plane import FloatArray
 
-# With fewer seeds an interval is no more than their range.
-FEWEST_SEEDS = 4
+# With fewer seeds a band would be wider than a chart.
+FEWEST_SEEDS = 3
 # Steps of a bisection from 0 to 1, to the last digit of a number.
 N_HALVINGS = 53
-# Quantiles at the ends of an interval.
-ENDS = (1 - LEVEL) / 2, (1 + LEVEL) / 2
+# Quantile at the upper end of an interval.
+UPPER = (1 + LEVEL) / 2
 
 
 class Band(NamedTuple):
@@ -33,19 +32,21 @@ class Band(NamedTuple):
 
 
 def band_over_seeds(scores: FloatArray) -> Band:
-    """Return the mean over the seeds at each point, with an interval; a resample has the same seeds at all points.
+    """Return the mean over the seeds at each point, with Student's 95 % interval for other seeds.
 
     Args:
         scores: Scores, shape (seeds, points), all finite.
 
     Returns:
-        The band, without an interval if there is one seed.
+        The band, without an interval if there are fewer than `FEWEST_SEEDS` seeds.
     """
-    values = scores.mean(axis=0)
-    if len(scores) < 2 or not scores.size:
-        return Band(values, *(np.full(len(values), np.nan) for _ in range(2)))
-    drawn = _times_drawn(len(scores), np.random.default_rng(0)) @ scores / len(scores)
-    return Band(values, *np.quantile(drawn, ENDS, axis=0))
+    from scipy.special import stdtrit
+
+    means, n_seeds = scores.mean(axis=0), len(scores)
+    if n_seeds < FEWEST_SEEDS:
+        return Band(means, *(np.full(len(means), np.nan) for _ in range(2)))
+    half = stdtrit(n_seeds - 1, UPPER) * scores.std(axis=0, ddof=1) / n_seeds**0.5
+    return Band(means, means - half, means + half)
 
 
 def probability_of_improvement(ours: FloatArray, theirs: FloatArray) -> Estimate:
@@ -87,7 +88,7 @@ def _furthest(values: FloatArray, end: float, n_seeds: FloatArray) -> FloatArray
         each = (inside + outside) / 2
         excess = (n_seeds.sum(axis=1) / 2 - 1) * ((1 - each) / (2 - each) + each / (1 + each))
         variance = each * (1 - each) * (1 + excess) / n_seeds.prod(axis=1)
-        explains = (values - each) ** 2 <= ndtri(ENDS[1]) ** 2 * variance
+        explains = (values - each) ** 2 <= ndtri(UPPER) ** 2 * variance
         inside, outside = np.where(explains, each, inside), np.where(explains, outside, each)
     return inside
 
@@ -100,9 +101,3 @@ def _wins(ours: FloatArray, theirs: FloatArray) -> FloatArray:
         )
     pairs = ours[:, None], theirs[None, :]
     return np.asarray((np.greater(*pairs) + 0.5 * np.equal(*pairs)).mean(axis=-1))
-
-
-def _times_drawn(n_seeds: int, rng: np.random.Generator) -> FloatArray:
-    """Return how often each seed is drawn in each resample, shape (resamples, seeds)."""
-    drawn = rng.integers(n_seeds, size=(N_RESAMPLES, n_seeds))
-    return np.asarray((drawn[..., None] == np.arange(n_seeds)).sum(axis=1), dtype=float)

@@ -21,7 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from armscan.stats.aggregation import band_over_seeds, probability_of_improvement
+from armscan.stats.aggregation import probability_of_improvement
+from armscan.stats.bootstrap import LEVEL, N_RESAMPLES
 from armscan.stats.paired import crossed_mean
 from armscan.sweeps.scheduling.race import race
 
@@ -78,13 +79,13 @@ def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float, *, see
             continue
         truth = true[study, chosen] - true[study, 0]
         differences = own[study, chosen] - own[study, 0]
-        of_seeds = differences.mean(axis=-1, keepdims=True)
-        band = band_over_seeds(of_seeds)
+        drawn = rng.choice(differences.mean(axis=-1), size=(N_RESAMPLES, n_seeds)).mean(axis=1)
+        low, high = np.quantile(drawn, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
         improvement = probability_of_improvement(own[study, chosen], own[study, 0])
         held.append(
             (
                 holds(differences, truth),
-                bool(band.lows[0] <= truth <= band.highs[0]),
+                bool(low <= truth <= high),
                 bool(improvement.low <= ndtr(truth / OF_DIFFERENCE) <= improvement.high),
             )
         )

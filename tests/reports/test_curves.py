@@ -5,7 +5,8 @@ import numpy as np
 from armscan.reports.curves import MAX_POINTS, curve_of
 from armscan.reports.groups import group_trainings
 
-FIGURE, STEPS, SECONDS = "validation/mean_steps", "environment steps", "seconds of training"
+FIGURE, RATE = "validation/mean_steps", "validation/success_rate"
+STEPS, SECONDS = "environment steps", "seconds of training"
 
 
 def curve(*trainings, axis=STEPS):
@@ -19,8 +20,18 @@ def test_a_training_that_has_finished_is_carried_on_with_its_last_value(make_tra
     ours = curve(early, late)
     assert ours.places.tolist() == [100, 200, 300, 400]
     assert ours.band.values.tolist() == [10.0, 5.0, 4.0, 3.0]
-    assert ours.band.lows.tolist() == [10.0, 2.0, 2.0, 2.0]
     assert [len(places) for places, _ in ours.lines.values()] == [2, 4]
+
+
+def test_a_rate_has_a_band_within_its_bounds_and_only_with_three_seeds(make_training):
+    trainings = [make_training(seed, steps=(100, 200), values=(0.2 * seed, 1.0)) for seed in range(3)]
+    for training in trainings:
+        training.series[RATE] = training.series[FIGURE]
+    (group,), _ = group_trainings(trainings)
+    steps, rate = (curve_of(group, figure, STEPS).band for figure in (FIGURE, RATE))
+    assert steps.lows[0] < 0.0 == rate.lows[0]
+    assert rate.highs.tolist() == steps.highs.tolist()
+    assert np.isnan(curve(*trainings[:2]).band.lows).all()
 
 
 def test_the_curve_ends_with_a_training_that_has_not_run_to_its_end(make_training):
