@@ -157,33 +157,44 @@ def _reached(shape: tuple[int, int], runs: Runs, numbers: RunArray, half_widths:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def bounding_boxes(slice_xz: Pixels) -> IntArray:
-    """Return for each label its first row, row after the last, first column and column after the last, shape (256, 4).
+def bounding_boxes(slice_xz: Pixels, labels: IntArray) -> IntArray:
+    """Return for each label its first row, row after the last, first column and column after the last, shape (n, 4).
 
-    Labels that the slice does not have are all 0. Background, label 0, is left out.
+    All four are 0 for a label that the slice does not have. There are at most eight labels, each of which has a bit of
+    the bytes that are joined, many at a time.
     """
-    n_cols = slice_xz.shape[1]
-    boxes = np.zeros((256, 4), dtype=np.int64)
+    n_rows, n_cols = slice_xz.shape
     pixels = slice_xz.ravel()
-    n_words = pixels.size // WORD
-    words = pixels[: WORD * n_words].view(np.uint64)
-    # Most of a slice is background, which is passed over eight pixels at a time.
-    for word in range(n_words + 1):
-        if word < n_words and words[word] == 0:
-            continue
-        row, col = WORD * word // n_cols, WORD * word % n_cols
-        for pixel in range(WORD * word, min(pixels.size, WORD * word + WORD)):
-            if pixels[pixel]:
-                box = boxes[pixels[pixel]]
-                if box[1] == 0:
-                    box[0], box[2] = row, col
-                box[1] = row + 1
-                box[2] = min(box[2], col)
-                box[3] = max(box[3], col + 1)
-            col += 1
-            if col == n_cols:
-                row, col = row + 1, 0
+    found = np.zeros(pixels.size, dtype=np.uint8)
+    for i in range(labels.size):
+        label, bit = np.uint8(labels[i]), np.uint8(1 << i)
+        for pixel in range(pixels.size):
+            found[pixel] |= bit * np.uint8(pixels[pixel] == label)
+    in_rows, in_cols = np.zeros(n_rows, dtype=np.uint8), np.zeros(n_cols, dtype=np.uint8)
+    for row in range(n_rows):
+        line, in_row = found[n_cols * row :][:n_cols], np.uint8(0)
+        for col in range(n_cols):
+            in_row |= line[col]
+            in_cols[col] |= line[col]
+        in_rows[row] = in_row
+    boxes = np.empty((labels.size, 4), dtype=np.int64)
+    for i in range(labels.size):
+        boxes[i, 0], boxes[i, 1] = _ends(in_rows, np.uint8(1 << i))
+        boxes[i, 2], boxes[i, 3] = _ends(in_cols, np.uint8(1 << i))
     return boxes
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _ends(found: Pixels, bit: np.uint8) -> tuple[int, int]:
+    """Return the first place that has the bit, and that after the last; 0 and 0 if none has."""
+    first, stop = 0, found.size
+    while first < stop and not found[first] & bit:
+        first += 1
+    if first == stop:
+        return 0, 0
+    while not found[stop - 1] & bit:
+        stop -= 1
+    return first, stop
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -249,7 +260,7 @@ def cluster_label(
     """
     # Of labels of other types than the volumes' bytes there may be any number.
     is_label = np.ascontiguousarray(slice_xz == label).view(np.uint8)
-    box = bounding_boxes(is_label)[1]
+    (box,) = bounding_boxes(is_label, np.array([1]))
     mask, clusters, sums = _cluster(is_label, 1, box, half_widths, min_samples)
     first_row, _, first_col, _ = box
     sums = sums[:-1]

@@ -107,7 +107,7 @@ class PlaneScorer:
 
     def seen(self, plane: ManipulatorAction) -> tuple[float, tuple[int, int, int]]:
         """Return the reward of a plane and the clusters of bones, tendons and artery that it shows."""
-        _, landmarks = self._scanner.look(0, plane.matrix, plane.offset_mm)
+        _, landmarks = self._scanner.look(0, plane)
         bones, tendons, artery = (int(count) for count in landmarks[:, 0])
         return self._reward.score(landmarks, self.volume.pixel_mm), (bones, tendons, artery)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from armscan.anatomy.clustering import WORD, IntArray, Pixels, bounding_boxes, summarise_label
 from armscan.anatomy.landmarks import Landmarks
 from armscan.anatomy.tissues import N_TISSUES, Tissues
-from armscan.volumes.plane import FloatArray
+from armscan.volumes.plane import NO_MAPS, FloatArray, ManipulatorAction, mapped_plane
 from armscan.volumes.slicing import sample_plane
 from armscan.volumes.volume import LabelVolume
 
@@ -29,8 +29,9 @@ def _look(
     labels_yxz: Pixels,
     occupied: Depths,
     which: int,
-    matrix: FloatArray,
-    offset_mm: FloatArray,
+    rotation: tuple[float, float],
+    translation: tuple[float, float],
+    maps: FloatArray,
     spacings_mm: FloatArray,
     tissue_labels: IntArray,
     half_widths: IntArray,
@@ -40,20 +41,21 @@ def _look(
 ) -> None:
     """Fill a slice and its summary; `half_widths` has for each volume a row a tissue, ended by -1."""
     s_x, s_y, s_z = spacings_mm[which]
+    matrix, offset_mm = mapped_plane(maps, rotation, translation)
     sample_plane(labels_yxz, occupied, (s_x, s_y, s_z), matrix, offset_mm, slice_xz)
-    boxes = bounding_boxes(slice_xz)
+    boxes = bounding_boxes(slice_xz, tissue_labels)
     for tissue in range(tissue_labels.size):
         label, widths = tissue_labels[tissue], half_widths[which, tissue]
         widths = widths[: np.sum(widths >= 0)]
-        summarise_label(slice_xz, label, boxes[label], widths, min_samples[which, tissue], landmarks[tissue])
+        summarise_label(slice_xz, label, boxes[tissue], widths, min_samples[which, tissue], landmarks[tissue])
 
 
 @numba.njit(cache=True, nogil=True)
 def _look_all(
     volumes: Sequence[tuple[Pixels, Depths]],
     which: IntArray,
-    matrices: FloatArray,
-    offsets_mm: FloatArray,
+    planes: FloatArray,
+    maps: FloatArray,
     spacings_mm: FloatArray,
     tissue_labels: IntArray,
     half_widths: IntArray,
@@ -67,7 +69,8 @@ def _look_all(
         labels_yxz, occupied = volumes[which[i]]
         _, n_across, n_depth = labels_yxz.shape
         slice_xz = slices[i, : n_across * n_depth].reshape((n_across, n_depth))
-        _look(labels_yxz, occupied, which[i], matrices[i], offsets_mm[i], *rules, slice_xz, landmarks[i])
+        rz, rx, tx, ty = planes[i]
+        _look(labels_yxz, occupied, which[i], (rz, rx), (tx, ty), maps[i], *rules, slice_xz, landmarks[i])
 
 
 @functools.cache
@@ -104,13 +107,13 @@ class Scanner:
         )
         self._typed_volumes: numba.typed.List | None = None
 
-    def look(self, which: int, matrix: FloatArray, offset_mm: FloatArray) -> tuple[Pixels, Landmarks]:
+    def look(self, which: int, plane: ManipulatorAction, maps: FloatArray = NO_MAPS) -> tuple[Pixels, Landmarks]:
         """Look at one plane.
 
         Args:
             which: Index of the volume.
-            matrix: Rotation from the plane's frame into the volume's, shape (3, 3).
-            offset_mm: Origin of the plane in the volume, in mm, shape (3,).
+            plane: Plane in the frame of the moved volume.
+            maps: Motion of the volume, `RigidTransform.maps`. Default: none.
 
         Returns:
             The slice, indexed [across, depth], and the summary of its clusters.
@@ -118,42 +121,42 @@ class Scanner:
         slice_xz = np.empty(self._shapes[which], dtype=np.uint8)
         landmarks = np.empty((N_TISSUES, 4))
         volume = self.volumes[which]
-        _look(volume.labels_yxz, volume.occupied, which, matrix, offset_mm, *self._rules, slice_xz, landmarks)
+        where = which, plane.rotation, plane.translation, maps
+        _look(volume.labels_yxz, volume.occupied, *where, *self._rules, slice_xz, landmarks)
         return slice_xz, landmarks
 
-    def look_all(
-        self, which: IntArray, matrices: FloatArray, offsets_mm: FloatArray
-    ) -> tuple[list[Pixels], FloatArray]:
+    def look_all(self, which: IntArray, planes: FloatArray, maps: FloatArray) -> tuple[list[Pixels], FloatArray]:
         """Look at n planes on NUMBA_NUM_THREADS threads; default: one for each core.
 
         Args:
             which: Index of each plane's volume, shape (n,).
-            matrices: Rotation of each plane, shape (n, 3, 3).
-            offsets_mm: Origin of each plane in its volume, in mm, shape (n, 3).
+            planes: Angles (rz, rx) in degrees and offsets (tx, ty) in mm of each plane, shape (n, 4).
+            maps: Motion of each plane's volume, `RigidTransform.maps`, shape (n, n_maps, 3, 4).
 
         Returns:
             The slices, and the summaries of their clusters, shape (n, 3, 4): bit for bit what `look` gives.
         """
-        volumes = self._typed_volumes = self._typed_volumes or numba.typed.List(
-            [(each.labels_yxz, each.occupied) for each in self.volumes]
-        )
+        # Numba's default is the number of cores that this process may use.
+        n_threads = int(os.environ.get("NUMBA_NUM_THREADS") or vars(numba.config)["NUMBA_DEFAULT_NUM_THREADS"])
+        n_at_once = N_AT_ONCE if n_threads > 1 else len(which)
+        if self._typed_volumes is None:
+            self._typed_volumes = numba.typed.List([(each.labels_yxz, each.occupied) for each in self.volumes])
+        volumes = self._typed_volumes
         shapes = [self._shapes[i] for i in which]
         longest = max(n_across * n_depth for n_across, n_depth in shapes)
         # Rows of whole words, so that each begins with one.
         slices = np.empty((len(which), -(-longest // WORD) * WORD), dtype=np.uint8)
         landmarks = np.empty((len(which), N_TISSUES, 4))
 
-        starts = iter(range(0, len(which), N_AT_ONCE))
+        starts = iter(range(0, len(which), n_at_once))
 
         def look_at_rest() -> None:
             for start in starts:
-                part = slice(start, start + N_AT_ONCE)
-                planes = which[part], matrices[part], offsets_mm[part]
-                _look_all(volumes, *planes, *self._rules, slices[part], landmarks[part])
+                part = slice(start, start + n_at_once)
+                where = which[part], planes[part], maps[part]
+                _look_all(volumes, *where, *self._rules, slices[part], landmarks[part])
 
-        # Numba's default is the number of cores that this process may use.
-        n_threads = int(os.environ.get("NUMBA_NUM_THREADS") or vars(numba.config)["NUMBA_DEFAULT_NUM_THREADS"])
-        n_helpers = min(n_threads, -(-len(which) // N_AT_ONCE)) - 1
+        n_helpers = min(n_threads, -(-len(which) // n_at_once)) - 1
         helpers = [_threads(os.getpid(), n_threads).submit(look_at_rest) for _ in range(n_helpers)]
         look_at_rest()
         for helper in helpers:

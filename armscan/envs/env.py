@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from armscan.envs.episode import Episode, begin, check_actions, info_of, look, wanted_volume
+from armscan.envs.episode import Episode, begin, check_actions, info_of, wanted_volume
 from armscan.envs.rules import Observed, Rules, Volumes
 from armscan.envs.scene import Scene
 from armscan.errors import ResetNeededError
@@ -171,7 +171,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         episode = self._episode
         if episode is None or not episode.is_running:
             raise ResetNeededError("the episode has ended or not begun: call reset() before step()")
-        episode.aim(check_actions(action, self.action_space.shape))
+        episode.aim(check_actions(action, (len(self.rules.action_names),)))
         observation, info = self._seen()
         return observation, episode.view.reward, episode.is_terminated, episode.is_truncated, info
 
@@ -189,10 +189,11 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
             self._window.close()
 
     def _seen(self) -> tuple[Observed, dict[str, Any]]:
-        look(self.rules, [self.episode])
+        episode = self.episode
+        episode.see(self.rules.look_at(episode.scene, episode.plane))
         if self._window is not None:
-            self._window.show(_drawn(self.episode))
-        return self.rules.observe(self.episode.view), info_of(self.episode)
+            self._window.show(_drawn(episode))
+        return self.rules.observe(episode.view), info_of(episode)
 
 
 def _drawn(episode: Episode) -> NDArray[np.uint8]:

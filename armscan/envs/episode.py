@@ -136,7 +136,8 @@ def check_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
     try:
         # A copy: what the caller does with the array afterwards must not change what was done. Text is no number.
         received = np.asarray(actions).astype(np.float64, casting="same_kind")
-        if received.shape == shape and (np.abs(received) <= 1.0).all():
+        # One by one: a few numbers are compared before NumPy has begun.
+        if received.shape == shape and all(-1.0 <= number <= 1.0 for number in received.ravel().tolist()):
             return received
     except (TypeError, ValueError):
         received = np.empty(0)

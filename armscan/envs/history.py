@@ -113,7 +113,7 @@ class FrameHistory:
 
     def push(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
         """See `Remembered.push`."""
-        self._latest[env_ids] = latest = self._places[self._latest[env_ids], 0]
+        self._latest[env_ids] = latest = (self._latest[env_ids] + 1) % self._size
         for name, frames in self._frames.items():
             frames[env_ids, latest] = parts[name]
 
@@ -160,14 +160,15 @@ class BestPairs:
 
     def refill(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
         """Make all pairs of environments whose episode begins those of its first plane."""
-        self.pairs[env_ids] = _paired(infos)[:, None]
+        self.pairs[env_ids] = self._paired(infos, env_ids)[:, None]
 
     def push(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
         """Add the latest pair of environments where it is good enough."""
-        enters = infos["reward"].astype(np.float32) > self.pairs[env_ids, -1, -1]
-        if enters.any():
+        latest = self._paired(infos, env_ids)
+        enters = (latest[:, -1] > self.pairs[:, -1, -1][env_ids]).nonzero()[0]
+        if len(enters):
             where = env_ids[enters]
-            self.pairs[where, -1] = _paired(infos)[enters]
+            self.pairs[where, -1] = latest[enters]
             order = np.argsort(-self.pairs[where, :, -1], axis=1, kind="stable")
             self.pairs[where] = np.take_along_axis(self.pairs[where], order[:, :, None], axis=1)
 
@@ -176,6 +177,7 @@ class BestPairs:
         pairs = self.pairs[env_ids].reshape(len(env_ids), -1)
         return {FLAT: np.concatenate([parts[FLAT], pairs], axis=-1)} if FLAT in parts else {**parts, MEMORY: pairs}
 
-
-def _paired(infos: Mapping[str, Any]) -> NDArray[np.float32]:
-    return np.column_stack([infos["action"], infos["reward"]]).astype(np.float32)
+    def _paired(self, infos: Mapping[str, Any], env_ids: EnvIds) -> NDArray[np.float32]:
+        pairs = np.empty((len(env_ids), self.pairs.shape[-1]), dtype=np.float32)
+        pairs[:, :-1], pairs[:, -1] = infos["action"], infos["reward"]
+        return pairs

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
+import numba
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -21,8 +22,7 @@ USUAL_AREAS_PX = (3000.0, 1000.0, 100.0)
 CENTRE_SCALE_MM = (25.0, 12.0)
 
 
-@dataclass(frozen=True)
-class SliceGeometry:
+class SliceGeometry(NamedTuple):
     """Shape (across, depth) in pixels and pixel size in mm of the slices of one volume."""
 
     shape: tuple[int, int]
@@ -126,7 +126,8 @@ class ClusterObservation:
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
-        highest = np.max([self._features(_most_landmarks(geometry), geometry) for geometry in geometries], axis=0)
+        most = [self._features(_most_landmarks(geometry)[None], geometry) for geometry in geometries]
+        highest = np.max(most, axis=0).reshape(-1, 4)
         lowest = np.zeros_like(highest)
         if self.normalised:
             lowest[:, 2:] = -highest[:, 2:]
@@ -134,27 +135,26 @@ class ClusterObservation:
 
     def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
-        return {"clusters": self._features(view.landmarks, view.geometry).ravel()}
+        return {"clusters": self._features(view.landmarks[None], view.geometry)[0]}
 
     def observe_all(self, views: Sequence[View]) -> Parts:
         """See `observe_all`."""
         landmarks = np.array([view.landmarks for view in views])
         geometries = [view.geometry for view in views]
         if geometries.count(geometries[0]) == len(geometries):
-            return {"clusters": self._features(landmarks, geometries[0]).reshape(len(views), -1)}
-        features = [self._features(*each) for each in zip(landmarks, geometries, strict=True)]
-        return {"clusters": np.array(features).reshape(len(views), -1)}
+            return {"clusters": self._features(landmarks, geometries[0])}
+        features = [self._features(each[None], of)[0] for each, of in zip(landmarks, geometries, strict=True)]
+        return {"clusters": np.array(features)}
 
-    def _features(self, landmarks: Landmarks, geometry: SliceGeometry) -> NDArray[np.float32]:
-        """Turn summaries of clusters, shape (..., 3, 4), into the wanted form."""
+    def _features(self, landmarks: FloatArray, geometry: SliceGeometry) -> NDArray[np.float32]:
+        """Turn summaries of clusters, shape (n, 3, 4), into the wanted form, shape (n, 12)."""
         if not self.normalised:
-            return landmarks.astype(np.float32)
+            return landmarks.reshape(len(landmarks), -1).astype(np.float32)
         if geometry not in self._scales:
             self._scales[geometry] = self._scale(geometry)
-        zero, scale = self._scales[geometry]
-        features = (landmarks - zero) * scale
-        features[landmarks[..., 0] == 0] = 0.0
-        return features.astype(np.float32)
+        features = np.empty((len(landmarks), landmarks[0].size), dtype=np.float32)
+        _normalise(landmarks, *self._scales[geometry], features)
+        return features
 
     def _scale(self, geometry: SliceGeometry) -> tuple[FloatArray, FloatArray]:
         """Return the offset to subtract from a summary, and the factor to multiply it with, each of shape (3, 4)."""
@@ -164,6 +164,17 @@ class ClusterObservation:
         scale[:, 1] = np.prod(geometry.pixel_mm) / np.prod(USUAL_PIXEL_MM) / np.array(USUAL_AREAS_PX)
         scale[:, 2:] = np.array(geometry.pixel_mm) / CENTRE_SCALE_MM
         return zero, scale
+
+
+@numba.njit(cache=True)
+def _normalise(landmarks: FloatArray, zero: FloatArray, scale: FloatArray, features: NDArray[np.float32]) -> None:
+    """Fill the features, shape (n, 12), of summaries of clusters, shape (n, 3, 4): 0 where a tissue is absent."""
+    n_numbers = landmarks.shape[2]
+    for i in range(landmarks.shape[0]):
+        for tissue in range(landmarks.shape[1]):
+            for k in range(n_numbers):
+                feature = (landmarks[i, tissue, k] - zero[tissue, k]) * scale[tissue, k]
+                features[i, n_numbers * tissue + k] = 0.0 if landmarks[i, tissue, 0] == 0.0 else feature
 
 
 def _most_landmarks(geometry: SliceGeometry) -> Landmarks:

@@ -127,7 +127,7 @@ def view_of(
     Returns:
         What is seen; no action led there, so its `action` is empty.
     """
-    slice_xz, landmarks = Scanner([volume], tissues).look(0, plane.matrix, plane.offset_mm)
+    slice_xz, landmarks = Scanner([volume], tissues).look(0, plane)
     return View(
         slice_xz=slice_xz,
         landmarks=landmarks,

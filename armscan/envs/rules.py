@@ -91,7 +91,8 @@ class Rules:
         }
         self._smallest_shape = smallest_shape(list(self._geometries.values()))
         self._observation = with_action_reward(observation, getattr(self.reward, "targets", PUBLISHED_TARGETS))
-        self._boxes = boxes = self._observation.spaces(list(self._geometries.values()), len(self.action_names))
+        boxes = self._observation.spaces(list(self._geometries.values()), len(self.action_names))
+        self._shapes = {name: box.shape for name, box in boxes.items()}
         are_vectors = all(len(box.shape) == 1 for box in boxes.values())
         self._is_flat = are_vectors if flat is None else check_bool("flat", flat)
         self.observation_space: spaces.Box | MultiBoxSpace = (
@@ -103,14 +104,18 @@ class Rules:
 
         The views' `action` is left empty.
         """
-        maps = [scene.plane_map(action) for scene, action in zip(scenes, actions, strict=True)]
-        places = [self._place[scene.volume.name] for scene in scenes]
         if len(scenes) == 1:
-            return [self._view(scenes[0], *self._scanner.look(places[0], *maps[0]))]
+            return [self.look_at(scenes[0], actions[0])]
         slices, landmarks = self._scanner.look_all(
-            np.array(places), np.array([matrix for matrix, _ in maps]), np.array([offset for _, offset in maps])
+            np.array([self._place[scene.volume.name] for scene in scenes]),
+            np.array([action.rotation + action.translation for action in actions]),
+            np.array([scene.maps for scene in scenes]),
         )
         return [self._view(*seen) for seen in zip(scenes, slices, landmarks, strict=True)]
+
+    def look_at(self, scene: Scene, action: ManipulatorAction) -> View:
+        """Look at one plane; as `look`."""
+        return self._view(scene, *self._scanner.look(self._place[scene.volume.name], action, scene.maps))
 
     @property
     def transform(self) -> RandomTransform | None:
@@ -167,8 +172,7 @@ class Rules:
         if volume.name not in self._labelled_views:
             plane = volume.optimal_action
             assert plane is not None
-            seen = self._scanner.look(self._place[volume.name], plane.matrix, plane.offset_mm)
-            self._labelled_views[volume.name] = self._view(self._sampler.unmoved(volume), *seen)
+            self._labelled_views[volume.name] = self.look_at(self._sampler.unmoved(volume), plane)
         return self._labelled_views[volume.name]
 
     def is_solved(self, view: View) -> bool:
@@ -177,12 +181,12 @@ class Rules:
 
     def observe(self, view: View) -> Observed:
         """Return the observation of a view, within `observation_space`."""
-        parts = in_order(self._observation.observe(view), self._boxes)
+        parts = in_order(self._observation.observe(view), self._shapes)
         return flatten({name: part.ravel() for name, part in parts.items()}) if self._is_flat else parts
 
     def observe_all(self, views: Sequence[View]) -> Observed:
         """Return the observations of many views, shape (n_views, ...)."""
-        parts = in_order(observe_all(self._observation, views), self._boxes, (len(views),))
+        parts = in_order(observe_all(self._observation, views), self._shapes, (len(views),))
         if not self._is_flat:
             return parts
         return flatten({name: part.reshape(len(views), -1) for name, part in parts.items()})
@@ -209,7 +213,7 @@ class Rules:
     def _check_optimal_planes(self) -> None:
         for volume in self.volumes.values():
             scene = self._sampler.unmoved(volume)
-            _, landmarks = self._scanner.look(self._place[volume.name], *scene.plane_map(scene.optimum))
+            _, landmarks = self._scanner.look(self._place[volume.name], scene.optimum)
             score = self._score(landmarks, volume)
             if score <= -self.success_threshold:
                 counts = tuple(landmarks[:, 0].astype(int).tolist())

@@ -11,7 +11,15 @@ from armscan.envs.actions import ActionBounds
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.utils.validation import check_bool, check_choice, check_float
 from armscan.volumes.deformation import DeformingTransform
-from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, plane_distance, shift_into
+from armscan.volumes.plane import (
+    NO_MAPS,
+    FloatArray,
+    ManipulatorAction,
+    RigidTransform,
+    mapped_plane,
+    plane_distance,
+    shift_into,
+)
 from armscan.volumes.volume import LabelVolume
 
 MAX_SHIFT_MM = 10_000.0
@@ -121,11 +129,14 @@ class Scene:
         """The optimal plane as a normalised vector, shape (4,)."""
         return self.bounds.normalised(self.optimum)
 
+    @property
+    def maps(self) -> FloatArray:
+        """The affine maps that take a point into the volume as it was read; see `RigidTransform.maps`."""
+        return NO_MAPS if self.transform is None else self.transform.maps
+
     def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
         """Return (M, b): a point p of the plane's frame lies at M p + b in the volume as it was read."""
-        if self.transform is None:
-            return action.matrix, action.offset_mm
-        return self.transform.plane_map(action)
+        return mapped_plane(self.maps, action.rotation, action.translation)
 
     def distance(self, action: ManipulatorAction) -> tuple[float, float]:
         """Return how far a plane is from the optimal one, as `plane_distance` does: (mm, degrees)."""

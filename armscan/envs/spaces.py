@@ -44,18 +44,18 @@ class MultiBoxSpace(spaces.Dict):
         return {name: box.shape or () for name, box in self.spaces.items()}
 
 
-def in_order(parts: Parts, boxes: Mapping[str, spaces.Box], leading: tuple[int, ...] = ()) -> Parts:
-    """Return the parts of an observation in the order of their boxes, each of shape (*leading, *box.shape)."""
-    if parts.keys() != boxes.keys():
+def in_order(parts: Parts, shapes: Mapping[str, tuple[int, ...]], leading: tuple[int, ...] = ()) -> Parts:
+    """Return the parts of an observation in the order of their boxes' shapes, each of shape (*leading, *shape)."""
+    if parts.keys() != shapes.keys():
         raise InvalidValueError(
-            f"the observation gave the parts {', '.join(parts)}, but its spaces are of {', '.join(boxes)}"
+            f"the observation gave the parts {', '.join(parts)}, but its spaces are of {', '.join(shapes)}"
         )
     ordered = {}
-    for name, box in boxes.items():
+    for name, shape in shapes.items():
         ordered[name] = part = np.asarray(parts[name])
-        if part.shape != leading + box.shape:
+        if part.shape != leading + shape:
             raise InvalidValueError(
-                f"the observation gave {name} of shape {part.shape}, but its space has shape {leading + box.shape}"
+                f"the observation gave {name} of shape {part.shape}, but its space has shape {leading + shape}"
             )
     return ordered
 

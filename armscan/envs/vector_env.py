@@ -174,9 +174,10 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             of, dtype = INFO[key]
             values = np.array([of(episode) for episode in given], dtype=dtype)
             # Of texts Gymnasium makes arrays of objects.
-            values = values.astype(object) if values.dtype.kind == "U" else values
-            infos[key] = np.zeros((len(episodes), *values.shape[1:]), dtype=values.dtype)
-            infos[key][is_given] = values
+            infos[key] = values = values.astype(object) if values.dtype.kind == "U" else values
+            if len(given) < len(episodes):
+                infos[key] = np.zeros((len(episodes), *values.shape[1:]), dtype=values.dtype)
+                infos[key][is_given] = values
             infos[f"_{key}"] = is_given.copy()
         return infos
 

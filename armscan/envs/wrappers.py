@@ -51,15 +51,15 @@ class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstruc
     ) -> tuple[Observed, dict[str, Any]]:
         """Start an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        parts, infos = _batch_of_one(observation, info)
-        self.remembered.refill(parts, infos, ONLY)
+        parts = _batch_of_one(observation)
+        self.remembered.refill(parts, info, ONLY)
         return self._with_memory(parts), info
 
     def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Take a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        parts, infos = _batch_of_one(observation, info)
-        self.remembered.push(parts, infos, ONLY)
+        parts = _batch_of_one(observation)
+        self.remembered.push(parts, info, ONLY)
         return self._with_memory(parts), float(reward), terminated, truncated, info
 
     def _with_memory(self, parts: dict[str, Any]) -> Observed:
@@ -162,7 +162,6 @@ def _checked(env: Any, kind: type[Any]) -> Any:
     return env
 
 
-def _batch_of_one(observation: Observed, info: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the parts of an observation, and the remembered parts of `info`, each as a batch of one."""
-    infos = {key: np.asarray(info[key])[None] for key in ("action", "reward") if key in info}
-    return {name: part[None] for name, part in parts_of(observation).items()}, infos
+def _batch_of_one(observation: Observed) -> Parts:
+    """Return the parts of an observation, each as a batch of one."""
+    return {name: part[None] for name, part in parts_of(observation).items()}

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from armscan.errors import InvalidValueError
-from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, composed
+from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, affine_map
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,14 +43,10 @@ class DeformingTransform(RigidTransform):
             )
 
     @cached_property
-    def _lookup(self) -> tuple[FloatArray, FloatArray]:
-        """(A, b) of D(q) = A q + b in the volume's frame."""
+    def maps(self) -> FloatArray:
+        """The affine maps (A | b), shape (2, 3, 4): that of D, and that of T, which comes first."""
         frame = self.plane.matrix
         matrix: FloatArray = frame @ np.linalg.inv(self.deformation) @ frame.T
         across_mm, depth_mm = self.about_mm
         kept_mm = frame @ np.array([across_mm, 0.0, depth_mm]) + self.plane.offset_mm
-        return matrix, kept_mm - matrix @ kept_mm
-
-    def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
-        """Return (M, b) with D(T(plane(p))) = M p + b: from the plane's frame into the volume as it is."""
-        return composed(*self._lookup, *super().plane_map(action))
+        return np.array([affine_map(matrix, kept_mm - matrix @ kept_mm), *super().maps])

@@ -16,6 +16,8 @@ from armscan.utils.validation import check_numbers
 
 FloatArray = NDArray[np.float64]
 LARGEST_SHIFT_MM = 1e6
+# The maps of a volume as it was read; see `RigidTransform.maps`.
+NO_MAPS = np.empty((0, 3, 4))
 
 
 @numba.njit(cache=True)
@@ -28,6 +30,13 @@ def rotation_matrix(rz_deg: float, rx_deg: float) -> FloatArray:
     matrix[1, 0], matrix[1, 1], matrix[1, 2] = sin_z, cos_z * cos_x, -cos_z * sin_x
     matrix[2, 0], matrix[2, 1], matrix[2, 2] = 0.0, sin_x, cos_x
     return matrix
+
+
+def affine_map(matrix: FloatArray, offset_mm: FloatArray) -> FloatArray:
+    """Return the map p -> matrix p + offset_mm as one array, shape (3, 4)."""
+    together = np.empty((3, 4))
+    together[:, :3], together[:, 3] = matrix, offset_mm
+    return together
 
 
 @numba.njit(cache=True)
@@ -46,13 +55,15 @@ def composed(
 
 
 @numba.njit(cache=True)
-def moved_plane(
-    motion: FloatArray, motion_mm: FloatArray, rotation: tuple[float, float], translation: tuple[float, float]
+def mapped_plane(
+    maps: FloatArray, rotation: tuple[float, float], translation: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return (M, b) of a plane p -> Rz(rz) Rx(rx) p + (tx, ty, 0), moved by q -> motion q + motion_mm."""
-    origin_mm = np.zeros(3)
-    origin_mm[0], origin_mm[1] = translation
-    return composed(motion, motion_mm, rotation_matrix(rotation[0], rotation[1]), origin_mm)
+    """Return (M, b) of a plane p -> Rz(rz) Rx(rx) p + (tx, ty, 0), taken through `RigidTransform.maps`."""
+    matrix, offset_mm = rotation_matrix(rotation[0], rotation[1]), np.zeros(3)
+    offset_mm[0], offset_mm[1] = translation
+    for i in range(maps.shape[0] - 1, -1, -1):
+        matrix, offset_mm = composed(maps[i, :, :3], maps[i, :, 3], matrix, offset_mm)
+    return matrix, offset_mm
 
 
 @dataclass(frozen=True)
@@ -151,9 +162,14 @@ class RigidTransform:
         offset_mm: FloatArray = centre_mm + np.array([*self.translation, 0.0]) - self.matrix @ centre_mm
         return offset_mm
 
+    @cached_property
+    def maps(self) -> FloatArray:
+        """The affine maps (A | b) that take a point into the unmoved volume, the last one first, shape (n, 3, 4)."""
+        return affine_map(self.matrix, self.offset_mm)[None]
+
     def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
         """Return (M, b) with T(plane(p)) = M p + b: from the plane's frame into the unmoved volume."""
-        return moved_plane(self.matrix, self.offset_mm, action.rotation, action.translation)
+        return mapped_plane(self.maps, action.rotation, action.translation)
 
     def inverse_plane(self, action: ManipulatorAction) -> ManipulatorAction:
         """Return the plane of the moved volume that shows the same slice as `action` in the unmoved one.
@@ -223,13 +239,26 @@ def plane_distance(
         The offset in mm of the slice's centre from the optimal plane along its normal, and the angle in degrees, in
         [0, 90], between the planes' normals.
     """
-    # In plain numbers: for three of them an array costs more than it saves.
-    matrix, normal = action.matrix.tolist(), optimum.normal.tolist()
-    across_mm, depth_mm = centre_mm
-    origin_mm, optimal_origin_mm = (*action.translation, 0.0), (*optimum.translation, 0.0)
+    offset_mm, cos = _offset_and_cosine(
+        action.rotation, action.translation, optimum.rotation, optimum.translation, centre_mm
+    )
+    return abs(offset_mm), math.degrees(math.acos(min(1.0, abs(cos))))
+
+
+@numba.njit(cache=True)
+def _offset_and_cosine(
+    rotation: tuple[float, float],
+    translation: tuple[float, float],
+    optimal_rotation: tuple[float, float],
+    optimal_translation: tuple[float, float],
+    centre_mm: tuple[float, float],
+) -> tuple[float, float]:
+    """Return the signed offset in mm and the cosine of the angle that `plane_distance` measures."""
+    matrix, normal = rotation_matrix(rotation[0], rotation[1]), rotation_matrix(*optimal_rotation)[:, 1]
+    origin_mm, optimal_origin_mm = (*translation, 0.0), (*optimal_translation, 0.0)
     offset_mm = cos = 0.0
     for axis in range(3):
-        centre = matrix[axis][0] * across_mm + matrix[axis][2] * depth_mm + origin_mm[axis]
+        centre = matrix[axis, 0] * centre_mm[0] + matrix[axis, 2] * centre_mm[1] + origin_mm[axis]
         offset_mm += normal[axis] * (centre - optimal_origin_mm[axis])
-        cos += matrix[axis][1] * normal[axis]
-    return abs(offset_mm), math.degrees(math.acos(min(1.0, abs(cos))))
+        cos += matrix[axis, 1] * normal[axis]
+    return offset_mm, cos

@@ -135,12 +135,15 @@ def _sample(
             start_all, stop_all = _within_occupied(ends, occupied, shape, n_depth)
             is_inside = _are_inside(ends, shape, start_all, stop_all)
             for i in range(first, min(first + N_ROWS, n_across)):
+                slot = i % (2 * N_ROWS)
+                inside[slot, 0], inside[slot, 1] = 0, 0
+                if start_all >= stop_all:
+                    continue
                 lines, start, stop = _lines(axes, i * s_x), start_all, stop_all
                 if not is_inside:
                     start, stop = _within(lines[0], 0, shape[0], start, stop)
                     start, stop = _within(lines[1], 0, shape[1], start, stop)
                     start, stop = _within(lines[2], 0, shape[2], start, stop)
-                slot = i % (2 * N_ROWS)
                 inside[slot, 0], inside[slot, 1] = start, stop
                 row = places[slot, start:stop]
                 _find_places(lines, shape, along[start:stop], row)

@@ -57,7 +57,9 @@ def test_cluster_label_equals_sklearns_dbscan(slice_xz, eps, min_samples):
         assert size == len(points)
         np.testing.assert_allclose(centre, points.mean(axis=0))
     summary = np.full(4, np.nan)
-    summarise_label(slice_xz, 1, bounding_boxes(slice_xz)[1], disc_half_widths(eps), min_samples, summary)
+    summarise_label(
+        slice_xz, 1, bounding_boxes(slice_xz, np.array([1]))[0], disc_half_widths(eps), min_samples, summary
+    )
     mean_centre = centres.mean(axis=0) if len(centres) else (0.0, 0.0)
     np.testing.assert_array_equal(summary, [len(sizes), sizes.sum(), *mean_centre])
 

@@ -30,7 +30,7 @@ def test_scanner_sees_what_slices_and_clusters_show(volumes, tissues):
     scanner = Scanner(volumes, tissues)
     n_clusters = 0
     for place, plane in zip(*drawn_planes(volumes, 40), strict=True):
-        slice_xz, landmarks = scanner.look(place, plane.matrix, plane.offset_mm)
+        slice_xz, landmarks = scanner.look(place, plane)
         np.testing.assert_array_equal(slice_xz, volumes[place].slice(plane))
         clusters = TissueClusters.from_slice(slice_xz, tissues, volumes[place].pixel_mm)
         np.testing.assert_array_equal(landmarks, clusters.landmarks)
@@ -41,10 +41,9 @@ def test_scanner_sees_what_slices_and_clusters_show(volumes, tissues):
 def test_scanner_gives_the_same_for_many_planes_at_once(volumes):
     scanner = pickle.loads(pickle.dumps(Scanner(volumes, PIXEL_TISSUES)))
     which, planes = drawn_planes(volumes, 30)
-    slices, landmarks = scanner.look_all(
-        which, np.array([plane.matrix for plane in planes]), np.array([plane.offset_mm for plane in planes])
-    )
+    maps = np.empty((len(planes), 0, 3, 4))
+    slices, landmarks = scanner.look_all(which, np.array([plane.to_array() for plane in planes]), maps)
     for i, (place, plane) in enumerate(zip(which, planes, strict=True)):
-        alone_xz, alone = scanner.look(place, plane.matrix, plane.offset_mm)
+        alone_xz, alone = scanner.look(place, plane)
         np.testing.assert_array_equal(slices[i], alone_xz)
         np.testing.assert_array_equal(landmarks[i], alone)
