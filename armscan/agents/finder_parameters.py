@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from armscan.agents.hyperparameters import number
 from armscan.errors import InvalidValueError
-from armscan.utils.validation import check_float, check_int, check_ints, check_numbers
+from armscan.utils.validation import check_bool, check_float, check_int, check_ints, check_numbers
 
 MOST_LOOKS, MOST_OFFSET_MM, MOST_UNITS = 20, 100.0, 4096
 N_CONVOLUTIONS = 3
@@ -46,6 +46,9 @@ class FinderParameters:
     most the number of looks. Looks lie beside this mean, and the last plane is the mean. 1: the latest estimate alone.
     The network is taught in the same way.
     """
+
+    average_tilts: bool = True
+    """Whether tilts are averaged, too, or only distances, while the tilt is that of the latest look."""
 
     filters: Sequence[int] = (12, 24, 36)
     """Filters of each of the three convolutions."""
@@ -93,6 +96,7 @@ class FinderParameters:
                 check_float(f"agent.{each.name}", getattr(self, each.name), **each.metadata["limits"])
         for name in ("num_envs", "n_seen", "n_averaged"):
             check_int(f"agent.{name}", getattr(self, name), at_least=1)
+        check_bool("agent.average_tilts", self.average_tilts)
         for name, n_sizes in (("filters", N_CONVOLUTIONS), ("hidden_sizes", None)):
             check_ints(f"agent.{name}", getattr(self, name), n_sizes, "", at_least=1, at_most=MOST_UNITS)
         n_offsets = len(self.offsets_mm) if isinstance(self.offsets_mm, list | tuple) else 0

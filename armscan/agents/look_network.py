@@ -151,6 +151,7 @@ class FinderModule(nn.Module):
         sure: Expected errors, in mm and degrees, below which it takes no further looks. None: it takes all looks.
         n_averaged: Number of latest looks whose estimates are averaged, weighted by the inverse squares of their
             expected errors.
+        average_tilts: Whether tilts are averaged, too, or only distances.
         has_stop: Whether actions end with the component `stop`, as with `env.ends=on_stop`.
     """
 
@@ -166,11 +167,13 @@ class FinderModule(nn.Module):
         sure: tuple[float, float] | None,
         *,
         n_averaged: int,
+        average_tilts: bool,
         has_stop: bool,
     ) -> None:
         super().__init__()
         self.network, self.geometry = network, geometry
-        self._n_averaged, self._is_ever_sure, self._has_stop = n_averaged, sure is not None, has_stop
+        self._n_averaged, self._average_tilts = n_averaged, average_tilts
+        self._is_ever_sure, self._has_stop = sure is not None, has_stop
         self.register_buffer("offsets", torch.tensor(offsets_mm, dtype=torch.float32), persistent=False)
         self.register_buffer("sure", torch.tensor(sure or (0.0, 0.0), dtype=torch.float32), persistent=False)
         self.register_buffer("calibration", torch.ones(2))
@@ -205,7 +208,10 @@ class FinderModule(nn.Module):
         places = self.geometry.seen_from(latest.plane.repeat(n_averaged, 1), planes).reshape(n_averaged, -1, 4)
         # Two components are angles, two are in mm.
         weights = by_look.expected[:, :, [1, 1, 0, 0]] ** -2
-        return latest._replace(place=(weights * places).sum(0) / weights.sum(0))
+        place = (weights * places).sum(0) / weights.sum(0)
+        if not self._average_tilts:
+            place = torch.cat([latest.place[:, :2], place[:, 2:]], dim=1)
+        return latest._replace(place=place)
 
     def _latest(self, observations: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return what was observed after the latest look, then one look earlier, and so on, shape (n_averaged n, ...).

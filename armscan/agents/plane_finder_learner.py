@@ -59,7 +59,13 @@ class PlaneFinderLearner(SupervisedLearner):
         sure = None if finder.sure_mm is None or finder.sure_deg is None else (finder.sure_mm, finder.sure_deg)
         geometry = common_geometry(teacher_of(envs).rules, finder.n_looks)
         module = FinderModule(
-            network, geometry, finder.offsets_mm, sure, n_averaged=finder.n_averaged, has_stop=self._has_stop
+            network,
+            geometry,
+            finder.offsets_mm,
+            sure,
+            n_averaged=finder.n_averaged,
+            average_tilts=finder.average_tilts,
+            has_stop=self._has_stop,
         )
         self._module: PlaneModule = module
         super().__init__(module, finder.lr, envs, setup)

@@ -102,9 +102,9 @@ def answers_of(learner, env):
     return actions, policy(batch), export_program(policy, batch).module()(batch)
 
 
-@pytest.mark.parametrize("n_averaged", [1, 2])
-def test_policy_answers_as_the_learner_does_also_exported(phantom, n_averaged):
-    learner, env = made(phantom, n_averaged=n_averaged)
+@pytest.mark.parametrize(("n_averaged", "average_tilts"), [(1, True), (2, True), (2, False)])
+def test_policy_answers_as_the_learner_does_also_exported(phantom, n_averaged, average_tilts):
+    learner, env = made(phantom, n_averaged=n_averaged, average_tilts=average_tilts)
     learner.learn(24)
     actions, of_policy, of_program = answers_of(learner, env)
     np.testing.assert_allclose(of_policy, actions, atol=1e-6)
@@ -112,8 +112,9 @@ def test_policy_answers_as_the_learner_does_also_exported(phantom, n_averaged):
     assert learner.policy().differs is None
 
 
-def test_place_is_averaged_over_the_estimates_of_the_latest_looks(phantom):
-    learner, env = made(phantom, n_averaged=2)
+@pytest.mark.parametrize("average_tilts", [True, False])
+def test_place_is_averaged_over_the_estimates_of_the_latest_looks(phantom, average_tilts):
+    learner, env = made(phantom, n_averaged=2, average_tilts=average_tilts)
     learner.learn(24)
     observation, _ = env.reset(seed=0)
     learner.begin(seed=0, bounds=env.get_wrapper_attr("scene").bounds)
@@ -128,7 +129,10 @@ def test_place_is_averaged_over_the_estimates_of_the_latest_looks(phantom):
         # After the first look there is one estimate alone.
         places = [geometry.seen_from(estimate.plane, plane) for plane in planes[-2:]]
         weighted = sum(weight * place for weight, place in zip(weights[-2:], places, strict=True))
-        torch.testing.assert_close(found.place, weighted / sum(weights[-2:]), atol=1e-3, rtol=1e-3)
+        expected = weighted / sum(weights[-2:])
+        if not average_tilts:
+            expected[:, :2] = estimate.place[:, :2]
+        torch.testing.assert_close(found.place, expected, atol=1e-3, rtol=1e-3)
         observation = env.step(learner.act(observation, 0.0))[0]
     assert (found.place - estimate.place).abs().max() > 0.1
 
@@ -225,6 +229,7 @@ def test_environments_that_do_not_fit_are_refused(phantom, rules, message):
         ({"offsets_mm": (0.0,)}, "agent.offsets_mm is"),
         ({"offsets_mm": "wide"}, "agent.offsets_mm is"),
         ({"n_seen": 4}, "agent.n_seen is 4, but it must be at most 3"),
+        ({"average_tilts": "no"}, "agent.average_tilts is 'no', but it must be true or false"),
         ({"n_averaged": 4}, "agent.n_averaged is 4, but it must be at most 3"),
         ({"sure_mm": 1.0}, "both or none"),
         ({"filters": (2, 2)}, "agent.filters"),
