@@ -57,7 +57,7 @@ class ResetNeededError(ArmscanError, RuntimeError):
 
 
 class ExportError(ArmscanError, RuntimeError):
-    """A policy cannot be written down as a model, or the model does not answer as the agent does."""
+    """A policy cannot be exported as a model, or the model does not act as the agent does."""
 
 
 class DivergedError(ArmscanError, ArithmeticError):

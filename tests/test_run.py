@@ -327,7 +327,7 @@ def test_run_is_refused_a_folder_where_it_would_overwrite_files_of_others(answer
         (tmp_path / "mine" / precious).write_text("precious")
     code, printed = answer("hydra.run.dir=mine", *SMALL)
     assert code == 2
-    assert f"mine: holds {Path(name).parts[0]}, which no run has left there" in printed
+    assert f"mine: holds {Path(name).parts[0]}, which no run made" in printed
     assert len(printed.splitlines()) == 1
     there = {file.relative_to(tmp_path).as_posix() for file in tmp_path.rglob("*") if file.is_file()}
     assert there == {f"mine/{name}", "mine/tracking/notes.txt"}

@@ -35,7 +35,7 @@ class BaseLearner(ABC):
         return dict(self._network.state_dict())
 
     def load_weights(self, weights: dict[str, Any]) -> None:
-        """Take over what `weights` returned.
+        """Load what `weights` returned.
 
         Raises:
             CheckpointError: If it is that of another network.
@@ -87,7 +87,7 @@ class SupervisedLearner(BaseLearner):
         """Do nothing: the first planes already count for learning."""
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
-        """Learn for one epoch of at least `n_env_steps`; returns its training metrics by name.
+        """Learn for one epoch of at least `n_env_steps`; return its training metrics by name.
 
         Raises:
             DivergedError: If the weights are not finite afterwards.
@@ -110,7 +110,7 @@ class SupervisedLearner(BaseLearner):
 
     @abstractmethod
     def _learn_until(self, n_env_steps: int, seeds: list[int], rng: np.random.Generator) -> list[Tensor]:
-        """Play and learn until this many environment steps were taken in all.
+        """Play and learn until the environments have taken this many steps in total.
 
         Args:
             n_env_steps: Number of environment steps.
@@ -123,7 +123,7 @@ class SupervisedLearner(BaseLearner):
 
     @abstractmethod
     def _further_metrics(self, seed: int) -> dict[str, float]:
-        """Return further metrics of an epoch, whose draws come from `seed`."""
+        """Return further metrics of an epoch; `seed` seeds what they draw."""
 
     def _lr_groups(self) -> list[dict[str, Any]]:
         return self._optimiser.param_groups
@@ -138,7 +138,7 @@ class SupervisedLearner(BaseLearner):
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned.
+        """Restore what `state` returned.
 
         Raises:
             CheckpointError: If it is that of another agent.
@@ -160,9 +160,9 @@ def is_finite(module: nn.Module) -> bool:
 
 
 def diverged(n_env_steps: int, too_large: str = "agent.lr") -> DivergedError:
-    """Return the error of a training whose networks are not finite any more."""
+    """Return the error of a training whose weights are no longer finite."""
     return DivergedError(
-        f"learning has diverged: after {n_env_steps} environment steps the networks' weights are not finite any more; "
+        f"learning has diverged: after {n_env_steps} environment steps the networks' weights are no longer finite; "
         f"a smaller {too_large} may help"
     )
 
@@ -180,7 +180,7 @@ def load_into(module: nn.Module, weights: dict[str, Any]) -> None:
 
 
 def spare_dynamo() -> None:
-    """Make torch's optimisers without torch's compiler, which they would load without using it.
+    """Keep torch's optimisers from loading torch's compiler, which they do not use.
 
     That takes one and a half seconds. Code that compiles must load it first.
     """

@@ -52,7 +52,7 @@ class Compute:
         return self.torch_device == "cpu" and self.precision == "float32"
 
     def apply_to(self, network: nn.Module) -> None:
-        """Make a network compute in this way from now on; its inputs and outputs stay of 32 bits."""
+        """Make a network compute this way from now on; its inputs and outputs stay in 32 bits."""
         if self.precision == "bfloat16":
             import torch
 

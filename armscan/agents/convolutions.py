@@ -13,7 +13,7 @@ CONVOLUTIONS = ((8, 4), (4, 2), (3, 1))
 
 
 def smallest_side_px() -> int:
-    """Return the smallest side of an image that the convolutions leave a pixel of."""
+    """Return the smallest side, in pixels, of an image of which the convolutions leave a pixel."""
     side = 1
     for kernel, stride in reversed(CONVOLUTIONS):
         side = (side - 1) * stride + kernel

@@ -42,7 +42,7 @@ def decode(frames: list[bytes], n_pixels: int) -> Pixels:
 # Positions are unsigned: indices that might be negative would cost more than all the rest.
 @numba.njit(cache=True, nogil=True)
 def _encode(pixels: Pixels, buffer: Pixels) -> int:
-    """Write the runs; returns how many bytes they are, the number of pixels where it would be as many or more."""
+    """Write the runs; return how many bytes they are, the number of pixels where it would be as many or more."""
     n_pixels, n_bytes, i = np.uint64(pixels.size), np.uint64(0), np.uint64(0)
     one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
     while True:
@@ -118,7 +118,7 @@ class FrameStore:
         return sum(map(len, self._frames))
 
     def add(self, pixels: Pixels) -> int:
-        """Take a frame in, shape (n_pixels,); returns its id, which nothing refers to yet."""
+        """Store a frame, shape (n_pixels,); return its ID, which nothing refers to yet."""
         frame = encode(pixels)
         if self._free:
             frame_id = self._free.pop()
@@ -158,7 +158,7 @@ class FrameStore:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned."""
+        """Restore what `state` returned."""
         joined = memoryview(state["joined"].numpy())
         ends = state["lengths"].cumsum(0).tolist()
         self._frames = [bytes(joined[start:end]) for start, end in zip([0, *ends], ends, strict=False)]

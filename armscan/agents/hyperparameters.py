@@ -12,7 +12,7 @@ from armscan.utils.validation import check_bool, check_float, check_int
 
 
 def number(default: float, **limits: float) -> Any:
-    """Return a field of a number within limits, which are named as `check_float` names them."""
+    """Return a dataclass field of a number within limits, which are those of `check_float`."""
     return field(default=default, metadata={"limits": limits})
 
 
@@ -101,12 +101,12 @@ def check_collection(n_asked: int, num_envs: int, setup: AgentSetup, *, learning
 
 
 def check_updates(utd_ratio: float, setup: AgentSetup, *, learning_starts: int = 0) -> None:
-    """Raise `InvalidValueError` if a whole training would come to no gradient step."""
+    """Raise `InvalidValueError` if a whole training would take no gradient step."""
     n_left = setup.total_env_steps - learning_starts
     if utd_ratio * n_left < 1:
         raise InvalidValueError(
-            f"agent.utd_ratio is {utd_ratio:g}, but it must be at least {1 / n_left:.3g}, or not "
-            f"one gradient step is taken in {n_left} environment steps"
+            f"agent.utd_ratio is {utd_ratio:g}, but it must be at least {1 / n_left:.3g} for one gradient "
+            f"step in {n_left} environment steps"
         )
 
 

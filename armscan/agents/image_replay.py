@@ -26,7 +26,7 @@ def replay_for(observation_space: spaces.Space[Any], size: int, n_envs: int) -> 
 
 
 class ImageReplay(Replay):
-    """A `Replay` that has ids of frames in the place of images, and gives the images back as they were.
+    """A `Replay` that stores IDs of frames instead of images, and returns the images unchanged.
 
     An image of three axes or more is a row of frames along its first one, such as a stack; one of two axes is a single
     frame. Most frames have been seen a moment ago: in the stack before, or as the next observation of the last step.
@@ -48,7 +48,7 @@ class ImageReplay(Replay):
         self._last: dict[tuple[str, str], tuple[NDArray[np.int32], Pixels]] = {}
 
     def add(self, batch: Any, buffer_ids: Any = None) -> Added:
-        """Add a transition of each of these environments, which are all if none are named."""
+        """Add a transition of each of these environments; default: of all."""
         envs = range(self.buffer_num) if buffer_ids is None else [int(i) for i in buffer_ids]
         slots = [self._offset[i] + self.buffers[i]._insertion_idx for i in envs]
         self._last.clear()
@@ -69,7 +69,7 @@ class ImageReplay(Replay):
         return added
 
     def get(self, index: Any, key: str, default_value: Any = None, stack_num: int | None = None) -> Any:
-        """Return one part of transitions, its images as they were."""
+        """Return one part of transitions, with its images."""
         found: Any = super().get(index, key, default_value, stack_num)
         if key not in OBSERVATIONS:
             return found

@@ -1,4 +1,4 @@
-"""The network of the plane finder: several looks in, the wanted plane and how far off it may be out."""
+"""The network of the plane finder: from several looks to the wanted plane and its expected error."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ class Multimodal:
         return self
 
     def _n_weights(self, images: Iterable[spaces.Box]) -> int:
-        """Count the weights of one network before it is made, but for those of the vectors that come in."""
+        """Count the weights of one network before it is built, except those of the input vectors."""
         n_weights, n_features = linear_weights(self.vector_sizes), self.vector_sizes[-1]
         for box in images:
             channels = [int(np.prod(box.shape[:-2])), *self.filters]

@@ -48,7 +48,7 @@ class MultimodalBody(ModuleWithVectorOutput):
         self.head = _linear_layers(n_features + vector_sizes[-1], head_sizes)
 
     def forward(self, obs: Any, state: Any = None, info: Any = None, act: Any = None) -> tuple[torch.Tensor, Any]:
-        """Return the features of a batch of observations, shape (n, head_sizes[-1]), and the state as it came.
+        """Return the features of a batch of observations, shape (n, head_sizes[-1]), and the state unchanged.
 
         Args:
             obs: Parts of the observations by name, each of shape (n, ...).

@@ -48,7 +48,7 @@ def gaussian_actor(body: ModuleWithVectorOutput, n_free: int, log_std: float | N
 
 
 def init_linear(module: nn.Module) -> nn.Module:
-    """Initialise linear layers with orthogonal weights and no bias; returns the module."""
+    """Initialise linear layers with orthogonal weights and no bias; return the module."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.orthogonal_(layer.weight, gain=2**0.5)

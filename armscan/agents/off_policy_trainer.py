@@ -14,7 +14,7 @@ from armscan.agents.compiled_sac import CompiledSAC
 class EvenUpdatesTrainer(OffPolicyTrainer):
     """Tianshou's trainer, which would round the gradient steps of every collection by itself, and refuse to have none.
 
-    What is due is counted from the first collection on, so that it follows from the environment steps alone: a
+    Gradient steps that are due are counted from the first collection, so that they follow from the environment steps: a
     training that continues later takes the same gradient steps as one that was never cut off. No progress bar is shown.
 
     Args:
@@ -28,7 +28,7 @@ class EvenUpdatesTrainer(OffPolicyTrainer):
         self._learning_starts = learning_starts
 
     def _update_step(self, collect_stats: CollectStatsBase) -> TrainingStats:
-        """Take the gradient steps that are due since the collection before; returns figures of them."""
+        """Take the gradient steps that are due since the collection before; return figures of them."""
         collector = self.params.training_collector
         n_env_steps = collector.collect_step - self._learning_starts
         n_due = self._n_due(n_env_steps) - self._n_due(n_env_steps - collect_stats.n_collected_steps)

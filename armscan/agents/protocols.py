@@ -72,7 +72,7 @@ class Learner(Agent, Protocol):
         """Return the weights that `act` requires: tensors by name."""
 
     def load_weights(self, weights: dict[str, Any]) -> None:
-        """Take over what `weights` returned."""
+        """Load what `weights` returned."""
 
     def state(self) -> dict[str, Any]:
         """Return the full training state, weights included: tensors, numbers, strings, lists and dicts of them.
@@ -81,7 +81,7 @@ class Learner(Agent, Protocol):
         """
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned."""
+        """Restore what `state` returned."""
 
 
 @dataclass(frozen=True, kw_only=True)

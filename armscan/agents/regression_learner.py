@@ -139,6 +139,6 @@ class RegressionLearner(SupervisedLearner):
         return {**super().state(), "examples": self._examples.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned; see `SupervisedLearner.load_state`."""
+        """Restore what `state` returned; see `SupervisedLearner.load_state`."""
         super().load_state(state)
         self._examples.load_state(state["examples"])

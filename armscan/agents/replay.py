@@ -32,7 +32,7 @@ class Replay(VectorReplayBuffer):
         return False
 
     def add(self, batch: Any, buffer_ids: Any = None) -> Added:
-        """Add a transition of each of these environments, which are all if none are named.
+        """Add a transition of each of these environments; default: of all.
 
         Args:
             batch: Parts of the transitions by name, a `Batch` or a dict, each of shape (n, ...).
@@ -89,7 +89,7 @@ class Replay(VectorReplayBuffer):
         return {"transitions": _tensors(self._meta) if len(self) else {}, "rings": rings}
 
     def load_state(self, state: Tree) -> None:
-        """Take over what `state` returned."""
+        """Restore what `state` returned."""
         self.reset()
         if state["transitions"]:
             self.set_batch(_batch(state["transitions"]))

@@ -137,6 +137,6 @@ class ResidualLearner(PlaneFinderLearner):
         return {**super().state(), "sac": self._sac.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned; see `Learner.load_state`."""
+        """Restore what `state` returned; see `Learner.load_state`."""
         super().load_state(state)
         self._sac.load_state(state["sac"])

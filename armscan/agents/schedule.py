@@ -55,7 +55,7 @@ def read_schedule(where: str, described: Any, total_env_steps: int) -> tuple[Seg
 
 
 def scheduled_algorithms(algorithm: Algorithm, schedule: Sequence[Segment]) -> list[tuple[int, Algorithm]]:
-    """Return the algorithm with the values of each segment, and from which environment step on.
+    """Return the algorithm with the values of each segment, and the environment step at which it begins.
 
     A value lasts until another segment changes it.
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class ScheduledLearner:
-    """A learner that another takes the place of from an environment step on.
+    """A learner that another one replaces at a given environment step.
 
     At the first epoch that begins at or after that step, the next learner loads the state of the one before. Which
     one learns follows from the environment steps alone, so that a training that is resumed at any epoch, or that goes
@@ -103,5 +103,5 @@ class ScheduledLearner:
         return self._learner.state()
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned, also that of a learner without a schedule; see `Learner.load_state`."""
+        """Restore what `state` returned, also that of a learner without a schedule; see `Learner.load_state`."""
         self._learner.load_state(state)

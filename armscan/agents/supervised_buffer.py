@@ -47,12 +47,12 @@ class SupervisedBuffer:
         return observation_of({name: part[places] for name, part in self._parts.items()}), self._optima[places]
 
     def state(self) -> dict[str, Any]:
-        """Return all that is kept, as tensors."""
+        """Return the stored data as tensors."""
         parts = {name: torch.from_numpy(part[: len(self)]) for name, part in self._parts.items()}
         return {"parts": parts, "optima": torch.from_numpy(self._optima[: len(self)]), "n_added": self._n_added}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned."""
+        """Restore what `state` returned."""
         self._n_added = state["n_added"]
         for name, part in self._parts.items():
             part[: len(self)] = state["parts"][name].numpy()

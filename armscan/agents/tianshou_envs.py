@@ -51,7 +51,7 @@ class TianshouVectorEnv(BaseVectorEnv):
         return [getattr(self._envs, f"single_{key}", getattr(self._envs, key, None))] * self.env_num
 
     def reset(self, env_id: Ids = None, **kwargs: Any) -> tuple[Any, NDArray[Any]]:
-        """Start episodes; returns the first observations of those environments, and no information."""
+        """Start episodes; return the first observations of those environments, and no information."""
         ids = np.arange(self.env_num) if env_id is None else np.atleast_1d(env_id)
         observations = self.begin(np.isin(np.arange(self.env_num), ids))
         return batched(observations)[ids], self._no_info(ids)
@@ -63,13 +63,13 @@ class TianshouVectorEnv(BaseVectorEnv):
         return batched(observations), *outcome, self._no_info(np.arange(self.env_num))
 
     def begin(self, mask: Mask) -> Observed:
-        """Start episodes in the environments of a mask; returns the observations of all of them."""
+        """Start episodes in the environments of a mask; return the observations of all of them."""
         observations, _ = reset_each(self._envs, self._seeds, {"reset_mask": mask})
         self._seeds = None
         return observations
 
     def advance(self, actions: NDArray[Any]) -> tuple[Observed, FloatArray, Mask, Mask]:
-        """Take a step in all environments; returns observations, rewards, and which have terminated or truncated."""
+        """Take a step in all environments; return observations, rewards, and which have terminated or truncated."""
         observations, rewards, terminated, truncated, infos = self._envs.step(actions)
         has_ended = terminated | truncated
         self.n_ended += int(np.count_nonzero(has_ended))
@@ -90,5 +90,5 @@ class TianshouVectorEnv(BaseVectorEnv):
 
 
 def batched(observations: Observed) -> Any:
-    """Return observations as Tianshou takes them, which indexes a `Batch` as it does an array."""
+    """Return observations in the form that Tianshou indexes: an array, or a `Batch` of arrays."""
     return Batch(observations) if isinstance(observations, dict) else observations

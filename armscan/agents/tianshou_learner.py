@@ -92,7 +92,7 @@ class TianshouLearner(BaseLearner):
 
     @property
     def env_steps_at_once(self) -> int:
-        """Those of one collection."""
+        """Environment steps of one collection."""
         return int(self._trainer.params.collection_step_num_env_steps or 0)
 
     @property
@@ -120,7 +120,7 @@ class TianshouLearner(BaseLearner):
             self._collector.collect(n_step=self._learning_starts, random=True)
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
-        """Learn for one epoch of at least `n_env_steps`; returns its training metrics by name.
+        """Learn for one epoch of at least `n_env_steps`; return its training metrics by name.
 
         Raises:
             DivergedError: If the weights are not finite afterwards.
@@ -198,7 +198,7 @@ class TianshouLearner(BaseLearner):
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Take over what `state` returned.
+        """Restore what `state` returned.
 
         Raises:
             CheckpointError: If it is that of another agent.

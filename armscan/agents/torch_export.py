@@ -1,4 +1,4 @@
-"""A policy as files that need nothing of ours: a program of torch, and ONNX."""
+"""A policy as files that do not require armscan: a torch program, and ONNX."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_REASON_CHARS = 300
 
 
 def export_program(policy: Policy, batch: Batch) -> ExportedProgram:
-    """Return a policy as a program of torch, for batches of every size.
+    """Return a policy as a torch program, for batches of every size.
 
     Args:
         policy: Policy of a learner.

@@ -206,11 +206,11 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolum
     print_table("volume", names, [Column(heading, justify="right") for heading in headings], rows)
     for volume, plane in labelled:
         if plane.score <= -SUCCESS_THRESHOLD:
-            wanted = f"an environment wants more than {-SUCCESS_THRESHOLD:g}"
+            wanted = f"an environment requires more than {-SUCCESS_THRESHOLD:g}"
             print_sentence(f"note: {volume.name} scores {plane.score:.3f}, and {wanted}")
     print(f"look at   {options.pictures}")
-    print("accept    nothing is left to do")
-    print("reject    in the manifest, take rotation, translation and score out of the")
+    print("accept    do nothing")
+    print("reject    in the manifest, remove rotation, translation and score from the")
     print("          volume's entry, or give the entry an exclude: REASON")
     if not options.markups:
         print("          (--markups writes the planes as files for 3D Slicer)")

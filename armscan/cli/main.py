@@ -60,7 +60,7 @@ def armscan() -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; a mistake of its user is answered in one line.
+    """Run the program; answer a user's mistake in one line.
 
     Args:
         arguments: Arguments of the command line. Default: those of this process.

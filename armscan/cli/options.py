@@ -24,7 +24,7 @@ def examples(*lines: str) -> str:
 
 
 class FilePath(click.ParamType[Path]):
-    """A path; an empty one, as of a variable that is not set, would be the working folder."""
+    """A path that is not empty: that of an unset variable would be the working folder."""
 
     name = "path"
 

@@ -63,7 +63,7 @@ def report(study: str | None, runs: str | None, out: Path | None, watch: bool, s
 
 
 def _watch(write: Callable[[int | None], Path]) -> None:
-    """Write a report again and again until Ctrl-C, which writes it for the last time."""
+    """Rewrite a report until Ctrl-C, and then for the last time."""
     from armscan.errors import StorageAwayError
     from armscan.utils.retry import no_retry
 
@@ -92,7 +92,7 @@ def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int |
     check_study_name("--study", name)
     storage = existing_storage(uri, where="--storage")
     if storage is None:
-        raise StudyError(f"--storage is {uri!r}, but nothing is there: give the one that it is in")
+        raise StudyError(f"--storage is {uri!r}, but there is no storage: give the one that contains the study")
     names = optuna.get_all_study_names(storage.optuna)
     if name not in names:
         others = [each for each in names if not each.endswith(FINAL_SUFFIXES)]

@@ -115,7 +115,7 @@ def show(run: str, tracking: str) -> None:
 def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, **selected: Any) -> int:
     """Remove checkpoints or folders of ended runs.
 
-    checkpoints: from their folders. folders: all of their files on this machine. What is in the store stays: MLflow
+    checkpoints: from their folders. folders: all of their files on this machine. The store is left as it is: MLflow
     deletes runs and artifacts. docs/runs.md says what is never removed.
     """
     from rich.filesize import decimal
@@ -179,8 +179,8 @@ def stop(target: str, storage: str, tracking: str) -> None:
 def sync(folder: Path, tracking: str | None, trust: bool) -> int:
     """Upload metrics and files buffered while the tracking server was unreachable.
 
-    FOLDER is the folder of a run, of a study, or above them. What is delivered already is not delivered again; runs
-    that are still going on deliver for themselves. Exit code: 1 if something is left.
+    FOLDER is the folder of a run, of a study, or above them. Nothing is uploaded twice, and running runs upload
+    by themselves. Exit code: 1 if something is left.
     """
     from armscan.config.trust import check_stored_address
     from armscan.tracking import open_existing_store
@@ -210,7 +210,7 @@ def sync(folder: Path, tracking: str | None, trust: bool) -> int:
 @tracking_option()
 @trust_option
 def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: bool) -> int:
-    """Run a run once more, and compare every metric.
+    """Repeat a run, and compare every metric.
 
     RUN is an MLflow run ID or its first four or more characters. Nothing is checked out or installed: what differs in
     code, packages and machine is listed. The volumes must be the same. The new run has the configuration and the seed

@@ -15,7 +15,7 @@ MAX_CHARS = 100
 
 
 def choices() -> dict[str, dict[str, Path]]:
-    """Return the file of each choice, by group and name; one's own files replace those of the same name."""
+    """Return the file of each choice, by group and name; the user's files replace those of the same name."""
     own = own_folders()
     roots = [(config_folder(), ""), (own.get(CONF), ""), (sweeps_folder(), SWEEP), (own.get(SWEEPS), SWEEP)]
     found: dict[str, dict[str, Path]] = {}

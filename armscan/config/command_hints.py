@@ -23,7 +23,7 @@ UV_RUN = "UV_RUN_RECURSION_DEPTH"
 
 @cache
 def typed(program: str) -> tuple[str, ...]:
-    """Return the words with which a program of this Python's environment is started from the working folder."""
+    """Return the words that start a program of this Python's environment from the working folder."""
     if UV_RUN in os.environ:
         return "uv", "run", program
     file, found = Path(sys.executable).with_name(program), shutil.which(program)
@@ -33,7 +33,7 @@ def typed(program: str) -> tuple[str, ...]:
 
 
 def kept_command(words: Iterable[str]) -> str:
-    """Return the command that runs these Hydra overrides, as a run keeps it for every machine."""
+    """Return the command that runs these Hydra overrides, in the form that a run stores for any machine."""
     return shlex.join([*RUN, *words])
 
 

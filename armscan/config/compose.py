@@ -88,7 +88,7 @@ def _print_replaced(names: tuple[str, ...]) -> None:
 
 @functools.cache
 def register() -> None:
-    """Make both known to Hydra in this process."""
+    """Register both classes with Hydra in this process."""
     for plugin in (SweepsSource, OwnFolders):
         Plugins.instance().register(plugin)
 
@@ -101,7 +101,7 @@ def application(run: Callable[[DictConfig], None]) -> Callable[[], None]:
 
 
 def compose(overrides: Sequence[str] = (), *, return_hydra_config: bool = False) -> DictConfig:
-    """Return the configuration that `armscan run` composes of these overrides.
+    """Return the configuration that `armscan run` composes from these overrides.
 
     Args:
         overrides: Overrides in the syntax of the command line, such as `["agent=ppo", "seed=1"]`.
@@ -119,7 +119,7 @@ def compose_run(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
 
 
 def of_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
-    """Return a composed configuration without the parts that are not of a run, and the choice of each group."""
+    """Return the part of a composed configuration that describes a run, and the choice of each group."""
     choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
     with open_dict(config):
         # The store is the same, however it was given.

@@ -1,4 +1,4 @@
-"""Passwords of services: they come from the environment or a file; an address that has one is refused."""
+"""Passwords of services: they come from the environment or a file; an address that contains one is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Services that many machines share: the environment or a file of the user's says where they are.
+"""Addresses of services that many machines share, from the environment or the user's file.
 
 A configuration refers to one as `${armscan.service:NAME}`, which resolves to its address.
 """

@@ -31,7 +31,7 @@ def sweeps_folder() -> Path:
 
 
 def working_folder() -> Path:
-    """Return the working directory by the name that its user calls it.
+    """Return the working directory under the name by which the user entered it.
 
     Other machines may know that name, but not what a link or a mount of this machine leads to.
     """
@@ -54,7 +54,7 @@ def config_file(name: str) -> Path:
 
 
 def replaced_files() -> list[Path]:
-    """Return one's own files that are used instead of armscan's of the same name, but for copies of these."""
+    """Return the user's files that replace armscan's of the same name, except exact copies of them."""
     replaced = []
     for name, folder in own_folders().items():
         ours = sweeps_folder() if name == SWEEPS else config_folder()

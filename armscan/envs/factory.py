@@ -23,7 +23,7 @@ AnyEnv = TypeVar("AnyEnv", bound=Env | VectorEnv[Any, Any, Any])
 
 
 class EnvFactory:
-    """Makes environments that differ in nothing but their volumes.
+    """Makes environments that differ only in their volumes.
 
     Args:
         **rules: Rules of every environment, as keyword arguments of `make_armscan_env`.
@@ -47,7 +47,7 @@ class EnvFactory:
         )
 
     def undeformed(self) -> EnvFactory:
-        """Return a factory of environments that move volumes but leave their shape: those that agents are judged in."""
+        """Return a factory of environments that move volumes but keep their shape: agents are evaluated in these."""
         transform = self.rules.get("transform")
         if not isinstance(transform, RandomTransform):
             return self

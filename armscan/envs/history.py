@@ -69,14 +69,14 @@ def rows_of(observations: NDArray[Any] | Parts, rows: int | NDArray[Any]) -> NDA
 class Remembered(Protocol):
     """History of the episodes of a batch of environments, kept by a wrapper.
 
-    What it is given and returns has a row for each of the environments in `env_ids`, an array of their numbers.
+    Arguments and results have a row for each of the environments in `env_ids`, an array of their numbers.
     """
 
     boxes: dict[str, spaces.Box]
     """Space of each part of what one environment observes with it."""
 
     def refill(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
-        """Begin anew with the first observations of environments."""
+        """Start over with the first observations of some environments."""
 
     def push(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
         """Add the latest observation and `info` of environments."""

@@ -125,7 +125,7 @@ def view_of(
     """Look at a plane outside of an episode, in a volume as it was read.
 
     Returns:
-        What is seen; no action led there, so its `action` is empty.
+        View of the plane; no action led there, so its `action` is empty.
     """
     slice_xz, landmarks = Scanner([volume], tissues).look(0, plane)
     return View(

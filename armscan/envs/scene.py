@@ -169,7 +169,9 @@ class SceneSampler:
                 can leave the bounds of the rotations, or it misses the volume.
         """
         if volume.optimal_action is None:
-            raise OptimalPlaneError(f"{volume.name}: has no labelled optimal plane, which an environment needs")
+            raise OptimalPlaneError(
+                f"{volume.name}: has no labelled optimal plane, which an environment needs; armscan data label finds it"
+            )
         turns = (0.0, 0.0) if self.transform is None else (self.transform.rz_deg, self.transform.rx_deg)
         for name, angle, turn, bound in zip(
             ("rz", "rx"), volume.optimal_action.rotation, turns, self.rotation_bounds_deg, strict=True

@@ -242,7 +242,7 @@ def reset_each(
 def step_each(
     envs: VectorEnv[Any, Any, Any], actions: Any, env_ids: Sequence[int] | EnvIds | None = None
 ) -> VectorStep:
-    """Take a step in vector environments, or in those of `env_ids`, which only ours know; see `ArmscanVectorEnv`."""
+    """Take a step in vector environments, or in those of `env_ids` (only armscan's); see `ArmscanVectorEnv`."""
     stepped: VectorStep = envs.step(actions) if env_ids is None else cast(Any, envs).step(actions, env_ids)
     return stepped
 

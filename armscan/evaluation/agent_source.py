@@ -101,7 +101,7 @@ def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
 
 
 def from_its_folder(config: DictConfig, tags: Mapping[str, str]) -> DictConfig:
-    """Return a run's configuration with the files of its data named from anywhere, not from where it was started."""
+    """Return a run's configuration with absolute paths of its data, not relative to where it was started."""
     for key in PATHS:
         if isinstance(path := config.data.get(key), str) and "working_folder" in tags:
             config.data[key] = str(Path(tags["working_folder"], path))

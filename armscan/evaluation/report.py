@@ -83,7 +83,7 @@ class EvaluationReport:
         return tables
 
     def _played(self, evaluations: Mapping[str, Evaluation]) -> dict[str, Evaluation]:
-        """Return evaluations by the name of their volumes, with all of them together if they are to be added up."""
+        """Return evaluations by the name of their volumes, with all of them together if they are to be pooled."""
         if not self.has_total or len(evaluations) < 2:
             return dict(evaluations)
         everything = tuple(episode for each in evaluations.values() for episode in each.episodes)

@@ -100,7 +100,7 @@ def apply(
     if data and source.run:
         notes += known_volumes(source, groups)
     if source.run and source.volumes is None and own.cache_info().currsize:
-        notes.append("the run has not kept fingerprints of its volumes: nobody knows whether these are still the same")
+        notes.append("the run has no fingerprints of its volumes, so these may have changed since")
     for note in notes:
         print_sentence(printable(f"note: {note}"))
     return replace(prepared, notes=tuple(notes), data=data)

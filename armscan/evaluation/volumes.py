@@ -76,12 +76,12 @@ def data_name(data: str | None) -> str:
 
 
 def file_name(text: str) -> str:
-    """Return a text as a file can be named by it."""
+    """Return a text in a form that can name a file."""
     return re.sub(r"[^\w.\-]+", "-", text)
 
 
 def check_out(file: Path, out: Path | None, what: str) -> None:
-    """Write where a file will lie, before the agent plays for hours.
+    """Check that a file can be written, before the agent plays for hours.
 
     Raises:
         InvalidValueError: If none can be written there; it names `--out` and `what` would be written.
@@ -95,7 +95,7 @@ def check_out(file: Path, out: Path | None, what: str) -> None:
 
 
 def known_volumes(source: TrainedAgent, groups: Mapping[str, Volumes]) -> list[str]:
-    """Return a sentence for each purpose that an agent's run has had these volumes for, or others of these names.
+    """Return a sentence for each use that an agent's run made of these volumes, or of others with their names.
 
     Args:
         source: Agent of a run.
@@ -123,7 +123,7 @@ def known_volumes(source: TrainedAgent, groups: Mapping[str, Volumes]) -> list[s
 
 
 class TrainingVolumes(Mapping[str, LabelVolume]):
-    """Training volumes that `load` reads on first use; only some rewards use them."""
+    """Training volumes that `load` reads on first use; few rewards use them."""
 
     def __init__(self, load: Callable[[], Split]) -> None:
         self._load = load

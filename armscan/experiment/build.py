@@ -156,7 +156,7 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
 
 
 def check_words(config: DictConfig) -> None:
-    """Check all that can be checked before a volume is read or a library of learning is loaded.
+    """Check all that can be checked before a volume is read or a learning library is loaded.
 
     Raises:
         InvalidValueError: If a value is not allowed.

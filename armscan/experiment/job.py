@@ -87,7 +87,7 @@ class Job:
         return f"{self.number} {self.varied}".strip()
 
     def write_outcome(self, *, failure: str | None = None, metrics: dict[str, dict[str, float]] | None = None) -> None:
-        """Leave word of the outcome for the process that launched the job."""
+        """Write the outcome for the process that launched the job."""
         outcome = JobOutcome(self.overrides, self.varied, failure, metrics or {})
         file = self.folder / OUTCOME_FOLDER / f"{self.number}.json"
         atomic_write(file, lambda opened: opened.write(json.dumps(asdict(outcome)).encode()))
@@ -133,9 +133,9 @@ def remove_if_untracked(folder: Path, error: BaseException) -> None:
 
 
 def remove_run_folder(folder: Path) -> None:
-    """Remove the files of a run that produced nothing from its folder, and the folders that are empty then.
+    """Remove the files of a run that produced nothing from its folder, and the folders that this leaves empty.
 
-    Nothing else is touched: the folder may be one that somebody named, with other files in it.
+    Nothing else is touched: the folder may have been named by the user, with other files in it.
     """
     for ours in (folder / ".hydra", folder / OUTCOME_FOLDER):
         shutil.rmtree(ours, ignore_errors=True)

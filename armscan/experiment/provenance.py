@@ -54,7 +54,7 @@ def start_tracking(
 ) -> TrackedRun:
     """Write the provenance files, open the tracking store and start a run in it.
 
-    What an earlier run has made in the folder is replaced; `check_free` has found that it is a run's.
+    Files of an earlier run in the folder are replaced; `check_free` has found them to be a run's.
 
     Args:
         config: Composed configuration.

@@ -114,7 +114,7 @@ class RunResult:
         return "\n\n".join([table.markdown(), *self.notes()])
 
     def model_metrics(self) -> dict[str, list[str]]:
-        """Return the names of the run's metrics that its checkpoint is known by, by the part of their volumes."""
+        """Return the names of the metrics that describe the run's checkpoint, by the part of their volumes."""
         names = [*(limits.metric for limits in self.evaluations[TEST].on_plane), *OF_MODEL]
         groups = {"test": TEST.replace(" ", "_"), "validation": "validation"}
         return {part: [f"{group}/{name}" for name in names] for part, group in groups.items()}

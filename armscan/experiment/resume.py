@@ -71,7 +71,7 @@ def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -
 
 
 def _grid_of(run: Run) -> list[str]:
-    """Return the words that a grid is repeated with."""
+    """Return the words that repeat a grid."""
     try:
         return TypeAdapter(list[str]).validate_json(_tag(run, GRID_TAG), strict=True)
     except ValidationError as error:
@@ -79,7 +79,7 @@ def _grid_of(run: Run) -> list[str]:
 
 
 def _tag(run: Run, name: str) -> str:
-    """Return a tag that each run of armscan has."""
+    """Return a tag that every run of armscan has."""
     try:
         return str(run.data.tags[name])
     except KeyError as error:
@@ -189,11 +189,11 @@ def _started_with(run: Run, file: Path, what: str) -> bytes:
 
 
 def _check_last_checkpoint(run: Run, folder: Path) -> None:
-    """Raise `ResumeError` if a training would begin again whose epochs are tracked already."""
+    """Raise `ResumeError` if a training would restart although its epochs have been tracked."""
     last = folder / LAST_CHECKPOINT
     if not last.exists() and any(name.startswith("validation/") for name in run.data.metrics):
         raise ResumeError(
-            f"{last}: there is no such checkpoint any more, but run {run.info.run_id} has tracked epochs, which would "
+            f"{last}: this checkpoint is gone, but run {run.info.run_id} has tracked epochs, which would "
             "be trained and tracked again: put it back, or start another run"
         )
 
@@ -216,6 +216,6 @@ def _enter_working_folder(run: Run) -> None:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ResumeError(
-            f"run {run.info.run_id} was started in {folder}, from where its configuration names files, but one cannot "
-            f"go there ({reason})"
+            f"run {run.info.run_id} was started in {folder}, where its relative paths begin, but that folder cannot be "
+            f"entered ({reason})"
         ) from error

@@ -17,9 +17,9 @@ MAY_SET_FOLDS = (f"{FOLDS}=", f"+{FOLDS}=", "experiment=", "+experiment=")
 
 
 def with_folds(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line; if they ask for folds, as a grid over the folds.
+    """Return the words of a command line, as a grid over the folds if they ask for folds.
 
-    What else a grid varies, such as `seed=0,1,2`, stays.
+    Other keys that the grid varies, such as `seed=0,1,2`, stay.
 
     Raises:
         InvalidValueError: If there are no such folds.

@@ -1,4 +1,4 @@
-"""A learner's policy as a model: made, held against the learner itself, and kept with its run."""
+"""A learner's policy as a model: built, compared with the learner, and stored with its run."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FIRST_SEED, N_OBSERVED = 6 * 10**6, 8
 def save_policy(agent: Learner, env: Env, tracked: TrackedRun, folder: Path, tell: Callable[[str], None]) -> None:
     """Store the policy of a trained agent as a model of its run, unless its configuration disables it.
 
-    What cannot be kept stops no run: it is told, and noted in a tag.
+    A model that cannot be stored stops no run: the reason is printed, and noted in a tag.
     """
     config = yaml.safe_load((folder / CONFIG_FILE).read_bytes())
     # Runs of earlier versions say nothing of it.
@@ -66,7 +66,7 @@ def tags_of_kept(folder: Path) -> dict[str, str]:
 
 
 def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any]) -> None:
-    """Write an agent's policy as a model, in the place of what is there; one that fails a check is not written.
+    """Write an agent's policy as a model, replacing an earlier one; a model that fails a check is not written.
 
     Raises:
         ExportError: If the policy cannot be written down, or the model does not answer as the agent does.
@@ -88,11 +88,11 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
     except Exception as error:
         if isinstance(error, ExportError) or is_interruption(error):
             raise
-        raise ExportError(f"the model cannot be written or asked: {reason_in(error)}") from error
+        raise ExportError(f"the model cannot be written or run: {reason_in(error)}") from error
 
 
 def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]:
-    """Return what stays with a model: where it comes from, what it has seen, what its actions stand for."""
+    """Return the metadata of a model: its origin, what it has observed, and the meaning of its actions."""
     rules = config["env"]
     ways: dict[str, Any] = {"tx": "the volume's size across", "ty": "the volume's size along the arm"}
     if rules["translation_bounds_mm"] is not None:
@@ -113,7 +113,7 @@ def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]
 
 
 def _played(agent: Learner, env: Env) -> list[tuple[Observed, FloatArray]]:
-    """Return observations of the agent's episodes, with the action that it has answered each with."""
+    """Return observations of the agent's episodes, with its action for each."""
     played: list[tuple[Observed, FloatArray]] = []
     seed, is_over = FIRST_SEED, True
     while len(played) < N_OBSERVED:
@@ -142,7 +142,7 @@ def _check(folder: Path, policy: Policy, played: list[tuple[Observed, FloatArray
 
 
 def onnx_answers(file: Path, arrays: Arrays) -> NDArray[np.float32]:
-    """Return what onnxruntime answers a batch of observations with, shape (n, n_free)."""
+    """Return the actions of onnxruntime for a batch of observations, shape (n, n_free)."""
     # Deferred: few commands need it.
     import onnxruntime
 
@@ -157,6 +157,4 @@ def _check_same(what: str, given: NDArray[Any], of: str, wanted: NDArray[Any], t
     furthest = float(np.abs(given - wanted).max())
     # A NaN is no number that would be near enough.
     if not furthest <= tolerance:
-        raise ExportError(
-            f"{what} answers otherwise than {of}: up to {furthest:.3g} away, but {tolerance:g} is allowed"
-        )
+        raise ExportError(f"{what} differs from {of} by up to {furthest:.3g}, but {tolerance:g} is allowed")

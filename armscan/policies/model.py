@@ -80,7 +80,7 @@ def is_model(folder: Path) -> bool:
 
 
 def others_in(folder: Path) -> list[str]:
-    """Return what lies in the folder of a model and is no part of one."""
+    """Return the files in a model's folder that are no part of a model."""
     found = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     return sorted(found - {*FILES, *(str(Path(file).parent) for file in FILES)})
 

@@ -122,7 +122,7 @@ def write_page(
     for name in () if _is_report(folder / REPORT_FILE) else (REPORT_FILE, *(f"{name}.csv" for name in tables)):
         if (folder / name).exists():
             raise InvalidValueError(
-                f"the report would replace {folder / name}, but that is no report's: name another folder with --out"
+                f"the report would replace {folder / name}, but no report made it: name another folder with --out"
             )
     folder.mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():

@@ -138,7 +138,7 @@ def validation_titles(names: Iterable[str]) -> dict[str, str]:
 
 
 def read_trainings(store: TrackingStore, found: Sequence[SelectedRuns], folder: Path) -> list[TrackedTraining]:
-    """Return what runs say of their trainings.
+    """Return the trainings that runs describe.
 
     Args:
         store: Store that they are in.

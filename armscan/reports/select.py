@@ -52,7 +52,7 @@ def read_runs(text: str) -> list[str]:
 
 
 def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[SelectedRuns]:
-    """Return the trainings that are meant, each once: in the order in which they are named, and then were started.
+    """Return the named trainings, each once: in the order of the names, then of their starts.
 
     Args:
         store: Store of the runs.
@@ -127,7 +127,7 @@ def _selected(store: TrackingStore, runs: Sequence[Run]) -> list[SelectedRuns]:
 
 
 def _runs(store: TrackingStore, experiment_id: str, condition: str = "") -> Iterator[Run]:
-    """Yield the runs of an experiment, the first that was started first."""
+    """Yield the runs of an experiment in the order of their starts."""
     token: Any = None
     while True:
         order = ["attributes.start_time ASC"]

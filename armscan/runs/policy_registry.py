@@ -133,7 +133,7 @@ def _check_kept(run: FoundRun, folder: Path) -> None:
 def _not_kept(run: FoundRun) -> ExportError:
     return ExportError(
         f"run {run.run_id}: its {POLICY_FOLDER}/ is not the one that it has kept: changed, or another run's; remove "
-        "it from its artifacts, and it is made anew"
+        "it from its artifacts, and it is made again"
     )
 
 

@@ -70,7 +70,7 @@ def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
         condition = f"attributes.run_id IN ('{run_id}', '{parent_id}')"
         now = {run.info.run_id: run for run in search(client, experiment_ids(client), condition)}
         if run_id not in now:
-            raise RunSkippedError("somebody has deleted it meanwhile")
+            raise RunSkippedError("it has been deleted meanwhile")
         for file in _files(_folder(now[run_id], now), what):
             file.unlink(missing_ok=True)
         if what == CHECKPOINTS:

@@ -31,7 +31,7 @@ def find(
     before: datetime | None = None,
     where: str | None = None,
 ) -> list[Run]:
-    """Return the runs of a store that fit all that is given, in no order. Default: all runs.
+    """Return the runs of a store that match all criteria, in no particular order. Default: all runs.
 
     Args:
         client: Client of the store.
@@ -63,7 +63,7 @@ def find(
     except MlflowException as error:
         if where is None or error.error_code != "INVALID_PARAMETER_VALUE":
             raise
-        raise InvalidValueError(f"--where is {where!r}, but MLflow takes no such filter: {reason_in(error)}") from error
+        raise InvalidValueError(f"--where is {where!r}, but MLflow rejects this filter: {reason_in(error)}") from error
     projections = _projection_params(projection) if projection else None
 
     def is_fit(run: Run) -> bool:
@@ -93,14 +93,14 @@ def experiment_ids(client: TrackingStore, name: str | None = None) -> list[str]:
 
 
 def search(client: TrackingStore, experiments: list[str], condition: str = "") -> list[Run]:
-    """Return all runs of experiments that a filter of MLflow lets through."""
+    """Return all runs of experiments that match an MLflow filter."""
     if not experiments:
         return []
     return all_pages(lambda **page: client.search_runs(experiments, filter_string=condition, **page))
 
 
 def all_pages(ask: Callable[..., Any]) -> list[Any]:
-    """Return everything that MLflow tells page by page."""
+    """Return all that MLflow returns page by page."""
     found: list[Any] = []
     token = None
     while True:

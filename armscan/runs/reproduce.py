@@ -33,7 +33,7 @@ N_SHOWN = 8
 
 @dataclass(frozen=True)
 class Original:
-    """A run that is to be made again.
+    """A run that is to be reproduced.
 
     Args:
         run: Tracked run.
@@ -49,7 +49,7 @@ class Original:
 
 
 def load_original(tracking: str, run_id: str, *, trust: bool = False) -> Original:
-    """Return a tracked run, ready to be made again.
+    """Return a tracked run, ready to be reproduced.
 
     Raises:
         ArmscanError: If there is no such run, it is none of `armscan run`, it has not ended, what it has kept is gone
@@ -129,9 +129,7 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
     """
     run = original.run
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InvalidValueError(
-            f"--out is {str(folder)!r}, but that is there already, and no empty folder: name another"
-        )
+        raise InvalidValueError(f"--out is {str(folder)!r}, but it exists and is not an empty folder: name another")
     is_ours = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     choices = {group: run.tags.get(f"choice.{group}", "unknown") for group in CHOICES_IN_TAGS}

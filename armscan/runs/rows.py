@@ -136,7 +136,7 @@ class RunRow:
 def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
     """Return rows of the runs whose parent is not among them, the others folded into them.
 
-    What is too deep below others stands by itself, as do runs that are above themselves.
+    Runs too deep below others have rows of their own, as have runs that are their own ancestors.
     """
     parents = {run.info.run_id: run.data.tags.get(PARENT_TAG, "") for run in runs}
 

@@ -57,9 +57,9 @@ class OwnFolder:
         if path.resolve() != path:
             raise RunSkippedError(f"its folder {path} is reached through a link")
         if not path.is_dir():
-            raise RunSkippedError(f"its folder {path} is not there any more")
+            raise RunSkippedError(f"its folder {path} is gone")
         if config.is_symlink() or not config.is_file():
-            raise RunSkippedError(f"{path} has no {CONFIG_FILE}, so that nobody knows whether it is the run's")
+            raise RunSkippedError(f"{path} has no {CONFIG_FILE}, so it may not be the run's")
         try:
             contents = config.read_bytes()
         except OSError as error:
@@ -72,7 +72,7 @@ class OwnFolder:
         return cls(path, run.info.run_id)
 
     def files(self) -> dict[Path, int]:
-        """Return the run's own files with their bytes; last those by which they are known to be its own, or held."""
+        """Return the run's own files with their sizes in bytes; those that prove ownership or hold it come last."""
         last = [CONFIG_FILE, *(f"{OUTBOX_FOLDER}/{self.run_id}{end}" for end in (DELIVERED, SUFFIX, LOCK)), LOCK_FILE]
         unfinished = [file.name for file in self.path.glob(f".*.{UNFINISHED}")]
         names = [*unfinished, *RESULTS, *STARTED_WITH, *RECORDS, *self._tracked(), *HYDRA_FILES]
@@ -111,16 +111,16 @@ class OwnFolder:
                         stack.enter_context(FileLock(lock, timeout=0))
                 is_delivered = not outbox.exists() or OutboxFile(outbox).is_delivered
             except Timeout as error:
-                raise RunSkippedError(f"another process is at work in its folder {self.path}") from error
+                raise RunSkippedError(f"another process is using its folder {self.path}") from error
             except TrackingError as error:
-                raise RunSkippedError(f"what it was to be tracked with cannot be read: {error}") from error
+                raise RunSkippedError(f"the outbox in its folder cannot be read: {error}") from error
             except OSError as error:
                 raise RunSkippedError(
-                    f"nobody knows whether another process is at work in its folder {self.path} ({error.strerror})"
+                    f"it is unknown whether another process is using its folder {self.path} ({error.strerror})"
                 ) from error
             if not is_delivered:
                 raise RunSkippedError(
-                    f"not all of it is delivered: {armscan_command('runs', 'sync', str(self.path))} does that"
+                    f"not all of it is uploaded: run {armscan_command('runs', 'sync', str(self.path))}"
                 )
             yield
 
@@ -146,5 +146,5 @@ def _noted(run: Run) -> Path:
     if host != socket.gethostname():
         raise RunSkippedError(f"its folder {folder} is on the host {host}")
     if not Path(folder).is_absolute():
-        raise RunSkippedError(f"its folder is {folder!r}, and nobody knows where that is")
+        raise RunSkippedError(f"its folder is {folder!r}, which is not an absolute path")
     return Path(folder)

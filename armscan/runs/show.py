@@ -1,4 +1,4 @@
-"""Everything of one run, in the terminal."""
+"""Everything about one run, in the terminal."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class Target:
 
 
 def target_of(run: Run) -> Target | None:
-    """Return the trial or the study that a run is of; None if it is of none.
+    """Return the trial or the study that a run belongs to; None if there is none.
 
     Raises:
         TrackingError: If its tag is no number of a trial.
@@ -52,6 +52,6 @@ def interrupt(run: Run) -> str:
     if run.info.status != "RUNNING":
         raise TrackingError(f"run {run_id} has ended already ({run.info.status})")
     if note is None or not note.process.is_here or not note.process.is_alive:
-        raise TrackingError(f"run {run_id} is of no study, and no process of it is known on this machine")
+        raise TrackingError(f"run {run_id} belongs to no study, and this machine knows no process of it")
     os.kill(note.process.pid, signal.SIGINT)
     return f"run {run_id}: its process {note.process.pid} was interrupted, and ends as with Ctrl-C"

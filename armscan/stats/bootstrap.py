@@ -40,7 +40,7 @@ class Estimate(NamedTuple):
     high: float
 
     def clipped(self, least: float, most: float) -> Estimate:
-        """Return it with an interval that ends at the bounds of the figure, of which Student's knows nothing."""
+        """Return the estimate with its interval cut at the bounds of the figure, which Student's interval ignores."""
         low, high = np.clip((self.low, self.high), least, most)
         return Estimate(self.value, float(low), float(high))
 
@@ -55,7 +55,7 @@ def mean(samples: FloatArray) -> FloatArray:
 
 
 def quantile(share: float) -> Statistic:
-    """Return the statistic that gives a quantile over the last axis as `mean` gives the mean, by interpolation."""
+    """Return a statistic like `mean` that computes a quantile over the last axis, by interpolation."""
 
     def statistic(samples: FloatArray) -> FloatArray:
         # NaNs come last.

@@ -56,7 +56,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
             print_sentence(printable(beginning.told))
     for phase in opened.phases:
         if phase.scheduler.go_on():
-            print(f"{phase.name}: was stopped, and goes on")
+            print(f"{phase.name}: was stopped, and resumes")
         if n_failed := phase.scheduler.reset_failures():
             print(f"{phase.name}: {n_failed} failures before this start are ignored")
     try:

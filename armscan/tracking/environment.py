@@ -60,7 +60,7 @@ def environment_file() -> bytes:
 
 
 def environment_tags() -> dict[str, str]:
-    """Return the versions that figures may depend on, and the sum of the constraints that were to be installed."""
+    """Return the versions that figures may depend on, and the checksum of the constraints to be installed."""
     packages = environment()["packages"]
     constraints = Path(__file__).parents[2] / "constraints.txt"
     return {

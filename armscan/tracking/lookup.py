@@ -156,7 +156,7 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
         max_results=N_SHOWN + 1,
     )
     if not found:
-        raise TrackingError(f"the run is {run_id!r}, but no run of {client.uri} has an id that begins so")
+        raise TrackingError(f"the run is {run_id!r}, but no run of {client.uri} has an ID that begins so")
     if len(found) > 1:
         ids = [run.info.run_id for run in found[:N_SHOWN]] + (["others"] if len(found) > N_SHOWN else [])
         raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the id")

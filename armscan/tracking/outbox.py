@@ -75,7 +75,7 @@ class OutboxFile:
         try:
             self.address = Address(**next(self.entries())["address"])
         except (StopIteration, TypeError, KeyError) as error:
-            raise TrackingError(f"{file}: does not begin with the run that it is of") from error
+            raise TrackingError(f"{file}: does not begin with the ID of its run") from error
         self._delivered: dict[Channel, int] = dict.fromkeys(CHANNELS, 0) | self._read_delivered()
 
     @property

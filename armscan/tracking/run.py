@@ -85,14 +85,14 @@ class TrackedRun:
 
     @classmethod
     def joined(cls, store: TrackingStore, run_id: str, *, name: str, folder: Path) -> Self:
-        """Return a run that is there, to add to it."""
+        """Return an existing run, to add to it."""
         return cls(store, Outbox.begin(folder, Address(run_id, store.uri)), name=name)
 
     @classmethod
     def reopen(
         cls, store: TrackingStore, run: Run, *, folder: Path, config: Mapping[str, Any], tags: Mapping[str, str]
     ) -> Self:
-        """Open a run again that was interrupted, as if nothing had happened; parameters that it lacks are logged."""
+        """Reopen an interrupted run; log the parameters that it lacks."""
         run_id = run.info.run_id
         if not (resumed := run.data.tags.get("resumed", "0")).isdecimal():
             raise TrackingError(f"run {run_id}: its tag resumed is {resumed[:50]!r}, but it must be a whole number")
@@ -139,7 +139,7 @@ class TrackedRun:
             self._add(params=params)
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Log the metrics that are missing because the run was killed, and start to watch the machine."""
+        """Log the metrics that are missing because the run was killed, and start to monitor the machine."""
         for report in earlier:
             self.on_epoch(report)
         if (every_s := self._store.system_metrics_s) is not None:
@@ -157,13 +157,13 @@ class TrackedRun:
         self.log_metrics(figures, n_env_steps=report.n_env_steps)
 
     def on_end(self) -> None:
-        """Watch the machine no longer; evaluation and artifacts follow."""
+        """Stop monitoring the machine; evaluation and artifacts follow."""
         if self._system is not None:
             self._system.finish()
             self._system = None
 
     def log_metrics(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
-        """Log figures at an environment step; none twice."""
+        """Log figures at an environment step, each once."""
         at_ms = now_ms()
         points = [
             (name, float(value), at_ms, n_env_steps)
@@ -184,7 +184,7 @@ class TrackedRun:
         self._add(model=[n_env_steps, {part: list(names) for part, names in metrics.items()}])
 
     def set_note(self, text: str) -> None:
-        """Give the run a description in Markdown, shown first on its page of MLflow, unless somebody gave it one."""
+        """Give the run a description in Markdown, shown first on its page of MLflow, unless a person wrote one."""
         self._add(note=text)
 
     def log_files(self, *files: Path) -> None:

@@ -41,7 +41,7 @@ def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def name_of(key: str) -> str:
-    """Return a key as MLflow takes it for a name; one that is changed ends with a sum, so that no two become one."""
+    """Return a key as MLflow takes it for a name; a changed one ends with a checksum, so that no two become one."""
     name = posixpath.normpath(REFUSED.sub("_", key).strip(REFUSED_ENDS).replace("..", "._") or "_")
     if name == key and len(key) <= MAX_KEY_CHARS:
         return key

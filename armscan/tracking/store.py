@@ -173,7 +173,7 @@ def _check_address(uri: str) -> None:
     except ValueError:
         is_server = False
     if not is_server:
-        raise TrackingError(f"tracking.uri is {uri!r}, but that is no address of a server")
+        raise TrackingError(f"tracking.uri is {uri!r}, but that is not the address of a server")
 
 
 @contextlib.contextmanager

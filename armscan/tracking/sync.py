@@ -54,7 +54,7 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
             Default: False.
 
     Returns:
-        What became of each run that had something left.
+        The delivery of each run that had something left.
     """
     place = folder.absolute()
     removed = [
@@ -92,7 +92,7 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
 
 
 def _is_abandoned(run_id: str, file: Path) -> bool:
-    """Return whether the process that kept a run's outbox in this file has died on this machine."""
+    """Return whether the process that kept a run's outbox in this file died on this machine."""
     note = Note.of(run_id)
     return note is not None and note.is_abandoned and note.outbox == file.absolute()
 
@@ -181,7 +181,7 @@ def _deliver_pending(store: TrackingStore) -> None:
 def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
     """Mark the runs of dead processes in a folder tree as FAILED.
 
-    What the store does not get now is in their folders.
+    Entries that the store cannot take now stay in the folders of the runs.
     """
     for file in outbox_files(folder):
         try:

@@ -67,7 +67,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     # The checksum matches, so the file is not damaged; torch's readers raise exceptions of many types.
     except Exception as error:
         raise CheckpointError(
-            f"{path}: is no checkpoint: it holds something else than tensors, numbers and texts"
+            f"{path}: is no checkpoint: it holds something other than tensors, numbers and texts"
         ) from error
 
 
@@ -103,7 +103,7 @@ def _verified(file: io.BufferedReader, path: Path) -> BinaryIO:
             raise CheckpointError(f"{path}: is empty, but it must be a checkpoint")
         if header.startswith(MAGIC):
             raise CheckpointError(f"{path}: is damaged: its first line is {header!r}")
-        raise CheckpointError(f"{path}: is no checkpoint of armscan, or damaged: it begins with {header[:16]!r}")
+        raise CheckpointError(f"{path}: is not a checkpoint of armscan, or is damaged: it begins with {header[:16]!r}")
     if int(match[1]) != FORMAT:
         newer = "it was written by a newer version" if int(match[1]) > FORMAT else "there never was such a format"
         raise CheckpointError(

@@ -125,13 +125,13 @@ def take_over_checkpoints(
 
 
 def _restore(learner: Learner, last: Path, provenance: CheckpointProvenance) -> list[EpochReport]:
-    """Restore a learner to the state of a checkpoint; returns the reports of the epochs before it."""
+    """Restore a learner to the state of a checkpoint; return the reports of the epochs before it."""
     state, facts = load_checkpoint(last)
     provenance.check(last, facts)
     reports = _read(facts.get("reports"), last)
     try:
         learner.load_state(state)
-    # The checksum is right, so somebody has written another state.
+    # The checksum is right, so the state was written with other contents.
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         if isinstance(error, CheckpointError):
             raise

@@ -73,7 +73,7 @@ class TrainingDomain:
             raise InvalidValueError(f"no training domain can be read from {text[:MAX_SHOWN_CHARS]!r}") from error
 
     def check_observed(self, other: TrainingDomain) -> None:
-        """Raise `InvalidValueError` if other environments show something of another shape than these."""
+        """Raise `InvalidValueError` if observations of other environments have another shape than these."""
         for name in self.observed.keys() | other.observed.keys():
             here, there = self.observed.get(name), other.observed.get(name)
             if here != there:

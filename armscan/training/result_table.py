@@ -54,7 +54,7 @@ class ResultTable:
 
     @property
     def quantities(self) -> list[Quantity]:
-        """The columns of which any result has a figure; of results that have none of them, all metrics."""
+        """The columns for which a result has a figure; if there are none, all metrics."""
         known = {
             name for each in self.results.values() for name, estimate in each.estimates.items() if is_known(estimate)
         }

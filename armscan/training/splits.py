@@ -58,7 +58,7 @@ class Split:
         return {part: getattr(self, part) for part in PARTS}
 
     def fingerprints(self) -> Fingerprints:
-        """Return a sum of each volume's contents, by split and name."""
+        """Return a checksum of each volume's contents, by split and name."""
         return {
             part: {name: fingerprint(volume) for name, volume in volumes.items()}
             for part, volumes in self.parts.items()

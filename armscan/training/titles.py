@@ -71,7 +71,7 @@ def leading_among(metrics: Iterable[str]) -> list[str]:
 
 
 def title_of(metric: str) -> str:
-    """Return how people call a metric, with its statistic and unit, such as `steps, mean`."""
+    """Return the title of a metric, with its statistic and unit, such as `steps, mean`."""
     limits = limits_among([metric])
     return limits[0].title if limits else TITLES.get(metric, metric.replace("_", " "))
 

@@ -85,7 +85,7 @@ def show(
 
 
 def last_judged(storage: Storage) -> tuple[str, int] | None:
-    """Return the name and the number of the last study that has a result; None if none has."""
+    """Return the name and the number of the last study with a result; None if there is none."""
     # Deferred, as above.
     from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
 

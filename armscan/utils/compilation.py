@@ -1,4 +1,4 @@
-"""A line in the log where code is compiled for the first time on a machine, because that takes a while."""
+"""A line in the log when code is compiled for the first time on a machine, because that takes a while."""
 
 from __future__ import annotations
 

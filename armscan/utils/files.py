@@ -164,7 +164,7 @@ def is_made_by_run(name: str) -> bool:
 
 
 def check_free(folder: Path) -> None:
-    """Raise `FolderTakenError` if a run's file in a folder was left by no run; an earlier run's is in nobody's way."""
+    """Raise `FolderTakenError` if a folder has a file named like a run's, but not made by a run."""
     # An earlier run that was never tracked has left what it was started with: the first three, always together.
     outboxes = (folder / OUTBOX_FOLDER).glob(RUN_ID + OUTBOX_SUFFIXES[-1])
     if any(outboxes) or all((folder / name).is_file() for name in STARTED_WITH[:3]):
@@ -172,7 +172,7 @@ def check_free(folder: Path) -> None:
     # Also a link that leads nowhere.
     if taken := [name for name in (*RESULTS, *STARTED_WITH, POLICY_FOLDER) if os.path.lexists(folder / name)]:
         raise FolderTakenError(
-            f"{folder}: holds {taken[0]}, which no run has left there, and which this run would overwrite: "
+            f"{folder}: holds {taken[0]}, which no run made and this run would overwrite: "
             "name another folder with hydra.run.dir or hydra.sweep.dir"
         )
 
@@ -191,7 +191,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
             yield
     except Timeout as error:
         raise FolderInUseError(
-            f"{folder}: another process is at work in this folder; wait for its end, or stop it"
+            f"{folder}: another process is using this folder; wait until it ends, or stop it"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Log lines of a process, and what its libraries are kept from telling."""
+"""Log lines of a process, and its libraries without their noise."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def log(text: str) -> None:
 
 
 def silence_libraries() -> None:
-    """Hide warnings of libraries that a user cannot act on, and keep MLflow from telling its makers of its use."""
+    """Hide warnings of libraries that a user cannot act on, and turn off MLflow's telemetry."""
     # Read when MLflow is imported.
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     for message in (

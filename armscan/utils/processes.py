@@ -34,7 +34,7 @@ def limit_threads() -> None:
 
 
 def collect_garbage_rarely() -> None:
-    """Look for garbage in circles after 50,000 new objects, not after 700, and not at the end of the process.
+    """Collect cyclic garbage after 50,000 new objects, not after 700, and not at the end of the process.
 
     Libraries make some hundred thousand objects that stay. To look through them again and again takes half a second of
     a command's three, and at the end of a run three seconds.

@@ -46,6 +46,6 @@ def load_yaml(text: str | bytes) -> Any:
 
 
 def check_no_duplicates(keys: list[str]) -> None:
-    """Raise `ValueError` if a key is there twice."""
+    """Raise `ValueError` if a key appears twice."""
     if len(set(keys)) < len(keys):
-        raise ValueError(f"the key {Counter(keys).most_common(1)[0][0]!r} is there twice")
+        raise ValueError(f"the key {Counter(keys).most_common(1)[0][0]!r} appears twice")

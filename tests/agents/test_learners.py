@@ -203,7 +203,7 @@ def test_algorithm_refuses_impossible_parameters(algorithm, changes, message):
         (SAC, {"utd_ratio": -1}, r"agent\.utd_ratio is -1"),
         (SAC, {"learning_starts": 100}, r"agent\.learning_starts is 100, .* must be below"),
         (SAC, {"learning_starts": 1, "num_envs": 100}, r"agent\.learning_starts is 1, 100 for 100 environments"),
-        (SAC, {"utd_ratio": 0.01}, r"agent\.utd_ratio is 0\.01, .* at least 0\.0125, or not one"),
+        (SAC, {"utd_ratio": 0.01}, r"agent\.utd_ratio is 0\.01, .* at least 0\.0125 for one"),
         (
             SAC,
             {"env_steps_per_collection": 10**4},
@@ -234,7 +234,7 @@ def test_algorithm_refuses_impossible_parameters(algorithm, changes, message):
         (
             Regression,
             {"utd_ratio": 0.001},
-            r"agent\.utd_ratio is 0\.001, .* at least 0\.01, or not",
+            r"agent\.utd_ratio is 0\.001, .* at least 0\.01 for one",
         ),
     ],
 )

@@ -171,7 +171,7 @@ def test_damaged_checkpoint_is_told_and_changes_nothing(answer, tmp_path):
     damages = {
         "best.pt: is damaged: its contents are not those that were written": whole[: len(whole) // 2],
         "best.pt: is empty": b"",
-        "best.pt: is no checkpoint of armscan": b"nonsense",
+        "best.pt: is not a checkpoint of armscan": b"nonsense",
     }
     for line, contents in damages.items():
         file.write_bytes(contents)

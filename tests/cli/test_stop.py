@@ -70,7 +70,7 @@ def test_trial_is_stopped_by_its_run(answer, study, run_with):
         ({"study": "b", "trial": "0"}, "the study is 'b', but it is not in 'optuna.journal': give --storage URI"),
         ({"study": "b"}, "the study is 'b', but it is not in 'optuna.journal': give --storage URI"),
         ({"study": "a", "trial": "-1"}, "run {}: its tag trial is '-1', but it must be a number"),
-        ({}, "run {} is of no study, and no process of it is known on this machine"),
+        ({}, "run {} belongs to no study, and this machine knows no process of it"),
     ],
     ids=str,
 )

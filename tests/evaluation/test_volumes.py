@@ -77,7 +77,7 @@ def test_run_without_fingerprints_is_evaluated_with_a_note(answer, tmp_path):
     run_id = tracked(tmp_path, agent=GUESSER, kept=("config.yaml",))
     code, printed, _ = answer(run_id, "--trust", "--episodes=1")
     assert code == 0
-    assert "note: the run has not kept fingerprints of its volumes" in printed
+    assert "note: the run has no fingerprints of its volumes" in printed
     code, printed, _ = answer(run_id, "--trust", "--data=phantom", "--phantoms=1", "--episodes=1")
     assert code == 0
     assert "fingerprints" not in printed

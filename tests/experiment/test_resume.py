@@ -219,7 +219,7 @@ def test_interrupted_run_says_how_to_go_on_and_only_one_process_may(tmp_path):
     process.send_signal(signal.SIGSTOP)
     beside = armscan_run(f"resume={run.info.run_id}", cwd=tmp_path)
     assert beside.returncode == 2
-    assert "another process is at work in this folder" in beside.stderr
+    assert "another process is using this folder" in beside.stderr
     assert len(beside.stderr.splitlines()) == 1
     process.send_signal(signal.SIGCONT)
     process.send_signal(signal.SIGINT)
@@ -332,7 +332,7 @@ def test_resume_refuses_a_run_that_names_the_folder_of_another(answer, cut_off):
 def test_resume_refuses_a_run_that_is_going_on(answer, cut_off):
     _, run_id, folder = cut_off
     with folder_lock(folder):
-        assert f"{folder}: another process is at work in this folder" in refused(answer, f"resume={run_id}")
+        assert f"{folder}: another process is using this folder" in refused(answer, f"resume={run_id}")
 
 
 def test_resume_refuses_a_run_of_a_newer_version(answer, cut_off):
@@ -347,8 +347,8 @@ def test_resume_refuses_a_run_of_a_newer_version(answer, cut_off):
         ("armscan.version", "x", "its tag armscan.version is 'x', no version"),
         ("config.sha256", None, "has no tag config.sha256"),
         ("working_folder", None, "has no tag working_folder"),
-        ("working_folder", "/nowhere", "one cannot go there (No such file or directory)"),
-        ("working_folder", "a\0b", "one cannot go there (embedded null byte)"),
+        ("working_folder", "/nowhere", "that folder cannot be entered (No such file or directory)"),
+        ("working_folder", "a\0b", "that folder cannot be entered (embedded null byte)"),
         (GRID_TAG, "x", "its tag grid holds no words of a command line"),
         (GRID_TAG, "{}", "its tag grid holds no words of a command line"),
         (GRID_TAG, "[1]", "its tag grid holds no words of a command line"),
@@ -387,7 +387,7 @@ def test_resume_refuses_a_checkpoint_that_is_damaged_or_gone_and_leaves_the_run_
     last.write_bytes(contents[:-1])
     assert f"{last}: is damaged" in refused(answer, f"resume={run.info.run_id}")
     last.unlink()
-    assert f"{last}: there is no such checkpoint any more, but run" in refused(answer, f"resume={run.info.run_id}")
+    assert f"{last}: this checkpoint is gone, but run" in refused(answer, f"resume={run.info.run_id}")
     assert client.get_run(run.info.run_id).info.status == "KILLED"
     # A run that was killed when all but the closing was done; its figures stand already.
     last.write_bytes(contents)

@@ -181,7 +181,7 @@ def test_model_that_answers_otherwise_than_the_agent_is_not_written(regression, 
     learner, env = regression
     make_model(learner, env, tmp_path / "model", {"armscan": "0"})
     before = (tmp_path / "model" / "MLmodel").read_bytes()
-    refusal = r"the model answers otherwise than the agent: up to .* away, but 1e-05 is allowed"
+    refusal = r"the model differs from the agent by up to .*, but 1e-05 is allowed"
     with pytest.raises(ExportError, match=refusal):
         make_model(Otherwise(learner, 1e-3), env, tmp_path / "model", {"armscan": "0"})
     with pytest.raises(ExportError, match="up to nan away"):
@@ -221,7 +221,7 @@ def test_error_of_a_library_is_one_line_but_an_interrupt_stays_one(regression, t
         raise SystemError("compiled code") from KeyboardInterrupt()
 
     monkeypatch.setattr("mlflow.pyfunc.load_model", refuse)
-    with pytest.raises(ExportError, match=r"^the model cannot be written or asked: no such flavour$"):
+    with pytest.raises(ExportError, match=r"^the model cannot be written or run: no such flavour$"):
         make_model(*regression, tmp_path / "model", {"armscan": "0"})
     monkeypatch.setattr("mlflow.pyfunc.load_model", interrupt)
     with pytest.raises(SystemError):
@@ -229,9 +229,7 @@ def test_error_of_a_library_is_one_line_but_an_interrupt_stays_one(regression, t
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("shift", "tag"), [(0.0, "kept"), (1e-3, "not kept: the model answers otherwise than the agent")]
-)
+@pytest.mark.parametrize(("shift", "tag"), [(0.0, "kept"), (1e-3, "not kept: the model differs from the agent")])
 def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path, capsys, shift, tag):
     learner, env = regression
     store, experiment_id = open_store(

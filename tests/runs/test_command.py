@@ -37,8 +37,8 @@ def test_runs_answers_mistakes_in_one_line(answer, make_run, tmp_path):
         (["list", "--status=done"], "Invalid value for '--status': 'done' is not finished, failed, killed or running."),
         (["list", "--sort=name"], "Invalid value for '--sort': 'name' is not one of 'started', '-started', 'duration'"),
         (["list", "--experiment=none"], "--experiment is 'none', but sqlite:///"),
-        (["list", "--where=metrics > 3"], "--where is 'metrics > 3', but MLflow takes no such filter: "),
-        (["list", "--where=a.b = 'c'"], "--where is \"a.b = 'c'\", but MLflow takes no such filter: "),
+        (["list", "--where=metrics > 3"], "--where is 'metrics > 3', but MLflow rejects this filter: "),
+        (["list", "--where=a.b = 'c'"], "--where is \"a.b = 'c'\", but MLflow rejects this filter: "),
         (["list", "--parent=ffffffff"], "the run is 'ffffffff', but no run of sqlite:///"),
         (["list", "--tracking=sqlite:///no.db"], "tracking.uri is 'sqlite:///no.db', but there is no "),
         (
@@ -69,7 +69,7 @@ def test_runs_explains_itself(answer):
 
 def resumed(folder, store, run_id, locked):
     locked(folder / LOCK_FILE)
-    return "another process is at work in its folder"
+    return "another process is using its folder"
 
 
 def going_on_elsewhere(folder, store, run_id, locked):
@@ -85,12 +85,12 @@ def taken_by_another(folder, store, run_id, locked):
 def added_to(folder, store, run_id, locked):
     with file_of(folder, run_id).open("a") as outbox:
         outbox.write('{"tags": {"a": "b"}}\n')
-    return "not all of it is delivered"
+    return "not all of it is uploaded"
 
 
 def removed_by_another(folder, store, run_id, locked):
     store[0].delete_run(run_id)
-    return "somebody has deleted it meanwhile"
+    return "it has been deleted meanwhile"
 
 
 @pytest.mark.parametrize("change", [resumed, going_on_elsewhere, taken_by_another, added_to, removed_by_another])
@@ -116,7 +116,7 @@ def test_what_another_prune_has_removed_is_no_failure(store, make_run, capsys, t
     printed = capsys.readouterr()
     assert printed.err == ""
     folder = tmp_path / "outputs" / "tiny"
-    assert f"{run_id} stays: its folder {folder} is not there any more\n" in printed.out
+    assert f"{run_id} stays: its folder {folder} is gone\n" in printed.out
     assert not folder.exists()
 
 

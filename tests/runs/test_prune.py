@@ -82,7 +82,7 @@ def test_folder_that_another_process_holds_is_left(answer, make_run, locked, sna
     run_id = make_run()
     before = snapshot()
     locked(tmp_path / "outputs" / "tiny" / LOCK_FILE)
-    assert_stays(answer, run_id, "another process is at work in its folder", what)
+    assert_stays(answer, run_id, "another process is using its folder", what)
     assert snapshot().keys() - before.keys() == {tmp_path / "outputs" / "tiny" / LOCK_FILE}
     assert ids_in(tmp_path) == {run_id}
 
@@ -91,7 +91,7 @@ def test_folder_that_another_process_holds_is_left(answer, make_run, locked, sna
 def test_outbox_that_another_process_holds_is_left(answer, make_run, locked, tmp_path, what):
     run_id = make_run()
     locked(file_of(tmp_path / "outputs" / "tiny", run_id).with_suffix(".lock"))
-    assert_stays(answer, run_id, "another process is at work in its folder", what)
+    assert_stays(answer, run_id, "another process is using its folder", what)
 
 
 @WHAT
@@ -100,14 +100,14 @@ def test_what_is_not_delivered_is_left(answer, make_run, tmp_path, what):
     with file_of(tmp_path / "outputs" / "tiny", run_id).open("a") as outbox:
         outbox.write('{"tags": {"a": "b"}}\n')
     folder = tmp_path / "outputs" / "tiny"
-    assert_stays(answer, run_id, f"not all of it is delivered: armscan runs sync {folder} does that", what)
+    assert_stays(answer, run_id, f"not all of it is uploaded: run armscan runs sync {folder}", what)
 
 
 @WHAT
 def test_damaged_outbox_is_left(answer, make_run, tmp_path, what):
     run_id = make_run()
     file_of(tmp_path / "outputs" / "tiny", run_id).write_text("no entry\n")
-    assert_stays(answer, run_id, "what it was to be tracked with cannot be read: ", what)
+    assert_stays(answer, run_id, "the outbox in its folder cannot be read: ", what)
 
 
 @WHAT
@@ -155,7 +155,7 @@ def another_config(folder, make_run):
 def no_config(folder, make_run):
     run_id = make_run()
     (folder / "config.yaml").unlink()
-    return run_id, f"{folder} has no config.yaml, so that nobody knows whether it is the run's"
+    return run_id, f"{folder} has no config.yaml, so it may not be the run's"
 
 
 def a_link_above(folder, make_run):
@@ -172,7 +172,7 @@ def anothers_outbox(folder, make_run):
 
 
 def relative(folder, make_run):
-    return make_run(tags={"folder": "outputs/tiny"}), "its folder is 'outputs/tiny', and nobody knows where that is"
+    return make_run(tags={"folder": "outputs/tiny"}), "its folder is 'outputs/tiny', which is not an absolute path"
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_files_of_others_and_what_links_lead_to_are_left(answer, make_run, tmp_p
     (folder / "best.pt").symlink_to(tmp_path / "precious")
     with file_of(folder, run_id).open("a") as outbox:
         outbox.write('{"file": "../../precious"}\n')
-    assert answer("prune", "folders", "--apply")[1].count("not all of it is delivered") == 1
+    assert answer("prune", "folders", "--apply")[1].count("not all of it is uploaded") == 1
     file_of(folder, run_id).with_suffix(".delivered.json").write_text(
         '{{"files": {0}, "figures": {0}}}'.format(file_of(folder, run_id).stat().st_size)
     )
@@ -237,7 +237,7 @@ def test_run_that_cannot_be_removed_is_one_line_and_the_rest_goes_on(answer, mak
 def test_folder_that_may_not_be_written_is_left(answer, make_run, made_read_only, tmp_path, what):
     run_id = make_run()
     with made_read_only(tmp_path / "outputs" / "tiny"):
-        assert_stays(answer, run_id, "nobody knows whether another process is at work in its folder", what)
+        assert_stays(answer, run_id, "it is unknown whether another process is using its folder", what)
 
 
 def test_file_of_somebody_else_that_an_earlier_version_has_tracked_stays(answer, make_run, tmp_path):

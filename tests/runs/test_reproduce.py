@@ -210,4 +210,4 @@ def test_reproduce_writes_into_no_folder_that_holds_something(made, answer):
     folder, _, run = made
     code, _, errors = answer(run.info.run_id, f"--out={folder}")
     assert code == 2
-    assert f"--out is {str(folder)!r}, but that is there already, and no empty folder" in errors
+    assert f"--out is {str(folder)!r}, but it exists and is not an empty folder" in errors

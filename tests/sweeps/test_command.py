@@ -233,7 +233,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
         (["sweep=sac_y", "--plan"], "a study has many runs, which needs -m: python -m armscan.run -m sweep=sac_y"),
         (["-m", "sweep=sac_y", "sweep=sac_zy"], "sweep is given 2 times, but it must be once"),
         (["-m", "sweep=foo"], "sweep is 'foo', but it must be landmarks, pbt_sac_zy, ppo_zy, sac_full"),
-        (["-m", "sweep=sac_y", "resume=true"], "resume is not for a study, which goes on where it stands"),
+        (["-m", "sweep=sac_y", "resume=true"], "resume is not for a study, which resumes by its own command"),
         (
             ["-m", "sweep=sac_y", "hydra/launcher=foo"],
             "hydra/launcher is 'foo', but it must be basic, joblib",

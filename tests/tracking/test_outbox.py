@@ -77,7 +77,7 @@ def test_outbox_names_a_file_that_does_not_say_what_it_is_of(tmp_path, contents)
     file = file_of(tmp_path, "b" * 32)
     file.parent.mkdir()
     file.write_bytes(contents)
-    with pytest.raises(TrackingError, match="does not begin with the run that it is of"):
+    with pytest.raises(TrackingError, match="does not begin with the ID of its run"):
         Outbox(file)
     # Nobody holds what could not be opened.
     file.write_bytes(json.dumps({"address": {"run_id": "b", "uri": "c"}}).encode() + b"\n")

@@ -44,7 +44,7 @@ def whole(tmp_path_factory):
 def test_truncated_checkpoint_is_refused(tmp_path, whole, data):
     kept = data.draw(st.integers(0, len(whole) - 1))
     (tmp_path / "a.pt").write_bytes(whole[:kept])
-    with pytest.raises(CheckpointError, match=r"a\.pt: is (empty|damaged|no checkpoint)") as refused:
+    with pytest.raises(CheckpointError, match=r"a\.pt: is (empty|damaged|not a checkpoint)") as refused:
         load_checkpoint(tmp_path / "a.pt")
     assert len(str(refused.value).splitlines()) == 1
 
@@ -58,7 +58,7 @@ def test_tampered_checkpoint_is_refused(tmp_path, whole, data):
     changed = bytearray(whole)
     changed[place] ^= flipped
     (tmp_path / "a.pt").write_bytes(changed)
-    with pytest.raises(CheckpointError, match=r"a\.pt: is (damaged|no checkpoint|a checkpoint of format)"):
+    with pytest.raises(CheckpointError, match=r"a\.pt: is (damaged|not a checkpoint|a checkpoint of format)"):
         load_checkpoint(tmp_path / "a.pt")
 
 
@@ -79,7 +79,7 @@ def test_other_files_are_no_checkpoints(tmp_path):
     torch.save({"state": {}, "facts": {}}, tmp_path / "a.pt")
     (tmp_path / "b.pt").write_text("weights: 3\n")
     (tmp_path / "c.pt").mkdir()
-    for name, message in (("a", "is no checkpoint of"), ("b", "is no checkpoint of"), ("c", "cannot be read")):
+    for name, message in (("a", "is not a checkpoint of"), ("b", "is not a checkpoint of"), ("c", "cannot be read")):
         with pytest.raises(CheckpointError, match=rf"{name}\.pt: {message}"):
             load_checkpoint(tmp_path / f"{name}.pt")
 
@@ -106,7 +106,7 @@ def test_checkpoint_runs_no_code_from_the_file(tmp_path, capsys, is_zipped):
     else:
         pickle.dump({"state": Malicious(), "facts": {}}, file, protocol=2)
     (tmp_path / "a.pt").write_bytes(with_a_right_sum(file.getvalue()))
-    with pytest.raises(CheckpointError, match="something else than tensors, numbers and texts"):
+    with pytest.raises(CheckpointError, match="something other than tensors, numbers and texts"):
         load_checkpoint(tmp_path / "a.pt")
     assert capsys.readouterr().out == ""
 

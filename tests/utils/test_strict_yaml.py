@@ -33,7 +33,7 @@ def test_aliases_and_merged_mappings_are_read():
     ["a: 1\na: 2", "- {b: {c: 1, c: 2}}", "a: &a [*a]", "a: &a {b: [*a]}", "&a {? [*a] : 1}"],
 )
 def test_mapping_with_a_key_twice_and_collection_in_itself_are_refused(text):
-    with pytest.raises(ValueError, match=r"is there twice|repeats more than"):
+    with pytest.raises(ValueError, match=r"appears twice|repeats more than"):
         load_yaml(text)
 
 

@@ -76,7 +76,7 @@ def test_read_dataset_names_a_file_without_an_entry(write_labelmap, write_manife
         ({"a.nii.gz": {**PLANE, "rotation": "12"}}, r"entry 'a.nii.gz': rotation is '12'"),
         ({"a.nii.gz": {**PLANE, "rotation": ["1", "2"]}}, r"entry 'a.nii.gz': rotation is \['1', '2'\]"),
         ({"a.nii.gz": {**PLANE, "rotation": [10**400, 0]}}, r"entry 'a.nii.gz': rotation is"),
-        ('{"a.nii.gz": {}, "a.nii.gz": {}}', r"the key 'a.nii.gz' is there twice"),
+        ('{"a.nii.gz": {}, "a.nii.gz": {}}', r"the key 'a.nii.gz' appears twice"),
         ("[" * 100_000, "cannot be read as JSON"),
         ({"a.nii.gz": {**PLANE, "axes": 3}}, r"entry 'a.nii.gz': axes is 3"),
     ],

@@ -104,8 +104,8 @@ def test_manifest_refuses_impossible_splits(folder, splits, message):
 @pytest.mark.parametrize(
     ("contents", "message"),
     [
-        ("volumes: {a.nii.gz: {}, a.nii.gz: {}}", r"cannot be read as YAML \(the key 'a\.nii\.gz' is there twice"),
-        ("axes: xyz\naxes: zyx", "the key 'axes' is there twice"),
+        ("volumes: {a.nii.gz: {}, a.nii.gz: {}}", r"cannot be read as YAML \(the key 'a\.nii\.gz' appears twice"),
+        ("axes: xyz\naxes: zyx", "the key 'axes' appears twice"),
         ("{unclosed", "cannot be read as YAML"),
         ("!!python/object:os.system {}", "cannot be read as YAML"),
         ("- a", "is a list, but"),
@@ -127,7 +127,7 @@ def test_manifest_refuses_impossible_splits(folder, splits, message):
         ("volumes: {a.nii.gz: {subject: ''}}", "entry 'a.nii.gz': subject is '', but it must be a text"),
         ("volumes: {a.nii.gz: {exclude: 1}}", "entry 'a.nii.gz': exclude is 1, but it must be true, false or the"),
         ("volumes: {a.nii.gz: {exclude: ''}}", "entry 'a.nii.gz': exclude is '', but it must be true, false or the"),
-        ("? ''\n: 1\n? ''\n: 2", "the key '' is there twice"),
+        ("? ''\n: 1\n? ''\n: 2", "the key '' appears twice"),
         ("volumes: {a.nii.gz: {score: 0.1}}", "entry 'a.nii.gz': score is 0.1, but it must be"),
         ("volumes: {a.nii.gz: {score: .nan}}", "entry 'a.nii.gz': score is nan, but it must be"),
         ("volumes: {a.nii.gz: {rotation: [.inf, 0]}}", r"entry 'a.nii.gz': rotation is \[inf, 0\], but it must be"),

@@ -56,7 +56,7 @@ class Difference(NamedTuple):
         return above if self.paired.low > 0 else below if self.paired.high < 0 else ""
 
     def row(self) -> dict[str, str]:
-        """Return what a table shows of it, by column."""
+        """Return its cells in a table, by column."""
         unit = " points" if is_rate(self.metric) else ""
         sizes = (value_text(self.metric, abs(each)).removesuffix("%") for each in self.paired)
         value, low, high = (f"{'-' if each < 0 else '+'}{size}" for each, size in zip(self.paired, sizes, strict=True))
@@ -145,7 +145,7 @@ class Judgement:
 
 
 def judge(final: FinalEvaluation) -> Judgement | None:
-    """Return what the test volumes say; None before a configuration was chosen."""
+    """Return the judgement on the test volumes; None before a configuration is chosen."""
     chosen = final.race().chosen
     if chosen is None:
         return None

@@ -86,7 +86,7 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
 
 
 def repeat(show: Callable[[], None], stopped: threading.Event) -> None:
-    """Show how a study is going again and again; where its storage is away or damaged, that it is, and nothing new.
+    """Show a study's progress again and again; if its storage is unreachable or damaged, say so.
 
     Args:
         show: Function that shows it once.
@@ -114,7 +114,7 @@ def _ended(opened: OpenedStudy) -> list[tuple[tuple[str, int], FrozenTrial, Phas
 
 
 def _table(opened: OpenedStudy) -> Table:
-    """Return the running trials, below how the study stands."""
+    """Return a table of the running trials, below the state of the study."""
     state = opened.search.scheduler.state()
     finals = [(phase, phase.scheduler.state()) for phase in opened.finals]
     # As wide as the terminal.
@@ -134,7 +134,7 @@ def _table(opened: OpenedStudy) -> Table:
 
 
 def _final_summary(final: FinalEvaluation, n_done: Sequence[int]) -> str:
-    """Return how the final evaluation stands, in one line."""
+    """Return the state of the final evaluation in one line."""
     _, most = n_trainings(final.settings)
     chosen = final.race().chosen
     n_left = sum(standing.is_in for standing in final.race().standings.values())
@@ -144,7 +144,7 @@ def _final_summary(final: FinalEvaluation, n_done: Sequence[int]) -> str:
 
 
 def _summary(opened: OpenedStudy, state: StudyState) -> str:
-    """Return how a study stands, in one line."""
+    """Return the state of a study in one line."""
     settings = opened.settings
     n_pruned = sum(trial.state == TrialState.PRUNED for trial in state.finished)
     parts = [
@@ -224,7 +224,7 @@ def _print_replay(opened: OpenedStudy) -> None:
 
 
 def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
-    """Print how a configuration was chosen, and what the test volumes say of it; returns whether they say anything."""
+    """Print how a configuration was chosen, and its results on the test volumes; return whether there are any."""
     trials = opened.search.scheduler.study.get_trials(deepcopy=False)
     for phase in opened.finals:
         check_trials(phase.scheduler.study, n_searched=len(trials))

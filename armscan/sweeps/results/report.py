@@ -111,7 +111,7 @@ def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Seq
 
 
 def _running(trials: Sequence[FrozenTrial]) -> str:
-    """Return a table of the trials that run, nothing if none does."""
+    """Return a table of the running trials, nothing if there are none."""
     rows = [
         {
             "trial": trial.number,

@@ -49,7 +49,7 @@ class Candidate(NamedTuple):
         return name_of(self.number)
 
     def row(self, objective: str) -> dict[str, str]:
-        """Return what a table shows of it, by column."""
+        """Return its cells in a table, by column."""
         value, low, high = (value_text(objective, each) for each in self.estimate)
         is_known = math.isfinite(self.estimate.value)
         return {

@@ -1,7 +1,7 @@
 """Population-based training: which member trains next, from which checkpoint, and with which values.
 
 A trial trains one member for one generation, an interval of environment steps, from the last checkpoint of its parent.
-Members wait for nobody (the asynchronous form of Jaderberg et al. 2017, arXiv:1711.09846). Everything here is a
+Members never wait for each other (asynchronous, as in Jaderberg et al. 2017, arXiv:1711.09846). Everything here is a
 function of the trials in the storage and of the study's seed, so nothing is lost with a worker.
 """
 
@@ -47,7 +47,7 @@ class PopulationSampler(RandomSampler):
         interval_env_steps: Environment steps of a generation; divides those of the whole training.
         quantile: Share of the members, above 0 and at most 0.5, that are worst and continue from one of the best, of
             which there are as many.
-        resample_probability: Probability that a value is drawn anew, and not changed by a fifth.
+        resample_probability: Probability that a value is drawn again instead of changed by a fifth.
         seed: Seed of the draws. Default: None, other draws each time.
     """
 
@@ -124,7 +124,7 @@ class Population:
         return []
 
     def takeable(self, trials: Sequence[FrozenTrial]) -> set[int]:
-        """Return the numbers of the trials whose last checkpoints somebody may still continue from.
+        """Return the numbers of the trials from whose last checkpoints a member may still continue.
 
         Those of a generation that all members have passed are not among them, nor those that cannot be among the best.
 
@@ -215,7 +215,7 @@ def lineage(trials: Sequence[FrozenTrial], last: FrozenTrial) -> Iterator[Frozen
 
 
 def _members(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
-    """Return the trials of members, without those that somebody else has enqueued."""
+    """Return the trials of members, without those that were enqueued from elsewhere."""
     return [trial for trial in trials if MEMBER in trial.user_attrs]
 
 

@@ -69,7 +69,7 @@ class Race:
 
 
 def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, drop_level: float = DROP_LEVEL) -> Race:
-    """Return how a race stands.
+    """Return the state of a race.
 
     All configurations are trained with the first `min_seeds` seeds. Then those are dropped whose mean is below the
     leader's by more than chance explains (a one-sided t test), and the others are trained with the next seed, until one

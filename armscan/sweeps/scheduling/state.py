@@ -161,7 +161,7 @@ class PendingWrites(list[Callable[[], object]]):
     """
 
     def write(self) -> int:
-        """Write all; returns how many."""
+        """Write all; return how many."""
         writes = self.copy()
         for write in writes:
             write()

@@ -80,7 +80,7 @@ class Parameter:
             # What the command line takes away.
             described = {key: value for key, value in described.items() if value is not None}
         if not KEY.fullmatch(name):
-            raise InvalidValueError(f"{where}: {name!r} is no key of the configuration, such as agent.lr")
+            raise InvalidValueError(f"{where}: {name!r} is not a key of the configuration, such as agent.lr")
         if re.split("[/.]", name)[0] in NOT_SEARCHED:
             raise InvalidValueError(f"{where}: {name!r} says how a study is run or kept, which no trial can try")
         if not isinstance(described, Mapping) or ("choices" in described) is bool({"low", "high"} & described.keys()):
@@ -137,7 +137,7 @@ class Parameter:
 
 
 def as_kept(value: Any) -> Value:
-    """Return a value as Optuna keeps it: a number or a text; of a list how it is written."""
+    """Return a value as Optuna stores it: a number or a text, a list as the text that Hydra reads."""
     kept: Value = written(value) if isinstance(value, list | tuple | Mapping) else value
     return kept
 

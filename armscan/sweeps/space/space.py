@@ -35,7 +35,7 @@ class Space:
                 if wrong := [value for value in values if value not in above[name]]:
                     raise InvalidValueError(f"{where}.{name} is {wrong[0]!r}, but it must be {listed(above[name])}")
             if space._with_needs(parameter.name, None) is None:
-                raise InvalidValueError(f"{where} can never hold, for what its keys need")
+                raise InvalidValueError(f"{where} can never apply, because of what its keys require")
             if isinstance(parameter.distribution, CategoricalDistribution):
                 above[parameter.name] = parameter.extremes
         return space
@@ -83,7 +83,7 @@ class Space:
                 yield chosen
 
     def completed(self, chosen: Mapping[str, Value]) -> dict[str, Value]:
-        """Return choices with a value of every other parameter that is searched beside them, as a trial has them."""
+        """Return choices with a value of every other parameter that is searched beside them, as in a trial."""
         complete: dict[str, Value] = {}
         for parameter in self.parameters:
             if parameter.name in chosen or parameter.applies(complete):

@@ -114,7 +114,7 @@ class DatabaseStorage(_CheckedStorage):
             is_exclusive: Whether to hold the lock of a PostgreSQL database. Default: False.
 
         Returns:
-            What the operation returns.
+            The result of the operation.
         """
         if hasattr(self._here, "inside"):
             return operate()

@@ -1,4 +1,4 @@
-"""A study's journal file, the default storage: lines that are appended whole, each with the sum of all up to it."""
+"""A study's journal file, the default storage: whole lines are appended, each with a checksum of all up to it."""
 
 from __future__ import annotations
 
@@ -92,10 +92,10 @@ class Position:
 
 
 class JournalFile(BaseJournalBackend):
-    """A journal file in which a line that was lost or changed is noticed where a line with a sum follows.
+    """A journal file in which a lost or changed line is noticed, if a line with a checksum follows it.
 
-    What earlier versions or Optuna have appended has no sum of its own; the next sum counts it. Only lost last lines
-    remain unseen: they may never have been written.
+    Lines that earlier versions or Optuna have appended have no checksum of their own; the next checksum includes them.
+    Only lost last lines go unnoticed: they may never have been written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -110,7 +110,7 @@ class JournalFile(BaseJournalBackend):
         """Hold the lock of the file, which then ends with a whole line.
 
         The system frees it when a process dies; Optuna's own lock would block all others for 30 s. A line whose writer
-        died is truncated: the next would be appended to it, and nobody could read either.
+        died is truncated: the next one would be appended to it, and neither could be read.
         """
         with self._lock:
             truncate_torn_line(self._path)

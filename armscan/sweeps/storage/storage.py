@@ -110,7 +110,7 @@ def _lock_file_of(file: Path) -> Path:
 
 
 def _is_there(file: Path) -> bool:
-    """Return whether there is a file; raises `OSError` if none can be."""
+    """Return whether there is a file; raise `OSError` if none can be."""
     try:
         if stat.S_ISREG(file.stat().st_mode):
             return True

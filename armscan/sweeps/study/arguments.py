@@ -48,7 +48,7 @@ class StudyCommand:
         if not {*MULTIRUN} & {*words}:
             raise InvalidValueError(f"a study has many runs, which needs -m: {run_command(['-m', *words])}")
         if RESUME in keys:
-            raise InvalidValueError(f"{RESUME} is not for a study, which goes on where it stands by itself")
+            raise InvalidValueError(f"{RESUME} is not for a study, which resumes by its own command: type that again")
         if STUDY in keys:
             raise InvalidValueError("study is a section of the configuration: give its keys, such as study.n_trials=40")
         for override in overrides:
@@ -91,7 +91,7 @@ def fixed_by(words: Sequence[str]) -> dict[str, Any]:
 
 
 def _merging(word: str) -> str:
-    """Return a word so that Hydra changes the space of the study key by key, where it is one that does."""
+    """Return a word; one that changes the study's space is rewritten, so that Hydra changes it key by key."""
     given = SPACE_WORD.fullmatch(word)
     if given is None:
         return word

@@ -37,8 +37,8 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
     config = compose(words, return_hydra_config=True)
     if config.get(SWEEP) is not None:
         raise InvalidValueError(
-            f"what {SWEEP}= names is a section {SWEEP} of the configuration, and not all of it: its file must begin "
-            "with the line '# @package _global_'"
+            f"what {SWEEP}= names sets only the section {SWEEP} of the configuration: its file must begin with the "
+            "line '# @package _global_'"
         )
     section = to_plain(config.study) if config.get("study") is not None else {}
     # The command sets it for each worker.

@@ -34,7 +34,7 @@ def note_run(
 ) -> None:
     """Leave a note with the link to the tracked run of a study or a trial, its folder, and its figures.
 
-    A note of a study that somebody has changed stays as it is.
+    A note of a study that a person has edited stays as it is.
 
     Args:
         target: Study or trial to note it at.
@@ -71,7 +71,7 @@ def table_of_seeds(of_seeds: Mapping[int, Mapping[str, float]]) -> str:
 
 
 def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float]:
-    """Return the leading metrics of a trial, rounded and called as people call them: user attributes of their own.
+    """Return the leading metrics of a trial, rounded and by their titles, as user attributes.
 
     Args:
         metrics: Metrics by name; of a final training, those of the test are shown.

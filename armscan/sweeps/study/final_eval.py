@@ -159,11 +159,11 @@ class FinalEvaluation:
         return scores
 
     def race(self) -> Race:
-        """Return how the selection stands."""
+        """Return the state of the selection's race."""
         return race(self.scores(), self.selection_seeds, min_seeds=self.settings.min_seeds)
 
     def missing_of_selection(self) -> list[PlannedTrial]:
-        """Return the trainings that the selection needs next, and that nobody has begun."""
+        """Return the trainings that the selection needs next and no worker has begun."""
         return self._planned(self.race().missing, self.selection)
 
     def judged(self) -> list[int]:
@@ -172,7 +172,7 @@ class FinalEvaluation:
         return [] if chosen is None else list(dict.fromkeys((chosen, CONTROL)))
 
     def missing_of_judgement(self) -> list[PlannedTrial]:
-        """Return the trainings of the judgement that nobody has begun; nothing before a configuration is chosen."""
+        """Return the trainings of the judgement that no worker has begun; nothing before a configuration is chosen."""
         judged = self.judged()
         return self._planned([(number, seed) for seed in self.judge_seeds for number in judged], self.judgement)
 
@@ -192,12 +192,12 @@ def training_of(trial: FrozenTrial | Trial) -> tuple[int, int]:
 
 
 def name_of(number: int) -> str:
-    """Return how people call a configuration: `control`, or `trial 7`."""
+    """Return the name of a configuration for people: `control`, or `trial 7`."""
     return "control" if number == CONTROL else f"trial {number}"
 
 
 def key_of(number: int) -> int | str:
-    """Return what a configuration is called in files: the number of its trial, or `control`."""
+    """Return the name of a configuration in files: the number of its trial, or `control`."""
     return "control" if number == CONTROL else number
 
 

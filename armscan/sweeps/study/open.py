@@ -79,7 +79,7 @@ class Phase:
     population: Population | None = None
 
     def remove_checkpoints(self) -> None:
-        """Remove the last checkpoints of a population's trials that nobody can continue from any more."""
+        """Remove the last checkpoints of a population's trials from which no member can continue any more."""
         if self.population is None:
             return
         trials = self.scheduler.study.get_trials(deepcopy=False)

@@ -195,7 +195,8 @@ class StudySettings(Limits):
         n_threads = int(os.environ.get("OMP_NUM_THREADS", "1"))
         if self.workers * n_threads > n_cores:
             each = "" if n_threads == 1 else f" of {n_threads} compute threads each (OMP_NUM_THREADS)"
+            cores = "1 core" if n_cores == 1 else f"{n_cores} cores"
             raise InvalidValueError(
-                f"study.workers is {self.workers}{each}, but this machine has {n_cores} cores: give at most "
+                f"study.workers is {self.workers}{each}, but this machine has {cores}: give at most "
                 f"{max(1, n_cores // n_threads)}"
             )

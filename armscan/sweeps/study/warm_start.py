@@ -62,7 +62,7 @@ class Beginning:
     enqueued: tuple[dict[str, Value], ...] = ()
 
     def add(self, storage: Storage, study: optuna.Study) -> bool:
-        """Add the trials to a study, once; returns whether this call has added them."""
+        """Add the trials to a study, once; return whether this call has added them."""
 
         def add() -> bool:
             begun_with = study.user_attrs.get(BEGUN_WITH, [])
@@ -86,7 +86,7 @@ def beginnings(
 ) -> list[Beginning]:
     """Return the beginnings of a study: the presets of `study.enqueue`, then the studies of `study.warm_start`.
 
-    What it has begun with already is left out.
+    Those that it has begun with already are left out.
 
     Args:
         settings: Settings of the study.
@@ -200,7 +200,7 @@ def _plain(flat: Mapping[str, Any]) -> dict[str, Value]:
 
 
 def _best_different(source: optuna.Study, chosen: Mapping[int, dict[str, Value]]) -> tuple[dict[str, Value], ...]:
-    """Return the settings of the best trials of a study, each other ones, of those with the numbers in `chosen`."""
+    """Return the different settings of a study's best trials, among those with the numbers in `chosen`."""
     best = [chosen[trial.number] for trial in best_trials(source, NO_LIMIT) if trial.number in chosen]
     return tuple({json.dumps(each, sort_keys=True): each for each in reversed(best)}.values())[::-1][:N_ENQUEUED]
 

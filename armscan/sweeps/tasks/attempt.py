@@ -220,7 +220,7 @@ def trial_folder(study_folder: Path, number: int) -> Path:
 
 
 def config_sha256(config: Mapping[str, Any]) -> str:
-    """Return a sum of a configuration's values, but for the seed, which the runs of one trial differ by."""
+    """Return the SHA-256 of a configuration's values except the seed, by which the runs of one trial differ."""
     values = {key: value for key, value in config.items() if key != "seed"}
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 

@@ -15,7 +15,7 @@ from armscan.utils.files import RUN_FILE
 
 
 def begin_generation(attempt: Attempt, setup: Experiment, folder: Path, *, run_id: str) -> list[EpochReport]:
-    """Take an untrained agent to where the parent of a trial has left its own; the first generation has no parent.
+    """Restore an untrained agent as the parent of a trial left its own; the first generation has no parent.
 
     Args:
         attempt: The attempt at the trial.

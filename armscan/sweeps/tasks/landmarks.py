@@ -25,7 +25,7 @@ NEAR_MM, STEP_MM = 15.0, 2.5
 class LandmarksTask:
     """The task of clustering: rewards at the labelled planes, and at planes along the rest of the arm.
 
-    What is searched are keys of `env.clustering`, written in full.
+    The space has keys of `env.clustering`, which is written in full.
     """
 
     def metrics(self, config: DictConfig) -> tuple[str, ...]:

@@ -95,7 +95,7 @@ class TrainingTask:
     """The task of training an agent, with each of a trial's seeds."""
 
     def metrics(self, config: DictConfig) -> tuple[str, ...]:
-        """Return those of the best validation, on-plane rates as configured, and those of the training."""
+        """Return the metrics of the best validation, on-plane rates as configured, and of the training."""
         return (*Evaluation((), on_plane_of(config)).metrics(), *TRAINING_METRICS)
 
     @property
@@ -113,7 +113,7 @@ class TrainingTask:
             )
 
     def run(self, attempt: Attempt) -> dict[str, float]:
-        """Train with each seed; returns the interquartile means of the metrics over the seeds. See `Task.run`."""
+        """Train with each seed; return the interquartile means of the metrics over the seeds. See `Task.run`."""
         for seed in attempt.seeds:
             if seed not in attempt.seeds_done:
                 attempt.keep_seed(seed, _trained(attempt, seed))
@@ -122,12 +122,12 @@ class TrainingTask:
         return {name: float(interquartile_mean(of_name)) for name, of_name in scores.items()}
 
     def validate(self, attempt: Attempt) -> dict[str, float]:
-        """Train, and play episodes on the validation volumes that chose no weights; returns their metrics."""
+        """Train, and play episodes on the validation volumes that chose no weights; return their metrics."""
         (seed,) = attempt.seeds
         return _trained(attempt, seed, partial(_validated, attempt))
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
-        """Train, evaluate, record a video and keep the policy; returns the metrics of the test."""
+        """Train, evaluate, record a video and keep the policy; return the metrics of the test."""
         (seed,) = attempt.seeds
         return _trained(attempt, seed, partial(_concluded, attempt))
 
@@ -135,7 +135,7 @@ class TrainingTask:
 def _validated(
     attempt: Attempt, setup: Experiment, result: TrainingResult, tracked: TrackedRun, folder: Path
 ) -> dict[str, float]:
-    """Evaluate a trained agent on the validation volumes; returns its metrics there."""
+    """Evaluate a trained agent on the validation volumes; return its metrics there."""
     seed, n_episodes = SELECTION_SEED + setup.seed, setup.n_episodes
     played = evaluate(setup.agent, setup.validation_env, n_episodes=n_episodes, seed=seed, on_plane=setup.on_plane)
     attempt.keep_episodes({VALIDATION: played})
@@ -169,7 +169,7 @@ def _concluded(
 
 
 def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:
-    """Train with one seed, from the last checkpoint if there is one; returns metrics, also those of `conclude`."""
+    """Train with one seed, from the last checkpoint if there is one; return metrics, also those of `conclude`."""
     config, choices = attempt.config(seed)
     setup = set_up(config)
     folder = attempt.folder / f"seed_{seed}"
@@ -215,7 +215,7 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
 def _begun(
     attempt: Attempt, seed: int, setup: Experiment, config: DictConfig, choices: dict[str, str], folder: Path
 ) -> tuple[Experiment, TrackedRun, list[EpochReport]]:
-    """Open the tracked run of a training, and takes the agent to where an attempt before has left it."""
+    """Open the tracked run of a training, and restore the agent as an earlier attempt left it."""
     _take_over(attempt, folder)
     begun, agent = folder / RUN_FILE, setup.agent
     assert isinstance(agent, Learner)

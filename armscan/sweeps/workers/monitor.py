@@ -49,7 +49,7 @@ class StudyMonitor:
         )
 
     def wait_until_over(self) -> bool:
-        """Wait as long as any worker is alive; returns whether the study is over then."""
+        """Wait as long as any worker is alive; return whether the study is over then."""
         seen_s = time.monotonic()
         with no_retry():
             while time.monotonic() - seen_s < LIFELESS_S:

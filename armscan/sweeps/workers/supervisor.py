@@ -65,18 +65,18 @@ def run_worker(words: Sequence[str], number: int, folder: Path) -> None:
 
 
 def _launcher_of(folder: Path) -> ProcessInfo:
-    """Return the process that launched this start; raises if this machine does not see its folders."""
+    """Return the process that launched this start; raise if this machine does not see its folders."""
     is_seen = (file := folder / LAUNCHER_FILE).exists()
     if is_seen and Path((launcher := ProcessInfo.read(file)).directory).is_dir():
         return launcher
     raise StudyError(
-        f"{launcher.directory if is_seen else folder} of the machine that the study was started on is not seen by "
+        f"{launcher.directory if is_seen else folder} of the machine that the study was started on cannot be seen from "
         f"{socket.gethostname()}: all machines with workers must share it"
     )
 
 
 def _worked(study_input: bytes, directory: str, log_file: BinaryIO, notice: Notice) -> int:
-    """Run the process of a worker to its end; returns its exit code."""
+    """Run the process of a worker to its end; return its exit code."""
     with subprocess.Popen(
         child_command(__name__, worker_main.__name__),
         stdin=subprocess.PIPE,

@@ -54,7 +54,7 @@ class Worker:
         self._tracked: TrackedRun | None = None
 
     def work(self) -> str:
-        """Run trials until none is left, and those of other workers have ended; returns why."""
+        """Run trials until none is left, and those of other workers have ended; return why."""
         outcome: TrialOutcome | None = None
         conclude: Callable[[], None] | None = None
         while True:
@@ -73,7 +73,7 @@ class Worker:
                 return reason
 
     def _wait_for_trial(self) -> str | None:
-        """Wait until a trial can be claimed; returns None then, or why there will be none."""
+        """Wait until a trial can be claimed; return None then, or why there will be none."""
         scheduler = self._phase.scheduler
         while True:
             scheduler.look_for_stop()
@@ -88,7 +88,7 @@ class Worker:
             time.sleep(WAIT_S)
 
     def _run(self, trial: Trial) -> TrialOutcome | None:
-        """Run a trial; returns its outcome, None if it was requeued or taken over."""
+        """Run a trial; return its outcome, None if it was requeued or taken over."""
         log(f"{self._phase.name}: trial {trial.number} {'is resumed' if RUN in trial.user_attrs else 'begins'}")
         writes = self._heartbeat.writes
         try:
@@ -229,7 +229,7 @@ def _close(*runs: TrackedRun | None) -> None:
 
 
 def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None:
-    """Work at a study until it is over.
+    """Work on a study until it is over.
 
     Args:
         words: Command line of the study, as words.

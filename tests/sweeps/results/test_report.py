@@ -224,11 +224,11 @@ def test_report_needs_only_to_read_the_storage(answer, tmp_path):
         ([], "error: neither --study nor --runs is given, but a report is of one of them: give --study NAME or --runs"),
         (
             ["--study=a", "--storage=nowhere"],
-            "error: --storage is 'nowhere', but nothing is there: give the one that it is",
+            "error: --storage is 'nowhere', but there is no storage: give the one that contains",
         ),
         (
             ["--study=a", "--storage=sqlite:///nowhere.db"],
-            "error: --storage is 'sqlite:///nowhere.db', but nothing is there",
+            "error: --storage is 'sqlite:///nowhere.db', but there is no storage",
         ),
         (["--study=a", "--storage=list.journal"], "error: --storage is '/"),
         (["--study=b"], "error: --study is 'b', but there is only a or foreign in '/"),

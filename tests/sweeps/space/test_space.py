@@ -105,7 +105,7 @@ def test_space_extremes_are_only_such_as_a_trial_can_have(when):
     [
         (None, "study.space is None, but it must have at least one key to search"),
         ({}, "study.space is {}, but it must have at least one key"),
-        ({"a b": {"choices": [1]}}, "study.space.a b: 'a b' is no key of the configuration"),
+        ({"a b": {"choices": [1]}}, "study.space.a b: 'a b' is not a key of the configuration"),
         ({"a": 3}, "study.space.a is 3, but it must have low and high, or choices"),
         ({"a": {"low": 3}}, "study.space.a.high is not set, but it must be"),
         ({"a": {"choices": []}}, "study.space.a.choices is [], but it must be a list of values"),
@@ -126,7 +126,7 @@ def test_space_extremes_are_only_such_as_a_trial_can_have(when):
         ({"a": {"low": 0.0, "high": 1.0, "step": 2.0}}, "but the range is not divisible by `step`"),
         (
             {"b": {"choices": [1]}, "a": {"choices": [1], "when": {"b": []}}},
-            "study.space.a.when can never hold",
+            "study.space.a.when can never apply",
         ),
         (
             {
@@ -134,7 +134,7 @@ def test_space_extremes_are_only_such_as_a_trial_can_have(when):
                 "b": {"choices": [1], "when": {"a": 1}},
                 "c": {"choices": [1], "when": {"b": 1, "a": 2}},
             },
-            "study.space.c.when can never hold",
+            "study.space.c.when can never apply",
         ),
         (
             {"a": {"low": 0.0, "high": 0.1, "step": 0.03}},

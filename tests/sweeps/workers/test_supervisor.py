@@ -10,7 +10,7 @@ from armscan.utils.processes import ProcessInfo
 
 
 def test_worker_on_a_machine_that_does_not_share_the_folder_of_the_study_says_so(tmp_path):
-    with pytest.raises(StudyError, match=f"{tmp_path} of the machine that the study was started on is not seen by "):
+    with pytest.raises(StudyError, match=f"{tmp_path} of the machine that the study was started on cannot be seen"):
         run_worker([], 0, tmp_path)
 
 
@@ -18,5 +18,5 @@ def test_worker_on_a_machine_that_does_not_share_the_directory_of_the_command_sa
     launcher = ProcessInfo("elsewhere", 1, "1", "/nowhere")
     launcher.write(tmp_path / LAUNCHER_FILE)
     assert json.loads((tmp_path / LAUNCHER_FILE).read_text())["directory"] == "/nowhere"
-    with pytest.raises(StudyError, match="/nowhere of the machine that the study was started on is not seen by "):
+    with pytest.raises(StudyError, match="/nowhere of the machine that the study was started on cannot be seen from "):
         run_worker([], 0, tmp_path)
