@@ -10,7 +10,7 @@ import numpy as np
 from armscan.reports.groups import Group
 from armscan.reports.load import Series, TrackedTraining
 from armscan.stats.aggregation import Band, band_over_seeds
-from armscan.training.titles import is_rate
+from armscan.training.titles import bounds_of
 from armscan.volumes.plane import FloatArray
 
 # What curves are drawn over, and how a series says it.
@@ -55,9 +55,8 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
         return None
     places = _places(known)
     scores = np.array([np.interp(places, *line) for _, line in known])
-    band = band_over_seeds(scores)
-    if is_rate(figure):
-        band = Band(band.values, *np.clip(band[1:], 0.0, 1.0))
+    values, *ends = band_over_seeds(scores)
+    band = Band(values, *np.clip(ends, *bounds_of(figure)))
     return Curve(places, band, len(known), {training.label: line for training, line in known})
 
 

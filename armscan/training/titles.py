@@ -81,6 +81,17 @@ def is_rate(metric: str) -> bool:
     return "success_rate" in metric or bool(limits_among([metric.rpartition("/")[2]]))
 
 
+def bounds_of(metric: str) -> tuple[float, float]:
+    """Return the lowest and the highest value that a metric can have."""
+    name = metric.rpartition("/")[2]
+    if is_rate(metric) or "dice" in name:
+        return 0.0, 1.0
+    if name not in {each.metric for each in (*QUANTITIES, *OLDER)}:
+        return -math.inf, math.inf
+    # An episode has one step at least.
+    return 1.0 if name.endswith("_steps") else 0.0, math.inf
+
+
 def value_text(metric: str, value: float) -> str:
     """Return a value of a metric as tables show it: a share in percent, distances with one digit after the point."""
     form = "{:.1%}" if is_rate(metric) else "{:,.0f}" if abs(value) >= 1000 else FORMS.get(metric, "{:.4g}")

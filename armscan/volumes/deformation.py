@@ -44,7 +44,7 @@ class DeformingTransform(RigidTransform):
 
     @cached_property
     def maps(self) -> FloatArray:
-        """The affine maps (A | b), shape (2, 3, 4): that of D, and that of T, which comes first."""
+        """The two affine maps (A | b): that of D, and that of T, which comes first. See `RigidTransform.maps`."""
         frame = self.plane.matrix
         matrix: FloatArray = frame @ np.linalg.inv(self.deformation) @ frame.T
         across_mm, depth_mm = self.about_mm

@@ -5,7 +5,7 @@ import numpy as np
 from armscan.reports.curves import MAX_POINTS, curve_of
 from armscan.reports.groups import group_trainings
 
-FIGURE, RATE = "validation/mean_steps", "validation/success_rate"
+FIGURE, RATE, RETURN = "validation/mean_steps", "validation/success_rate", "validation/mean_return"
 STEPS, SECONDS = "environment steps", "seconds of training"
 
 
@@ -23,14 +23,14 @@ def test_a_training_that_has_finished_is_carried_on_with_its_last_value(make_tra
     assert [len(places) for places, _ in ours.lines.values()] == [2, 4]
 
 
-def test_a_rate_has_a_band_within_its_bounds_and_only_with_three_seeds(make_training):
+def test_a_band_stays_within_the_bounds_of_its_metric_and_takes_three_seeds(make_training):
     trainings = [make_training(seed, steps=(100, 200), values=(0.2 * seed, 1.0)) for seed in range(3)]
     for training in trainings:
-        training.series[RATE] = training.series[FIGURE]
+        training.series.update(dict.fromkeys((RATE, RETURN), training.series[FIGURE]))
     (group,), _ = group_trainings(trainings)
-    steps, rate = (curve_of(group, figure, STEPS).band for figure in (FIGURE, RATE))
-    assert steps.lows[0] < 0.0 == rate.lows[0]
-    assert rate.highs.tolist() == steps.highs.tolist()
+    rate, returned = (curve_of(group, figure, STEPS).band for figure in (RATE, RETURN))
+    assert returned.lows[0] < 0.0 == rate.lows[0]
+    assert rate.highs.tolist() == returned.highs.tolist()
     assert np.isnan(curve(*trainings[:2]).band.lows).all()
 
 

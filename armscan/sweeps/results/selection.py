@@ -19,7 +19,7 @@ from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES
-from armscan.training.titles import is_rate, title_of, value_text
+from armscan.training.titles import bounds_of, is_rate, title_of, value_text
 
 ROW_PX, AROUND_PX = 44, 110
 
@@ -79,7 +79,7 @@ def candidates_of(final: FinalEvaluation) -> list[Candidate]:
             Candidate(
                 number,
                 {seed: sign * score for seed, score in sorted(scores.items())},
-                estimate.clipped(0.0, 1.0) if is_rate(objective_of(final)) else estimate,
+                estimate.clipped(*bounds_of(objective_of(final))),
                 standing.n_seeds,
                 _outcome(race, number, scores),
                 "" if number == CONTROL else " ".join(overrides_of(searched[number].params)),

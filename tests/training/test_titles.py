@@ -1,0 +1,23 @@
+"""Titles of metrics, their bounds, and their values as texts."""
+
+import math
+
+import pytest
+
+from armscan.training.titles import bounds_of
+
+
+@pytest.mark.parametrize(
+    ("metric", "bounds"),
+    [
+        ("validation/success_rate", (0.0, 1.0)),
+        ("on_plane_5mm_10deg", (0.0, 1.0)),
+        ("mean_dice_bones", (0.0, 1.0)),
+        ("test/mean_steps", (1.0, math.inf)),
+        ("median_distance_mm", (0.0, math.inf)),
+        ("validation/mean_return", (-math.inf, math.inf)),
+        ("update/actor_loss", (-math.inf, math.inf)),
+    ],
+)
+def test_bounds_of_a_metric_are_those_that_it_can_reach(metric, bounds):
+    assert bounds_of(metric) == bounds
