@@ -17,8 +17,8 @@ from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
 from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import beside_random, headline
+from armscan.training.metric_display import interval_text
 from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
-from armscan.training.titles import interval_text
 
 TOTAL = "all volumes"
 # What MLflow takes in the name of a metric.

@@ -10,7 +10,7 @@ from armscan.stats.on_plane import ON_PLANE, PREFIX
 from armscan.tracking import TrackingStore
 from armscan.tracking.outbox import now_ms
 from armscan.training.baselines import RANDOM
-from armscan.training.titles import leading_among
+from armscan.training.metric_display import leading_among
 
 TESTED = "test_volumes/"
 # Of the grid's run: which job its figures are of.

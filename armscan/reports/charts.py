@@ -17,7 +17,7 @@ from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
 from armscan.stats.aggregation import FEWEST_SEEDS
 from armscan.training import MetricEstimates
-from armscan.training.titles import is_rate, title_of
+from armscan.training.metric_display import is_rate, title_of
 
 # By figure, axis and number of the group.
 Curves = Mapping[tuple[str, str, int], Curve]

@@ -29,8 +29,8 @@ from armscan.stats.bootstrap import Estimate
 from armscan.training import MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
+from armscan.training.metric_display import title_of
 from armscan.training.result_table import with_baselines
-from armscan.training.titles import title_of
 
 HOW_CURVES = (
     "On the validation volumes, after each epoch. Thick: the mean of the seeds of a group. Band: its 95 % interval "

@@ -10,7 +10,7 @@ import numpy as np
 from armscan.reports.groups import Group
 from armscan.reports.load import Series, TrackedTraining
 from armscan.stats.aggregation import Band, band_over_seeds
-from armscan.training.titles import bounds_of
+from armscan.training.metric_display import bounds_of
 from armscan.volumes.plane import FloatArray
 
 # What curves are drawn over, and how a series says it.

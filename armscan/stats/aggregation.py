@@ -13,6 +13,7 @@ import numpy as np
 
 from armscan.errors import InvalidValueError
 from armscan.stats.bootstrap import LEVEL, Estimate
+from armscan.stats.paired import crossed_mean
 from armscan.volumes.plane import FloatArray
 
 # With fewer seeds a band would be wider than a chart.
@@ -40,13 +41,10 @@ def band_over_seeds(scores: FloatArray) -> Band:
     Returns:
         The band, without an interval if there are fewer than `FEWEST_SEEDS` seeds.
     """
-    from scipy.special import stdtrit
-
-    means, n_seeds = scores.mean(axis=0), len(scores)
-    if n_seeds < FEWEST_SEEDS:
-        return Band(means, *(np.full(len(means), np.nan) for _ in range(2)))
-    half = stdtrit(n_seeds - 1, UPPER) * scores.std(axis=0, ddof=1) / n_seeds**0.5
-    return Band(means, means - half, means + half)
+    means, halves = crossed_mean(scores.T[..., np.newaxis])
+    if len(scores) < FEWEST_SEEDS:
+        halves = np.full_like(means, np.nan)
+    return Band(means, means - halves, means + halves)
 
 
 def probability_of_improvement(ours: FloatArray, theirs: FloatArray) -> Estimate:

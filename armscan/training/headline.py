@@ -15,8 +15,8 @@ import numpy as np
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import crossed_mean
 from armscan.training.episode_results import Evaluation
+from armscan.training.metric_display import interval_text
 from armscan.training.metrics import MetricEstimates
-from armscan.training.titles import interval_text
 
 # Difference of the leading on-plane rates, among the figures of an agent.
 ABOVE_RANDOM = "on_plane_above_random"

@@ -16,8 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.stats.bootstrap import Estimate
+from armscan.training.metric_display import LEADING, OLDER, QUANTITIES, Quantity, interval_text
 from armscan.training.metrics import MetricEstimates
-from armscan.training.titles import LEADING, OLDER, QUANTITIES, Quantity, interval_text
 from armscan.utils.markdown import markdown_table
 
 # The most results that stand side by side; more of them are lines of their own.

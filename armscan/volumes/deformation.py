@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from armscan.errors import InvalidValueError
-from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform, affine_map
+from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,4 +49,4 @@ class DeformingTransform(RigidTransform):
         matrix: FloatArray = frame @ np.linalg.inv(self.deformation) @ frame.T
         across_mm, depth_mm = self.about_mm
         kept_mm = frame @ np.array([across_mm, 0.0, depth_mm]) + self.plane.offset_mm
-        return np.array([affine_map(matrix, kept_mm - matrix @ kept_mm), *super().maps])
+        return np.array([np.column_stack([matrix, kept_mm - matrix @ kept_mm]), *super().maps])

@@ -32,15 +32,8 @@ def rotation_matrix(rz_deg: float, rx_deg: float) -> FloatArray:
     return matrix
 
 
-def affine_map(matrix: FloatArray, offset_mm: FloatArray) -> FloatArray:
-    """Return the map p -> matrix p + offset_mm as one array, shape (3, 4)."""
-    together = np.empty((3, 4))
-    together[:, :3], together[:, 3] = matrix, offset_mm
-    return together
-
-
 @numba.njit(cache=True)
-def composed(
+def _composed(
     outer: FloatArray, outer_mm: FloatArray, inner: FloatArray, inner_mm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return (M, b) of the affine map p -> outer (inner p + inner_mm) + outer_mm."""
@@ -62,7 +55,7 @@ def mapped_plane(
     matrix, offset_mm = rotation_matrix(rotation[0], rotation[1]), np.zeros(3)
     offset_mm[0], offset_mm[1] = translation
     for i in range(maps.shape[0] - 1, -1, -1):
-        matrix, offset_mm = composed(maps[i, :, :3], maps[i, :, 3], matrix, offset_mm)
+        matrix, offset_mm = _composed(maps[i, :, :3], maps[i, :, 3], matrix, offset_mm)
     return matrix, offset_mm
 
 
@@ -165,7 +158,7 @@ class RigidTransform:
     @cached_property
     def maps(self) -> FloatArray:
         """The affine maps (A | b) that take a point into the unmoved volume, the last one first, shape (n, 3, 4)."""
-        return affine_map(self.matrix, self.offset_mm)[None]
+        return np.column_stack([self.matrix, self.offset_mm])[None]
 
     def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
         """Return (M, b) with T(plane(p)) = M p + b: from the plane's frame into the unmoved volume."""

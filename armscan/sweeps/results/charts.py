@@ -20,7 +20,7 @@ from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.reports import reports_of
-from armscan.training.titles import is_rate, title_of
+from armscan.training.metric_display import is_rate, title_of
 
 HEIGHT_PX, SMALL_PX, BAR_PX = 360, 260, 34
 MOST_TICKS = 20

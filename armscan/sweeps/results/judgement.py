@@ -22,8 +22,8 @@ from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, n
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, best_trials
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
+from armscan.training.metric_display import is_rate, leading_among, title_of, value_text
 from armscan.training.metrics import ENDS
-from armscan.training.titles import is_rate, leading_among, title_of, value_text
 from armscan.utils.markdown import markdown_table
 
 MAXIMIZE = "maximize"

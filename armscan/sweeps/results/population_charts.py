@@ -16,7 +16,7 @@ from armscan.reports.chart_style import BLUE, GREY, ORANGE
 from armscan.reports.html import chart
 from armscan.sweeps.scheduling.population import lineage
 from armscan.sweeps.scheduling.state import GENERATION, INTERVAL, MEMBER, PARENT, SCHEDULE
-from armscan.training.titles import title_of
+from armscan.training.metric_display import title_of
 
 HEIGHT_PX, SMALL_PX = 360, 260
 STEPS = "environment steps"

@@ -39,7 +39,7 @@ from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, n
 from armscan.sweeps.study.open import OpenedStudy, Phase
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import trial_folder
-from armscan.training.titles import title_of, value_text
+from armscan.training.metric_display import title_of, value_text
 from armscan.utils.console import WHOLE_CHARS, print_sentence, wide_console
 from armscan.utils.files import RUN_FILE
 from armscan.utils.retry import no_retry

@@ -30,7 +30,7 @@ from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, settings_of
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import FOLDER, RUN
-from armscan.training.titles import title_of, value_text
+from armscan.training.metric_display import title_of, value_text
 
 ID_CHARS = 8
 # How people say the states of trials.

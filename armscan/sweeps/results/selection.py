@@ -19,7 +19,7 @@ from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of
 from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES
-from armscan.training.titles import bounds_of, is_rate, title_of, value_text
+from armscan.training.metric_display import bounds_of, is_rate, title_of, value_text
 
 ROW_PX, AROUND_PX = 44, 110
 

@@ -11,7 +11,7 @@ from optuna.trial import Trial
 
 from armscan.config.services import MLFLOW_PORT
 from armscan.tracking import TrackingStore
-from armscan.training.titles import COSTS, leading_among, title_of, value_text
+from armscan.training.metric_display import COSTS, leading_among, title_of, value_text
 from armscan.utils.files import sha256
 from armscan.utils.log import log
 from armscan.utils.markdown import markdown_table

@@ -1,10 +1,10 @@
-"""Titles of metrics, their bounds, and their values as texts."""
+"""How metrics are shown: titles, bounds, and values as texts."""
 
 import math
 
 import pytest
 
-from armscan.training.titles import bounds_of
+from armscan.training.metric_display import bounds_of
 
 
 @pytest.mark.parametrize(

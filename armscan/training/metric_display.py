@@ -1,4 +1,4 @@
-"""Titles of metrics, and their values and intervals as texts."""
+"""How metrics are shown: their titles, formats and bounds, and their values and intervals as texts."""
 
 from __future__ import annotations
 
