@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from armscan.agents.sac_kernels import Adam, Floats, Weights
+from armscan.agents.mlp_kernels import Adam, Floats, Weights
 
 
 class AdamVectors:

@@ -21,6 +21,7 @@ from torch import nn
 from armscan.agents import sac_kernels as kernels
 from armscan.agents.adam_vectors import AdamVectors, flattened
 from armscan.agents.compute import Compute
+from armscan.agents.mlp_kernels import Layers
 from armscan.agents.replay import Replay
 from armscan.utils.compilation import compilation_told
 
@@ -65,7 +66,7 @@ class CompiledSAC(sac.SAC[Any]):
         self._sizes = [np.array(layer_sizes(network)) for network in (self.policy.actor, self.critic)]
         actor: Any = self.policy.actor
         self._n_free = int(actor.output_dim)
-        self._layers: tuple[kernels.Layers, kernels.Layers] | None = None
+        self._layers: tuple[Layers, Layers] | None = None
 
     def update(self, buffer: ReplayBuffer, sample_size: int | None) -> Any:
         """Take a gradient step; see Tianshou's."""
@@ -116,13 +117,11 @@ class CompiledSAC(sac.SAC[Any]):
             self.tau,
         )
 
-    def _layers_for(self, n: int) -> tuple[kernels.Layers, kernels.Layers]:
+    def _layers_for(self, n: int) -> tuple[Layers, Layers]:
         """Return memory for the layers of actor and critic; their gradients are never needed at once."""
         if self._layers is None or self._layers[0].values.size != n * self._sizes[0].sum():
             gradient = np.empty(n * max(sizes.sum() for sizes in self._sizes), np.float32)
-            actor, critic = (
-                kernels.Layers(sizes, np.empty(n * sizes.sum(), np.float32), gradient) for sizes in self._sizes
-            )
+            actor, critic = (Layers(sizes, np.empty(n * sizes.sum(), np.float32), gradient) for sizes in self._sizes)
             self._layers = actor, critic
         return self._layers
 

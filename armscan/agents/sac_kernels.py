@@ -1,7 +1,6 @@
-"""A gradient step of SAC for fully connected networks with ReLU, compiled: BLAS for products, loops for the rest.
+"""A gradient step of SAC for fully connected networks with ReLU, compiled.
 
-Everything is float32 and changed in place. The weights of a network are one vector: for each layer its weights, shape
-(n_out, n_in), then its biases; a head follows the hidden layers, of an actor two: mean and logarithm of the spread.
+A critic's network has one head, an actor's two: mean and logarithm of the spread.
 """
 
 from __future__ import annotations
@@ -9,24 +8,30 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from armscan.agents.mlp_kernels import (
+    Adam,
+    F,
+    Floats,
+    Ints,
+    Layers,
+    Weights,
+    adam_step,
+    backward,
+    compiled,
+    forward,
+    input_gradient,
+    layer_view,
+    linear,
+    linear_gradient,
+)
 from armscan.volumes.plane import FloatArray
 
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
-F = np.float32
 # As Tianshou has them: bounds of the logarithm of the spread, and what keeps the logarithm of 1 - tanh(x)^2 finite.
 LOG_STD_MIN, LOG_STD_MAX, EPS = F(-20.0), F(2.0), np.finfo(np.float32).eps
 LOG_SQRT_2PI = F(0.5 * math.log(2.0 * math.pi))
-
-# Arrays are copied by loops: at an assignment to a slice, Numba compiles the text of its shape error, for two seconds.
-# Sums may be reordered, so that loops over them are vectorised. NaN stays NaN: a training that diverges must show it.
-compiled = numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"}, boundscheck=False
-)
 
 
 class Transitions(NamedTuple):
@@ -39,25 +44,6 @@ class Transitions(NamedTuple):
     terminated: NDArray[np.bool_]
 
 
-class Weights(NamedTuple):
-    """Weights of a network, their gradient, and Adam's state; shape (n,), `steps` (1 or more,)."""
-
-    values: Floats
-    gradient: Floats
-    exp_avg: Floats
-    exp_avg_sq: Floats
-    steps: Floats
-
-
-class Adam(NamedTuple):
-    """Settings of an optimiser."""
-
-    lr: float
-    beta1: float
-    beta2: float
-    eps: float
-
-
 class Drawn(NamedTuple):
     """Actions that were drawn, shape (n, n_free) each, but for the logarithms of their probabilities, shape (n,)."""
 
@@ -65,14 +51,6 @@ class Drawn(NamedTuple):
     std: Floats
     actions: Floats
     log_prob: Floats
-
-
-class Layers(NamedTuple):
-    """Values of a network's input and hidden layers for a batch, one layer after another, and their gradient."""
-
-    sizes: Ints
-    values: Floats
-    gradient: Floats
 
 
 class Entropy(NamedTuple):
@@ -96,101 +74,15 @@ class Agent(NamedTuple):
 
 
 @compiled
-def _layer(values: Floats, sizes: Ints, n_rows: int, which: int) -> Floats:
-    """Return a view of one layer, shape (n_rows, sizes[which])."""
-    start = n_rows * sizes[:which].sum()
-    return values[start : start + n_rows * sizes[which]].reshape(n_rows, sizes[which])
-
-
-@compiled
-def _linear(x: Floats, weights: Floats, start: int, out: Floats, is_hidden: bool) -> int:
-    """Fill a layer's values, of a hidden one after ReLU; returns where the next layer's weights start."""
-    n_out: int = out.shape[1]
-    end: int = start + n_out * x.shape[1]
-    np.dot(x, weights[start:end].reshape(n_out, x.shape[1]).T, out)
-    bias = weights[end : end + n_out]
-    for i in range(out.shape[0]):
-        for j in range(n_out):
-            value = out[i, j] + bias[j]
-            out[i, j] = F(0.0) if is_hidden and value < F(0.0) else value
-    return end + n_out
-
-
-@compiled
-def _linear_gradient(x: Floats, d_out: Floats, gradient: Floats, start: int) -> None:
-    """Fill the gradient of a layer's weights."""
-    n_out, end = d_out.shape[1], start + d_out.shape[1] * x.shape[1]
-    np.dot(d_out.T, x, gradient[start:end].reshape(n_out, x.shape[1]))
-    d_bias = gradient[end : end + n_out]
-    d_bias[:] = F(0.0)
-    for i in range(d_out.shape[0]):
-        for j in range(n_out):
-            d_bias[j] += d_out[i, j]
-
-
-@compiled
-def _input_gradient(d_out: Floats, weights: Floats, start: int, d_x: Floats) -> None:
-    """Fill the gradient of a layer's input."""
-    n_out, n_in = d_out.shape[1], d_x.shape[1]
-    np.dot(d_out, weights[start : start + n_out * n_in].reshape(n_out, n_in), d_x)
-
-
-@compiled
-def _forward(weights: Floats, layers: Layers, n_rows: int) -> int:
-    """Fill the hidden layers; returns where the weights of the first head start."""
-    start: int = 0
-    for which in range(1, layers.sizes.size):
-        out = _layer(layers.values, layers.sizes, n_rows, which)
-        start = _linear(_layer(layers.values, layers.sizes, n_rows, which - 1), weights, start, out, True)
-    return start
-
-
-@compiled
-def _backward(weights: Weights, layers: Layers, n_rows: int, start: int, of_input: bool) -> None:
-    """Fill the gradient of the input, or else of all hidden layers' weights, from that of the last layer's values."""
-    for which in range(layers.sizes.size - 1, 0, -1):
-        x = _layer(layers.values, layers.sizes, n_rows, which - 1)
-        out = _layer(layers.values, layers.sizes, n_rows, which)
-        d_out = _layer(layers.gradient, layers.sizes, n_rows, which)
-        for i in range(n_rows):
-            for j in range(out.shape[1]):
-                d_out[i, j] = F(0.0) if out[i, j] <= F(0.0) else d_out[i, j]
-        start -= out.shape[1] * (x.shape[1] + 1)
-        if not of_input:
-            _linear_gradient(x, d_out, weights.gradient, start)
-        if of_input or which > 1:
-            d_x = _layer(layers.gradient, layers.sizes, n_rows, which - 1)
-            _input_gradient(d_out, weights.values, start, d_x)
-
-
-@compiled
-def adam_step(weights: Weights, settings: Adam) -> None:
-    """Take a step of Adam, as torch's."""
-    for i in range(weights.steps.size):
-        weights.steps[i] += F(1.0)
-    n_steps = weights.steps[0]
-    step_size = F(settings.lr / (1.0 - settings.beta1**n_steps))
-    root = F(math.sqrt(1.0 - settings.beta2**n_steps))
-    share1, share2 = F(1.0 - settings.beta1), F(1.0 - settings.beta2)
-    beta2, eps = F(settings.beta2), F(settings.eps)
-    for i in range(weights.values.size):
-        gradient = weights.gradient[i]
-        exp_avg = weights.exp_avg[i] + share1 * (gradient - weights.exp_avg[i])
-        exp_avg_sq = beta2 * weights.exp_avg_sq[i] + share2 * gradient * gradient
-        weights.exp_avg[i], weights.exp_avg_sq[i] = exp_avg, exp_avg_sq
-        weights.values[i] -= step_size * exp_avg / (np.sqrt(exp_avg_sq) / root + eps)
-
-
-@compiled
 def _act(actor: Weights, layers: Layers, noise: Floats) -> Drawn:
     """Draw an action for each observation that the first of the actor's layers holds."""
     n, n_free = noise.shape
     log_std, std, actions = np.empty((n, n_free), F), np.empty((n, n_free), F), np.empty((n, n_free), F)
     log_prob = np.zeros(n, F)
-    mean_head = _forward(actor.values, layers, n)
-    features = _layer(layers.values, layers.sizes, n, layers.sizes.size - 1)
-    std_head = _linear(features, actor.values, mean_head, actions, False)
-    _linear(features, actor.values, std_head, log_std, False)
+    mean_head = forward(actor.values, layers, n)
+    features = layer_view(layers.values, layers.sizes, n, layers.sizes.size - 1)
+    std_head = linear(features, actor.values, mean_head, actions, False)
+    linear(features, actor.values, std_head, log_std, False)
     for i in range(n):
         for j in range(n_free):
             log_s = min(max(log_std[i, j], LOG_STD_MIN), LOG_STD_MAX)
@@ -205,12 +97,12 @@ def _act(actor: Weights, layers: Layers, noise: Floats) -> Drawn:
 def _judge(critic: Floats, layers: Layers, obs: Floats, actions: Floats, values: Floats) -> int:
     """Fill a critic's values, shape (n, 1); returns where the weights of its head start."""
     n, n_obs = obs.shape
-    x = _layer(layers.values, layers.sizes, n, 0)
+    x = layer_view(layers.values, layers.sizes, n, 0)
     for i in range(n):
         for j in range(x.shape[1]):
             x[i, j] = obs[i, j] if j < n_obs else actions[i, j - n_obs]
-    head: int = _forward(critic, layers, n)
-    _linear(_layer(layers.values, layers.sizes, n, layers.sizes.size - 1), critic, head, values, False)
+    head: int = forward(critic, layers, n)
+    linear(layer_view(layers.values, layers.sizes, n, layers.sizes.size - 1), critic, head, values, False)
     return head
 
 
@@ -219,9 +111,9 @@ def _critic_gradient(critic: Weights, layers: Layers, head: int, d_values: Float
     """Fill the gradient of a critic's input, or else of its weights, from that of its values."""
     n, last = d_values.shape[0], layers.sizes.size - 1
     if not of_input:
-        _linear_gradient(_layer(layers.values, layers.sizes, n, last), d_values, critic.gradient, head)
-    _input_gradient(d_values, critic.values, head, _layer(layers.gradient, layers.sizes, n, last))
-    _backward(critic, layers, n, head, of_input)
+        linear_gradient(layer_view(layers.values, layers.sizes, n, last), d_values, critic.gradient, head)
+    input_gradient(d_values, critic.values, head, layer_view(layers.gradient, layers.sizes, n, last))
+    backward(critic, layers, n, head, of_input)
 
 
 @compiled
@@ -246,13 +138,13 @@ def _update_actor(
 ) -> tuple[float, float]:
     """Take a gradient step of the actor; returns its loss, and the mean logarithmic probability of its actions."""
     n, n_free = noise.shape
-    obs = _layer(layers.values, layers.sizes, n, 0)
+    obs = layer_view(layers.values, layers.sizes, n, 0)
     drawn = _act(agent.actor, layers, noise)
     values, d_values, d_actions = np.empty((2, n, 1), F), np.ones((n, 1), F), np.empty((2, n, n_free), F)
     for k in range(2):
         head = _judge(agent.critics[k].values, critic_layers, obs, drawn.actions, values[k])
         _critic_gradient(agent.critics[k], critic_layers, head, d_values, True)
-        d_x = _layer(critic_layers.gradient, critic_layers.sizes, n, 0)
+        d_x = layer_view(critic_layers.gradient, critic_layers.sizes, n, 0)
         for i in range(n):
             for j in range(n_free):
                 d_actions[k, i, j] = d_x[i, obs.shape[1] + j]
@@ -281,18 +173,18 @@ def _update_actor(
 def _actor_gradient(actor: Weights, layers: Layers, d_mean: Floats, d_log_std: Floats) -> None:
     """Fill the gradient of an actor's weights from that of its two heads."""
     n, n_free, last = d_mean.shape[0], d_mean.shape[1], layers.sizes.size - 1
-    features = _layer(layers.values, layers.sizes, n, last)
-    d_features, of_std = _layer(layers.gradient, layers.sizes, n, last), np.empty_like(features)
+    features = layer_view(layers.values, layers.sizes, n, last)
+    d_features, of_std = layer_view(layers.gradient, layers.sizes, n, last), np.empty_like(features)
     n_head = n_free * (features.shape[1] + 1)
     mean_head, std_head = actor.values.size - 2 * n_head, actor.values.size - n_head
-    _linear_gradient(features, d_mean, actor.gradient, mean_head)
-    _linear_gradient(features, d_log_std, actor.gradient, std_head)
-    _input_gradient(d_mean, actor.values, mean_head, d_features)
-    _input_gradient(d_log_std, actor.values, std_head, of_std)
+    linear_gradient(features, d_mean, actor.gradient, mean_head)
+    linear_gradient(features, d_log_std, actor.gradient, std_head)
+    input_gradient(d_mean, actor.values, mean_head, d_features)
+    input_gradient(d_log_std, actor.values, std_head, of_std)
     for i in range(n):
         for j in range(features.shape[1]):
             d_features[i, j] += of_std[i, j]
-    _backward(actor, layers, n, mean_head, False)
+    backward(actor, layers, n, mean_head, False)
 
 
 @compiled
@@ -357,7 +249,7 @@ def update(
             5).
     """
     n, tau = indices.shape[1], F(agent.tau)
-    obs, actions = _layer(actor_layers.values, actor_layers.sizes, n, 0), np.empty(noise.shape[2:], F)
+    obs, actions = layer_view(actor_layers.values, actor_layers.sizes, n, 0), np.empty(noise.shape[2:], F)
     for step, index in enumerate(indices):
         alpha = F(np.exp(agent.entropy.log_alpha.values[0]))
         _take(transitions.obs_next, index, obs)
