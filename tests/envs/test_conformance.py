@@ -254,6 +254,8 @@ def learn():
             model = getattr(baselines, algorithm)(
                 policy, env, seed=0, device="cpu", policy_kwargs={"net_arch": [16, 16]}, batch_size=32, **settings
             )
+            # The default logger leaves an empty folder in the temporary one.
+            model.set_logger(baselines.common.logger.Logger(folder=None, output_formats=[]))
             before = [weight.detach().clone() for weight in model.policy.parameters()]
             model.learn(300)
             changed = [

@@ -18,6 +18,7 @@ import optuna
 
 from benchmarks.sweeps.bench.collect import collect
 from benchmarks.sweeps.bench.report import report
+from benchmarks.sweeps.bench.warm_start import Target, replays, share_of_trials
 
 
 def main() -> None:
@@ -36,10 +37,21 @@ def main() -> None:
     replaying.add_argument("--trainings", type=int, default=40, help="budget of each search (default: 40)")
     replaying.add_argument("--resamples", type=int, default=50, help="resamples of importances (default: 50)")
     replaying.add_argument("--picture", type=Path, help="a PNG file that is written")
+    starting = commands.add_parser("warm-start", help="simulate studies that begin with the best settings of others")
+    starting.add_argument("source", help="name of the sweep that the settings are from, such as sac_y")
+    starting.add_argument("target", help="name of the sweep that begins with them, such as sac_zy")
+    starting.add_argument("--studies", type=int, default=20, help="studies (default: 20)")
     given = parser.parse_args()
-    if given.command == "report":
-        optuna.logging.set_verbosity(optuna.logging.ERROR)
-        warnings.simplefilter("ignore")
+    if given.command == "collect":
+        collect(given.sweep, given.configs, given.seeds, given.workers, allow_changes=given.allow_changes)
+        return
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    warnings.simplefilter("ignore")
+    if given.command == "warm-start":
+        studies = replays(Target.of(given.source), Target.of(given.target), given.studies)
+        print(studies.to_string())
+        print("trials with a warm start, of those without: {:.2f} ({:.2f} to {:.2f})".format(*share_of_trials(studies)))
+    else:
         report(
             given.sweep,
             n_studies=given.studies,
@@ -47,8 +59,6 @@ def main() -> None:
             n_resamples=given.resamples,
             picture=given.picture,
         )
-        return
-    collect(given.sweep, given.configs, given.seeds, given.workers, allow_changes=given.allow_changes)
 
 
 if __name__ == "__main__":

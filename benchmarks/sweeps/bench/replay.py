@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -16,6 +16,7 @@ from optuna.trial import Trial, TrialState
 from armscan.config.compose import compose
 from armscan.stats.bootstrap import interquartile_mean
 from armscan.sweeps.scheduling.race import race
+from armscan.sweeps.space.parameter import Value
 from armscan.volumes.plane import FloatArray
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
@@ -45,10 +46,14 @@ class Candidate:
     Args:
         value: Interquartile mean over its seeds of the mean steps in the best validation.
         config: Its configuration.
+        number: Number of the trial in its search, from 0.
+        values: Values of its configuration by name.
     """
 
     value: float
     config: SimulatedConfig
+    number: int
+    values: dict[str, Value]
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,15 @@ class Search:
     n_trainings: float
 
 
-def search(surrogate: Surrogate, sweep: str, rule: Rule, *, n_trainings: int, seed: int) -> Search:
+def search(
+    surrogate: Surrogate,
+    sweep: str,
+    rule: Rule,
+    *,
+    n_trainings: int,
+    seed: int,
+    enqueued: Sequence[Mapping[str, Value]] = (),
+) -> Search:
     """Search until the environment steps of so many whole trainings are spent.
 
     Args:
@@ -75,23 +88,27 @@ def search(surrogate: Surrogate, sweep: str, rule: Rule, *, n_trainings: int, se
         rule: How to search.
         n_trainings: The budget; the last trial may exceed it.
         seed: Seed of the sampler, and of the trainings.
+        enqueued: Values by name that the first trials try; the sampler proposes what is missing. Default: none.
     """
     settings = _settings(sweep, rule.sampler, rule.pruner)
     study = optuna.create_study(
         sampler=instantiate(settings.sampler, seed=seed), pruner=instantiate(settings.pruner), direction="minimize"
     )
+    for values in enqueued:
+        study.enqueue_trial(dict(values))
     total, spent = surrogate.env_steps[-1], 0.0
     rng, candidates, n_trials = np.random.default_rng(seed), [], 0
     while spent < n_trainings * total and n_trials < MOST_TRIALS_A_TRAINING * n_trainings:
         trial, n_trials = study.ask(), n_trials + 1
-        config = surrogate.config(surrogate.space.suggest(trial))
+        values = surrogate.space.suggest(trial)
+        config = surrogate.config(values)
         value, n_env_steps = _run(trial, config, rule.n_seeds, rng)
         spent += n_env_steps
         if value is None:
             study.tell(trial, state=TrialState.PRUNED)
         else:
             study.tell(trial, value)
-            candidates.append(Candidate(value, config))
+            candidates.append(Candidate(value, config, trial.number, values))
     # The first of equal ones, as armscan sorts them.
     candidates.sort(key=lambda each: each.value)
     return Search(tuple(candidates), n_trials, float(spent / total))

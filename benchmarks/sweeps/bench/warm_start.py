@@ -1,0 +1,96 @@
+"""Trials that a warm start saves: those until a study finds the best of a study without one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.stats import bootstrap
+
+from armscan.config.compose import compose
+from armscan.stats.bootstrap import Estimate
+from armscan.sweeps.space.parameter import Value
+from armscan.sweeps.space.space import Space
+from armscan.sweeps.study.warm_start import N_ENQUEUED
+from armscan.volumes.plane import FloatArray
+from benchmarks.sweeps.bench.replay import Rule, Search, search
+from benchmarks.sweeps.bench.surrogate import Surrogate
+from benchmarks.sweeps.bench.table import Curves
+
+
+class Target(NamedTuple):
+    """A sweep whose studies begin with the best settings of another one.
+
+    Args:
+        sweep: Name of the sweep.
+        surrogate: Simulates its trainings.
+        rule: Sampler, pruner and seeds of its trials.
+        n_trainings: Budget of each search, in whole trainings.
+    """
+
+    sweep: str
+    surrogate: Surrogate
+    rule: Rule
+    n_trainings: int
+
+    @classmethod
+    def of(cls, sweep: str) -> Target:
+        """Return a sweep with the table of its trainings, and with the seeds and the number of trials that it has."""
+        study = compose([f"sweep={sweep}"]).study
+        n_seeds = len(study.seeds)
+        rule = Rule("tpe", "median", n_seeds)
+        return cls(sweep, Surrogate.of(Curves.read(sweep)), rule, study.n_trials * n_seeds)
+
+
+def replays(source: Target, target: Target, n_studies: int) -> pd.DataFrame:
+    """Simulate each study cold and with a warm start from a study of the source, with the same seeds.
+
+    Args:
+        source: Sweep whose best settings are tried first.
+        target: Sweep that is searched.
+        n_studies: Number of studies of each kind.
+
+    Returns:
+        A row of each study: the numbers of trials, `cold` and `warm`, until the truly best settings of the cold study,
+        or truly better ones, are tried; one more than all trials where the warm study tries none.
+    """
+    rows = []
+    for seed in range(n_studies):
+        known = _search(source, seed)
+        cold = _search(target, seed)
+        warm = _search(target, seed, best_that_fit(known, target.surrogate.space))
+        goal = min(each.config.truth for each in cold.candidates)
+        rows.append({"cold": _trials_until(cold, goal), "warm": _trials_until(warm, goal)})
+    return pd.DataFrame(rows)
+
+
+def best_that_fit(found: Search, space: Space) -> list[dict[str, Value]]:
+    """Return the different settings of the best trials whose values lie in a space, as a study's warm start does."""
+    fitting = []
+    for each in found.candidates:
+        chosen, misfit = space.fit(each.values, partly=True)
+        if chosen and misfit is None and chosen not in fitting:
+            fitting.append(chosen)
+    return fitting[:N_ENQUEUED]
+
+
+def share_of_trials(studies: pd.DataFrame) -> Estimate:
+    """Return the median trials with a warm start over the median without; its 95 % interval draws studies."""
+
+    def share(warm: FloatArray, cold: FloatArray, axis: int = -1) -> FloatArray:
+        return np.asarray(np.median(warm, axis=axis) / np.median(cold, axis=axis))
+
+    samples = studies.warm.to_numpy(), studies.cold.to_numpy()
+    drawn = bootstrap(samples, share, paired=True, method="percentile", rng=np.random.default_rng(0))
+    return Estimate(float(share(*samples)), *map(float, drawn.confidence_interval))
+
+
+def _search(target: Target, seed: int, enqueued: Sequence[Mapping[str, Value]] = ()) -> Search:
+    sweep, surrogate, rule, n_trainings = target
+    return search(surrogate, sweep, rule, n_trainings=n_trainings, seed=seed, enqueued=enqueued)
+
+
+def _trials_until(found: Search, goal: float) -> float:
+    return min((each.number + 1.0 for each in found.candidates if each.config.truth <= goal), default=found.n_trials + 1.0)
