@@ -93,4 +93,5 @@ def _search(target: Target, seed: int, enqueued: Sequence[Mapping[str, Value]] =
 
 
 def _trials_until(found: Search, goal: float) -> float:
-    return min((each.number + 1.0 for each in found.candidates if each.config.truth <= goal), default=found.n_trials + 1.0)
+    numbers = [each.number for each in found.candidates if each.config.truth <= goal]
+    return min(numbers, default=found.n_trials) + 1.0
