@@ -11,7 +11,7 @@ from armscan.config.credentials import check_address
 from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.errors import printable
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher
-from armscan.sweeps.results.progress import print_result
+from armscan.sweeps.results.console import print_result
 from armscan.sweeps.study.arguments import STORAGE, StudyCommand, words_of_trials
 from armscan.sweeps.study.components import check_space, read_settings
 from armscan.sweeps.study.open import open_for_work

@@ -1,0 +1,119 @@
+"""The result of a study, in the terminal."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+
+from rich.table import Table
+from rich.text import Text
+
+from armscan.config.command_hints import armscan_command
+from armscan.errors import printable
+from armscan.experiment.console import print_table, print_where_to_look
+from armscan.sweeps.results.judgement import HOW, judge
+from armscan.sweeps.results.progress import status_line
+from armscan.sweeps.results.selection import candidates_of, objective_of
+from armscan.sweeps.results.summary import final_table
+from armscan.sweeps.scheduling.population import searched_values
+from armscan.sweeps.scheduling.state import FAILURE
+from armscan.sweeps.space.parameter import rounded_overrides
+from armscan.sweeps.storage.attributes import check_trials
+from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation
+from armscan.sweeps.study.open import OpenedStudy
+from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.tasks.attempt import trial_folder
+from armscan.training.metric_display import title_of, value_text
+from armscan.utils.console import WHOLE_CHARS, print_sentence, wide_console
+from armscan.utils.files import RUN_FILE
+
+
+def print_result(opened: OpenedStudy) -> int:
+    """Print the result of a study; return the exit code."""
+    scheduler, settings = opened.search.scheduler, opened.settings
+    state = scheduler.state()
+    print_sentence(status_line(opened, state))
+    if stopped := scheduler.look_for_stop():
+        print_sentence(printable(f"the study was stopped {stopped}; the same command resumes it"))
+        return 0
+    wrong = scheduler.broken(state)
+    if wrong is None and scheduler.end(state) is None:
+        wrong = (
+            f"all workers have ended, but only {len(state.finished)} of {settings.n_trials} trials have finished: "
+            f"their logs in {opened.folder / 'workers'} say why; the same command resumes the study"
+        )
+    if wrong:
+        print(printable(f"error: {wrong}"), file=sys.stderr)
+        return 1
+    if scheduler.termination is not None and (ended := scheduler.termination.reason):
+        told = f"the study has ended by itself: {ended}; study.n_trials or study.terminator change that"
+        print_sentence(printable(told))
+    if settings.constraints and state.finished and not best_trials(scheduler.study, 1):
+        print(f"no trial keeps all constraints: {', '.join(map(str, settings.constraints))}")
+    _print_best(opened)
+    is_judged = opened.final_eval is None or _print_final_results(opened, opened.final_eval)
+    print_where_to_look(opened.folder, opened.config.tracking.uri, storage=settings.storage)
+    _print_replay(opened)
+    print(f"report    {armscan_command('report', '--study', settings.name, storage=settings.storage)}")
+    return 0 if is_judged else 1
+
+
+def _print_best(opened: OpenedStudy) -> None:
+    """Print the best trials of the search."""
+    objectives = opened.settings.objectives
+    table = Table("trial", *map(title_of, objectives), title="best while searching", title_justify="left")
+    best = best_trials(opened.search.scheduler.study, max(1, opened.settings.final_eval.top_k))
+    for trial in best:
+        table.add_row(str(trial.number), *map(value_text, objectives, trial.values))
+    wide_console(WHOLE_CHARS).print(table)
+    for trial in best:
+        print_sentence(f"trial {trial.number}: {' '.join(rounded_overrides(searched_values(trial)))}")
+
+
+def _print_replay(opened: OpenedStudy) -> None:
+    """Print the command that trains the best member of a population again, with its whole schedule."""
+    search = opened.search
+    if search.population is not None and (best := best_trials(search.scheduler.study, 1)):
+        for seed in opened.settings.seeds:
+            file = trial_folder(search.folder, best[0].number) / f"seed_{seed}" / RUN_FILE
+            run_id = json.loads(file.read_text())["run_id"]
+            print(f"replay    {armscan_command('runs', 'reproduce', run_id, tracking=opened.config.tracking.uri)}")
+
+
+def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
+    """Print how a configuration was chosen, and its results on the test volumes; return whether there are any."""
+    trials = opened.search.scheduler.study.get_trials(deepcopy=False)
+    for phase in opened.finals:
+        check_trials(phase.scheduler.study, n_searched=len(trials))
+        failed = phase.scheduler.state().failed
+        if failed:
+            reason = failed[0].user_attrs.get(FAILURE)
+            print(printable(f"error: {len(failed)} trainings of {phase.name} have failed: {reason}"), file=sys.stderr)
+    candidates = candidates_of(final)
+    if candidates:
+        objective = objective_of(final)
+        title = f"selection on the validation volumes, by: {title_of(objective)}"
+        _print_rows(title, [each.row(objective) for each in candidates])
+    judgement = judge(final)
+    if judgement is None or not judgement.results:
+        reason = "no trial or no final training has finished"
+        if not final.race().is_over or final.missing_of_judgement():
+            reason = "trainings are missing; the same command resumes the study"
+        print(f"error: no final evaluation, because {reason}", file=sys.stderr)
+        return False
+    if judgement.differences:
+        _print_rows(judgement.compared, [each.row() for each in judgement.differences])
+        print_sentence(HOW)
+    print_table("the test volumes", final_table(judgement.results), judgement.notes)
+    for name, settings in judgement.settings.items():
+        print_sentence(f"{name}: {settings or NOTHING_SEARCHED}")
+    print_sentence(f"result: {judgement.result}")
+    return True
+
+
+def _print_rows(title: str, rows: Sequence[Mapping[str, str]]) -> None:
+    table = Table(*rows[0], title=Text(title), title_justify="left")
+    for row in rows:
+        table.add_row(*map(Text, row.values()))
+    wide_console(WHOLE_CHARS).print(table)
