@@ -6,6 +6,7 @@ import functools
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import hydra
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
@@ -15,6 +16,7 @@ from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
+from hydra.utils import instantiate
 from omegaconf import DictConfig, open_dict
 
 # They register the resolvers that the configuration uses.
@@ -31,7 +33,9 @@ from armscan.config.sources import (
     replaced_files,
     sweeps_folder,
 )
+from armscan.errors import InvalidValueError
 
+T = TypeVar("T")
 VERSION_BASE = "1.3"
 MAX_NAMED = 3
 
@@ -127,3 +131,11 @@ def of_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
         for section in ("study", "hydra", CLUSTER):
             config.pop(section, None)
     return config, choices
+
+
+def build_section(config: DictConfig, section: str, kind: type[T]) -> T:
+    """Build the object of a configuration section, which must be of this class."""
+    built = instantiate(config[section], _convert_="object")
+    if not isinstance(built, kind):
+        raise InvalidValueError(f"{section} builds {built!r}, but it must build a {kind.__name__}")
+    return built

@@ -14,7 +14,8 @@ from armscan.envs import EnvFactory
 from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed, printable
 from armscan.evaluation.agent_source import TrainedAgent
 from armscan.evaluation.volumes import TrainingVolumes, Volumes, known_volumes, own_split, volume_groups
-from armscan.experiment.build import apply_crop, make_agent, make_env_factory, on_plane_of
+from armscan.experiment.agent import make_agent
+from armscan.experiment.build import apply_crop, make_env_factory, on_plane_of
 from armscan.tracking import FoundRun
 from armscan.training import PARTS, Evaluation, Split, TrainingDomain, evaluate, evaluate_baselines
 from armscan.training.domain import smallest_slice

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import Any, TypeVar, cast
+from functools import cached_property
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from armscan.agents import (
     Agent,
-    AgentSetup,
-    Algorithm,
     Compute,
     Learner,
-    ScheduledLearner,
-    Segment,
     scheduled_algorithms,
 )
+from armscan.config.compose import build_section
 from armscan.config.defaults import CLUSTER, to_plain
 from armscan.config.trust import needs_trust
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError, listed
+from armscan.experiment.agent import make_agent, make_algorithm
 from armscan.tracking import check_settings
 from armscan.training import (
     ON_PLANE,
@@ -41,7 +38,6 @@ from armscan.utils.log import silence_libraries
 from armscan.utils.validation import check_int, check_seed
 from armscan.volumes import LabelVolume
 
-T = TypeVar("T")
 SECTIONS = ("data", "obs", "reward", "agent", "network", "tracking", "env", "training", "evaluation", "compute")
 SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
 EVALUATION_KEYS = ("episodes", "on_plane")
@@ -129,8 +125,8 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
     check_words(config)
     seed = check_seed("seed", config.seed)
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
-    budget = _made(config, "training", Budget)
-    split = split or _made(config, "data", Split)
+    budget = build_section(config, "training", Budget)
+    split = split or build_section(config, "data", Split)
     smallest = smallest_slice([*split.training.values(), *split.validation.values(), *split.test.values()])
     env_factory = make_env_factory(apply_crop(config, smallest, smallest), split.training)
     agent = make_agent(
@@ -167,18 +163,10 @@ def check_words(config: DictConfig) -> None:
     check_seed("seed", config.seed)
     check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
     on_plane_of(config)
-    budget = _made(config, "training", Budget)
-    _made(config, "compute", Compute)
+    budget = build_section(config, "training", Budget)
+    build_section(config, "compute", Compute)
     instantiate(config.env, _convert_="object")
     scheduled_algorithms(make_algorithm(config), budget.segments)
-
-
-def _made(config: DictConfig, section: str, kind: type[T]) -> T:
-    """Build the object of a configuration section, which must be of this class."""
-    made = instantiate(config[section], _convert_="object")
-    if not isinstance(made, kind):
-        raise InvalidValueError(f"{section} builds {made!r}, but it must build a {kind.__name__}")
-    return made
 
 
 def on_plane_of(config: DictConfig) -> tuple[OnPlane, ...]:
@@ -200,71 +188,6 @@ def make_env_factory(config: DictConfig, training: Mapping[str, LabelVolume]) ->
     """Return the factory of environments, its reward fitted to the training volumes."""
     env_factory: EnvFactory = instantiate(config.env, _convert_="object")
     return env_factory.fit(training)
-
-
-def make_agent(
-    config: DictConfig,
-    env_factory: EnvFactory,
-    volumes: Mapping[str, LabelVolume],
-    *,
-    total_env_steps: int,
-    seed: int,
-    validation: Mapping[str, LabelVolume] | None = None,
-    schedule: Sequence[Segment] = (),
-) -> Agent:
-    """Return the agent, which has learned nothing yet, for environments on these volumes.
-
-    Args:
-        config: Composed configuration.
-        env_factory: Factory of its environments.
-        volumes: Volumes to learn on.
-        total_env_steps: Budget of its training, in environment steps.
-        seed: Seed of all its random numbers.
-        validation: Validation volumes of its training. Default: None, for an agent that does not learn.
-        schedule: Changes of its hyperparameters while it learns. Default: none.
-    """
-    algorithm = make_algorithm(config)
-    env = env_factory.make_env(dict(volumes))
-    make_envs = partial(env_factory.make_vector_env, volumes=dict(volumes), autoreset_mode="Disabled")
-    make_validation_envs = None
-    if validation is not None:
-        factory = env_factory.undeformed()
-        make_validation_envs = partial(factory.make_vector_env, volumes=dict(validation), autoreset_mode="Disabled")
-    setup = AgentSetup(
-        make_envs=make_envs,
-        observation_space=env.observation_space,
-        action_names=env.get_wrapper_attr("action_names"),
-        total_env_steps=total_env_steps,
-        seed=seed,
-        compute=_made(config, "compute", Compute),
-        make_validation_envs=make_validation_envs,
-    )
-    agent = algorithm.agent(setup)
-    if hasattr(agent, "learn") and not isinstance(agent, Learner):
-        missing = [name for name in dir(Learner) if not name.startswith("_") and not hasattr(agent, name)]
-        raise InvalidValueError(
-            f"agent is {type(agent).__name__}, which learns, but it must have all methods of Learner: it has no "
-            f"{listed(missing)}"
-        )
-    # All of them now: what one refuses is told before anything is trained.
-    later: list[tuple[int, Any]] = [
-        (start, each.agent(setup)) for start, each in scheduled_algorithms(algorithm, schedule)
-    ]
-    return ScheduledLearner(cast(Learner, agent), later) if later else agent
-
-
-def make_algorithm(config: DictConfig) -> Algorithm:
-    """Return the algorithm that makes the agent.
-
-    Raises:
-        InvalidValueError: If the section `agent` describes none, or a hyperparameter is not allowed.
-    """
-    algorithm: Algorithm = instantiate(config.agent, _convert_="object")
-    if not callable(getattr(algorithm, "agent", None)):
-        raise InvalidValueError(
-            f"agent is {algorithm!r}, but it must have the method of Algorithm, agent: give agent._target_ such a class"
-        )
-    return algorithm
 
 
 def check_keys(config: DictConfig) -> None:

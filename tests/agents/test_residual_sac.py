@@ -13,7 +13,7 @@ from armscan.config.compose import compose
 from armscan.config.error_messages import one_line_message
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError
-from armscan.experiment.build import make_algorithm
+from armscan.experiment.agent import make_algorithm
 from tests.agents.conftest import SMALL_SAC, setup_for
 from tests.agents.test_plane_finder import NAMES, RULES, SMALL, answers_of, played
 

@@ -1,0 +1,96 @@
+"""The agent of an experiment, built from its configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, cast
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from armscan.agents import (
+    Agent,
+    AgentSetup,
+    Algorithm,
+    Compute,
+    Learner,
+    ScheduledLearner,
+    Segment,
+    VectorEnvFactory,
+    scheduled_algorithms,
+)
+from armscan.config.compose import build_section
+from armscan.envs import EnvFactory
+from armscan.errors import InvalidValueError, listed
+from armscan.volumes import LabelVolume
+
+
+def make_agent(
+    config: DictConfig,
+    env_factory: EnvFactory,
+    volumes: Mapping[str, LabelVolume],
+    *,
+    total_env_steps: int,
+    seed: int,
+    validation: Mapping[str, LabelVolume] | None = None,
+    schedule: Sequence[Segment] = (),
+) -> Agent:
+    """Return the agent, which has learned nothing yet, for environments on these volumes.
+
+    Args:
+        config: Composed configuration.
+        env_factory: Factory of its environments.
+        volumes: Volumes to learn on.
+        total_env_steps: Budget of its training, in environment steps.
+        seed: Seed of all its random numbers.
+        validation: Validation volumes of its training. Default: None, for an agent that does not learn.
+        schedule: Changes of its hyperparameters while it learns. Default: none.
+    """
+    algorithm = make_algorithm(config)
+    env = env_factory.make_env(dict(volumes))
+    setup = AgentSetup(
+        make_envs=_vector_envs(env_factory, volumes),
+        observation_space=env.observation_space,
+        action_names=env.get_wrapper_attr("action_names"),
+        total_env_steps=total_env_steps,
+        seed=seed,
+        compute=build_section(config, "compute", Compute),
+        make_validation_envs=None if validation is None else _vector_envs(env_factory.undeformed(), validation),
+    )
+    agent = algorithm.agent(setup)
+    _check_learner(agent)
+    # All of them now: what one refuses is told before anything is trained.
+    later: list[tuple[int, Any]] = [
+        (start, each.agent(setup)) for start, each in scheduled_algorithms(algorithm, schedule)
+    ]
+    return ScheduledLearner(cast(Learner, agent), later) if later else agent
+
+
+def _vector_envs(env_factory: EnvFactory, volumes: Mapping[str, LabelVolume]) -> VectorEnvFactory:
+    """Return what makes vector environments on these volumes, which the caller resets."""
+    return partial(env_factory.make_vector_env, volumes=dict(volumes), autoreset_mode="Disabled")
+
+
+def _check_learner(agent: Agent) -> None:
+    """Raise `InvalidValueError` if an agent learns, but lacks methods of `Learner`."""
+    if hasattr(agent, "learn") and not isinstance(agent, Learner):
+        missing = [name for name in dir(Learner) if not name.startswith("_") and not hasattr(agent, name)]
+        raise InvalidValueError(
+            f"agent is {type(agent).__name__}, which learns, but it must have all methods of Learner: it has no "
+            f"{listed(missing)}"
+        )
+
+
+def make_algorithm(config: DictConfig) -> Algorithm:
+    """Return the algorithm that makes the agent.
+
+    Raises:
+        InvalidValueError: If the section `agent` describes none, or a hyperparameter is not allowed.
+    """
+    algorithm: Algorithm = instantiate(config.agent, _convert_="object")
+    if not callable(getattr(algorithm, "agent", None)):
+        raise InvalidValueError(
+            f"agent is {algorithm!r}, but it must have the method of Algorithm, agent: give agent._target_ such a class"
+        )
+    return algorithm
