@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from functools import cache
@@ -121,7 +120,7 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
     from rich.filesize import decimal
 
     from armscan.config.command_hints import armscan_command
-    from armscan.runs.prune import plan
+    from armscan.runs.prune import plan, remove_planned
     from armscan.runs.query import find
     from armscan.runs.rows import RunRow, sort_rows
     from armscan.runs.tables import print_plan
@@ -247,33 +246,3 @@ def _open(uri: str) -> Iterator[TrackingStore]:
     client = open_existing_store(uri)
     with store_errors(client.uri):
         yield client
-
-
-def remove_planned(client: TrackingStore, cases: Sequence[Any], what: str) -> int:
-    """Remove the planned files, run by run, and print each outcome; return the exit code."""
-    from rich.filesize import decimal
-
-    from armscan.runs.prune import remove
-    from armscan.runs.run_folder import RunSkippedError
-    from armscan.tracking.client import reason_in
-
-    freed, n_removed, n_failed = 0, 0, 0
-    for case in cases:
-        run_id = case.run.info.run_id
-        if case.left is not None:
-            print(f"{run_id} stays: {case.left}")
-            continue
-        try:
-            note = remove(client, case, what)
-        except RunSkippedError as error:
-            print(f"{run_id} stays: {error}")
-        # An error of one store must not affect the runs of the others.
-        except Exception as error:
-            n_failed += 1
-            reason = f"{error.filename}: {error.strerror}" if isinstance(error, PermissionError) else reason_in(error)
-            print(f"{run_id} is not removed: {reason}", file=sys.stderr)
-        else:
-            freed, n_removed = freed + case.n_bytes, n_removed + 1
-            print(f"{run_id} removed, {decimal(case.n_bytes)}" + (f"; {note}" if note else ""), flush=True)
-    print(f"{what} of {n_removed} of {len(cases)} runs removed, {decimal(freed)}")
-    return 1 if n_failed else 0

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from mlflow.entities import Run
+from rich.filesize import decimal
 
 from armscan.errors import TrackingError
 from armscan.runs.query import experiment_ids, search
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.tracking import TrackingStore, check_version
+from armscan.tracking.client import reason_in
 from armscan.tracking.notes import forget
 from armscan.tracking.run import PARENT_TAG
 from armscan.tracking.sync import ENDED
@@ -77,6 +80,30 @@ def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
             return None
         forget(run_id)
         return None if folder.remove_emptied() else f"{folder.path} stays, with what is not the run's"
+
+
+def remove_planned(client: TrackingStore, items: Sequence[PruneItem], what: str) -> int:
+    """Remove the planned files, run by run, and print each outcome; return the exit code."""
+    freed, n_removed, n_failed = 0, 0, 0
+    for item in items:
+        run_id = item.run.info.run_id
+        if item.left is not None:
+            print(f"{run_id} stays: {item.left}")
+            continue
+        try:
+            note = remove(client, item, what)
+        except RunSkippedError as error:
+            print(f"{run_id} stays: {error}")
+        # What fails for one run must not keep the others.
+        except Exception as error:
+            n_failed += 1
+            reason = f"{error.filename}: {error.strerror}" if isinstance(error, PermissionError) else reason_in(error)
+            print(f"{run_id} is not removed: {reason}", file=sys.stderr)
+        else:
+            freed, n_removed = freed + item.n_bytes, n_removed + 1
+            print(f"{run_id} removed, {decimal(item.n_bytes)}" + (f"; {note}" if note else ""), flush=True)
+    print(f"{what} of {n_removed} of {len(items)} runs removed, {decimal(freed)}")
+    return 1 if n_failed else 0
 
 
 def _folder(run: Run, runs: Mapping[str, Run], sharing: Collection[str] = ()) -> OwnFolder:

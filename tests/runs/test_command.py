@@ -9,8 +9,7 @@ import sys
 import pytest
 from mlflow import MlflowClient
 
-from armscan.cli.runs import remove_planned
-from armscan.runs.prune import plan, remove
+from armscan.runs.prune import plan, remove, remove_planned
 from armscan.runs.query import find
 from armscan.runs.run_folder import RunSkippedError
 from armscan.tracking import open_store
