@@ -1,8 +1,7 @@
 """DBSCAN on a pixel grid, compiled: the same clusters as scikit-learn's.
 
 On a grid the neighbours within eps of a pixel fill a disc (an ellipse where pixels are not square), so neighbour counts
-are sums over the disc's rows, and the clusters are the connected components of core pixels. Core pixels are joined as
-runs: two runs in rows d apart touch when the gap between them is at most the disc's half width at d.
+are sums over the disc's rows, and the clusters are the connected components of core pixels.
 """
 
 from __future__ import annotations
@@ -13,13 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-IntArray = NDArray[np.int64]
-RunArray = NDArray[np.int32]
-# First and last column of each run, and the number of the first run of each row.
-Runs = tuple[RunArray, RunArray, IntArray]
-Pixels = NDArray[np.uint8]
-# Pixels that are looked at together where most are background: the bytes of a 64-bit integer.
-WORD = 8
+from armscan.anatomy.connected_components import WORD, IntArray, Pixels, RunArray, Runs, find_runs, number_runs
 
 
 def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -> IntArray:
@@ -77,66 +70,6 @@ def _find_core(mask: Pixels, stride: int, margin: int, half_widths: IntArray, mi
         for i in range(n_pixels):
             core[i] = inside[i] & np.uint8(of_pixels[i] >= fewest)
     return core
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _find_runs(core: Pixels, n_cols: int, are_joined: bool) -> Runs:
-    """Return the runs of core pixels; each pixel is a run of its own where neighbours in a row are not joined."""
-    n_rows = core.shape[0]
-    capacity = n_rows * (n_cols // 2 + 1 if are_joined else n_cols)
-    starts, stops = np.empty(capacity, dtype=np.int32), np.empty(capacity, dtype=np.int32)
-    first_run = np.zeros(n_rows + 1, dtype=np.int64)
-    n_runs = 0
-    words = core.view(np.uint64)
-    for row in range(n_rows):
-        line = core[row]
-        for word in range(words.shape[1]):
-            if words[row, word] == 0:
-                continue
-            for col in range(WORD * word, WORD * word + WORD):
-                if line[col]:
-                    if not are_joined or col == 0 or not line[col - 1]:
-                        starts[n_runs] = col
-                        n_runs += 1
-                    stops[n_runs - 1] = col
-        first_run[row + 1] = n_runs
-    return starts[:n_runs], stops[:n_runs], first_run
-
-
-@numba.njit(cache=True, nogil=True)
-def _find_root(parents: IntArray, run: int) -> int:
-    while parents[run] != run:
-        parents[run] = parents[parents[run]]
-        run = parents[run]
-    return run
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _number_runs(runs: Runs, half_widths: IntArray) -> tuple[RunArray, int]:
-    """Return the cluster of each run, from 0 in the order of the clusters' first runs, and how many there are."""
-    starts, stops, first_run = runs
-    n_rows, n_runs = first_run.size - 1, starts.size
-    parents = np.arange(n_runs)
-    for row in range(n_rows):
-        for run in range(first_run[row], first_run[row + 1]):
-            for other_row in range(row, min(n_rows, row + half_widths.size)):
-                width = half_widths[other_row - row]
-                for other in range(max(run + 1, first_run[other_row]), first_run[other_row + 1]):
-                    if starts[other] > stops[run] + width:
-                        break
-                    if stops[other] >= starts[run] - width:
-                        a, b = _find_root(parents, run), _find_root(parents, other)
-                        # The root is the earliest run, so roots come in the order of the clusters' first core pixels.
-                        parents[max(a, b)] = min(a, b)
-    numbers = np.empty(n_runs, dtype=np.int32)
-    n_clusters = 0
-    for run in range(n_runs):
-        if parents[run] == run:
-            numbers[run] = n_clusters
-            n_clusters += 1
-        else:
-            numbers[run] = numbers[parents[run]]
-    return numbers, n_clusters
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -223,8 +156,8 @@ def _cluster(
         flat_core = _find_core(flat, stride, margin, half_widths, min_samples, np.uint32(0))
     core = flat_core.reshape((n_rows, stride))
     # Below an eps of one column not even the next pixel is a neighbour, and every run is a single pixel.
-    runs = _find_runs(core, n_cols, pad >= 1)
-    numbers, n_clusters = _number_runs(runs, half_widths)
+    runs = find_runs(core, n_cols, pad >= 1)
+    numbers, n_clusters = number_runs(runs, half_widths)
     clusters = _reached((n_rows, n_cols), runs, numbers, half_widths, n_clusters)
     sums = np.zeros((n_clusters + 1, 3), dtype=np.int64)
     words = mask.view(np.uint64)

@@ -11,10 +11,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.anatomy.clustering import WORD, IntArray, Pixels, bounding_boxes, summarise_label
+from armscan.anatomy.clustering import bounding_boxes, summarise_label
+from armscan.anatomy.connected_components import WORD, IntArray, Pixels
 from armscan.anatomy.landmarks import Landmarks
 from armscan.anatomy.tissues import N_TISSUES, Tissues
-from armscan.volumes.plane import NO_MAPS, FloatArray, ManipulatorAction, mapped_plane
+from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.volumes.rigid_transform import NO_MAPS, mapped_plane
 from armscan.volumes.slicing import sample_plane
 from armscan.volumes.volume import LabelVolume
 

@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from armscan.anatomy.clustering import IntArray, count_disc_pixels, disc_half_widths
+from armscan.anatomy.clustering import count_disc_pixels, disc_half_widths
+from armscan.anatomy.connected_components import IntArray
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_float, check_int, check_numbers
 

@@ -13,7 +13,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from armscan.envs.observations import View
 from armscan.volumes import LANDMARK_LABELS
-from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
+from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.volumes.rigid_transform import RigidTransform
 from armscan.volumes.volume import LabelVolume
 
 BACKGROUND = (18, 20, 26)

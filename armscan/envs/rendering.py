@@ -25,7 +25,8 @@ from armscan.envs.panels import (
     slice_panel,
 )
 from armscan.volumes import LABEL_NAMES, LabelVolume
-from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance
+from armscan.volumes.plane import ManipulatorAction, plane_distance
+from armscan.volumes.rigid_transform import RigidTransform
 
 WIDTH, HEIGHT = 860, 512
 # (left, top, right, bottom)

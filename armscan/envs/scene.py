@@ -11,15 +11,8 @@ from armscan.envs.actions import ActionBounds
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.utils.validation import check_bool, check_choice, check_float
 from armscan.volumes.deformation import DeformingTransform
-from armscan.volumes.plane import (
-    NO_MAPS,
-    FloatArray,
-    ManipulatorAction,
-    RigidTransform,
-    mapped_plane,
-    plane_distance,
-    shift_into,
-)
+from armscan.volumes.plane import FloatArray, ManipulatorAction, plane_distance, shift_into
+from armscan.volumes.rigid_transform import NO_MAPS, RigidTransform, mapped_plane
 from armscan.volumes.volume import LabelVolume
 
 MAX_SHIFT_MM = 10_000.0

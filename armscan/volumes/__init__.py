@@ -6,8 +6,9 @@ from armscan.volumes.labelmap import LABEL_NAMES, LANDMARK_LABELS, LabelMap
 from armscan.volumes.manifest import MANIFEST_NAMES, record_planes
 from armscan.volumes.markups import read_markup, write_markup
 from armscan.volumes.phantom import load_phantom, load_phantoms, make_phantom
-from armscan.volumes.plane import ManipulatorAction, RigidTransform, plane_distance, shift_into
+from armscan.volumes.plane import ManipulatorAction, plane_distance, shift_into
 from armscan.volumes.reading import read_volume
+from armscan.volumes.rigid_transform import RigidTransform
 from armscan.volumes.summary import VolumeReport
 from armscan.volumes.volume import LabelVolume
 

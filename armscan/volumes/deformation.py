@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from armscan.errors import InvalidValueError
-from armscan.volumes.plane import FloatArray, ManipulatorAction, RigidTransform
+from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.volumes.rigid_transform import RigidTransform
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,4 +1,4 @@
-"""The slicing plane and the rigid motions it is moved by, in the volume's own frame (mm, axes along the array)."""
+"""The slicing plane in the volume's own frame (mm, axes along the array), and the distance between two planes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_numbers
 
 FloatArray = NDArray[np.float64]
-LARGEST_SHIFT_MM = 1e6
-# The maps of a volume as it was read; see `RigidTransform.maps`.
-NO_MAPS = np.empty((0, 3, 4))
 
 
 @numba.njit(cache=True)
@@ -30,33 +26,6 @@ def rotation_matrix(rz_deg: float, rx_deg: float) -> FloatArray:
     matrix[1, 0], matrix[1, 1], matrix[1, 2] = sin_z, cos_z * cos_x, -cos_z * sin_x
     matrix[2, 0], matrix[2, 1], matrix[2, 2] = 0.0, sin_x, cos_x
     return matrix
-
-
-@numba.njit(cache=True)
-def _composed(
-    outer: FloatArray, outer_mm: FloatArray, inner: FloatArray, inner_mm: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return (M, b) of the affine map p -> outer (inner p + inner_mm) + outer_mm."""
-    matrix, offset_mm = np.zeros((3, 3)), np.zeros(3)
-    for i in range(3):
-        for k in range(3):
-            offset_mm[i] += outer[i, k] * inner_mm[k]
-            for j in range(3):
-                matrix[i, j] += outer[i, k] * inner[k, j]
-        offset_mm[i] += outer_mm[i]
-    return matrix, offset_mm
-
-
-@numba.njit(cache=True)
-def mapped_plane(
-    maps: FloatArray, rotation: tuple[float, float], translation: tuple[float, float]
-) -> tuple[FloatArray, FloatArray]:
-    """Return (M, b) of a plane p -> Rz(rz) Rx(rx) p + (tx, ty, 0), taken through `RigidTransform.maps`."""
-    matrix, offset_mm = rotation_matrix(rotation[0], rotation[1]), np.zeros(3)
-    offset_mm[0], offset_mm[1] = translation
-    for i in range(maps.shape[0] - 1, -1, -1):
-        matrix, offset_mm = _composed(maps[i, :, :3], maps[i, :, 3], matrix, offset_mm)
-    return matrix, offset_mm
 
 
 @dataclass(frozen=True)
@@ -113,79 +82,6 @@ class ManipulatorAction:
     def normal(self) -> FloatArray:
         """The plane's unit normal, the image of the Y axis."""
         return self.matrix[:, 1]
-
-
-@dataclass(frozen=True)
-class RigidTransform:
-    """A rigid motion T(q) = R (q - c) + c + t of the volume's frame; the moved volume is V'(q) = V(T(q)).
-
-    Args:
-        rotation: Angles (rz, rx) in degrees; R = Rz(rz) Rx(rx).
-        translation: Offsets t = (tx, ty) in mm; the depth does not change.
-        centre_mm: Fixed point c of the rotation, in mm.
-
-    Raises:
-        InvalidValueError: If a component is not a finite number, or one in mm is beyond 1e6.
-    """
-
-    rotation: tuple[float, float] = (0.0, 0.0)
-    translation: tuple[float, float] = (0.0, 0.0)
-    centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        check_numbers("rotation", self.rotation, 2, "(rz, rx) in degrees")
-        shift_mm = check_numbers("translation", self.translation, 2, "(tx, ty) in mm")
-        centre_mm = check_numbers("centre_mm", self.centre_mm, 3, "(x, y, z) in mm")
-        # The differences of numbers much larger are no numbers any more.
-        if max(map(abs, shift_mm + centre_mm)) > LARGEST_SHIFT_MM:
-            raise InvalidValueError(
-                f"translation is {shift_mm} and centre_mm is {centre_mm}, but each must be within "
-                f"+-{LARGEST_SHIFT_MM:g} mm"
-            )
-
-    @cached_property
-    def matrix(self) -> FloatArray:
-        """R, 3 x 3."""
-        return rotation_matrix(*self.rotation)
-
-    @cached_property
-    def offset_mm(self) -> FloatArray:
-        """The b of the affine form T(q) = R q + b."""
-        centre_mm: FloatArray = np.asarray(self.centre_mm)
-        offset_mm: FloatArray = centre_mm + np.array([*self.translation, 0.0]) - self.matrix @ centre_mm
-        return offset_mm
-
-    @cached_property
-    def maps(self) -> FloatArray:
-        """The affine maps (A | b) that take a point into the unmoved volume, the last one first, shape (n, 3, 4)."""
-        return np.column_stack([self.matrix, self.offset_mm])[None]
-
-    def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
-        """Return (M, b) with T(plane(p)) = M p + b: from the plane's frame into the unmoved volume."""
-        return mapped_plane(self.maps, action.rotation, action.translation)
-
-    def inverse_plane(self, action: ManipulatorAction) -> ManipulatorAction:
-        """Return the plane of the moved volume that shows the same slice as `action` in the unmoved one.
-
-        The result is the same set of points. Where the motion turns about X as well, the picture may be turned and
-        shifted within the plane, because a `ManipulatorAction` has neither a rotation about Y nor a shift in depth.
-
-        Raises:
-            InvalidValueError: If the moved plane never meets the volume's floor z = 0, where every plane begins.
-        """
-        n_x, n_y, n_z = (self.matrix.T @ action.normal).tolist()
-        x_mm, y_mm, z_mm = (self.matrix.T @ (action.offset_mm - self.offset_mm)).tolist()
-        rx, rz = math.asin(min(max(n_z, -1.0), 1.0)), math.atan2(-n_x, n_y)
-        # The same plane has two descriptions; the one on the same side as `action` keeps the picture upright.
-        if math.cos(math.radians(action.rotation[1])) < 0:
-            rx, rz = math.pi - rx, math.atan2(n_x, -n_y)
-        rotation = wrap_deg(math.degrees(rz)), wrap_deg(math.degrees(rx))
-        if z_mm != 0.0:
-            in_depth_x, in_depth_y, in_depth_z = rotation_matrix(*rotation)[:, 2].tolist()
-            if abs(in_depth_z) < 1e-9:
-                raise InvalidValueError(f"{action}, moved by {self}, lies parallel to the volume's floor and above it")
-            x_mm, y_mm = x_mm - z_mm / in_depth_z * in_depth_x, y_mm - z_mm / in_depth_z * in_depth_y
-        return ManipulatorAction.of_finite(rotation, (x_mm, y_mm))
 
 
 def wrap_deg(angle_deg: float) -> float:

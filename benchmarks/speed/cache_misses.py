@@ -26,7 +26,7 @@ from numba.core.codegen import get_host_cpu_features
 
 from armscan.anatomy import PIXEL_TISSUES, Scanner
 from armscan.volumes import LabelVolume, load_phantoms
-from armscan.volumes.plane import mapped_plane
+from armscan.volumes.rigid_transform import mapped_plane
 from armscan.volumes.slicing import sample_plane
 
 BATCH = 16

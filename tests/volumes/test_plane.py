@@ -1,4 +1,4 @@
-"""The plane, the motions of a volume, and the distance between planes."""
+"""The plane, and the distance between planes."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from armscan.errors import InvalidValueError
-from armscan.volumes import ManipulatorAction, RigidTransform, plane_distance, shift_into
+from armscan.volumes import ManipulatorAction, plane_distance, shift_into
 from armscan.volumes.plane import wrap_deg
 
 moderate_deg = st.floats(-80, 80)
@@ -22,46 +22,16 @@ def test_action_refuses_what_is_not_two_finite_numbers(bad):
         ManipulatorAction((0.0, 0.0), bad)
 
 
-@pytest.mark.parametrize("bad", [{"rotation": 3}, {"translation": (1, 2, 3)}, {"centre_mm": (1, 2)}])
-def test_transform_refuses_what_is_not_finite_numbers(bad):
-    with pytest.raises(InvalidValueError, match=f"{next(iter(bad))} is"):
-        RigidTransform(**bad)
-
-
 @pytest.mark.parametrize("components", [None, (1, 2, 3), (1, 2, 3, float("nan"))])
 def test_action_from_array_refuses_what_is_not_four_numbers(components):
     with pytest.raises(InvalidValueError, match="components is"):
         ManipulatorAction.from_array(components)
 
 
-def test_inverse_plane_refuses_a_plane_that_never_meets_the_floor():
-    with pytest.raises(InvalidValueError, match="parallel to the volume's floor"):
-        RigidTransform((0.0, 180.0), centre_mm=(0.0, 0.0, 5.0)).inverse_plane(
-            ManipulatorAction((0.0, 90.0), (0.0, 0.0))
-        )
-
-
 def test_action_matrix_turns_about_x_first_and_z_second():
     matrix = ManipulatorAction((90.0, 90.0), (0.0, 0.0)).matrix
     np.testing.assert_allclose(matrix @ [0, 0, 1], [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(matrix @ [1, 0, 0], [0, 1, 0], atol=1e-12)
-
-
-@given(actions, st.tuples(moderate_deg, st.floats(-5, 5), any_mm, any_mm))
-def test_inverse_plane_is_mapped_onto_the_plane(action, moved):
-    transform = RigidTransform(moved[:2], moved[2:], (30.0, 100.0, 20.0))
-    inverse = transform.inverse_plane(action)
-    matrix, offset_mm = transform.plane_map(inverse)
-    np.testing.assert_allclose(abs(matrix[:, 1] @ action.normal), 1.0, atol=1e-9)
-    np.testing.assert_allclose(action.normal @ (offset_mm - action.offset_mm), 0.0, atol=1e-6)
-
-
-@given(actions, st.tuples(moderate_deg, any_mm, any_mm))
-def test_inverse_plane_of_a_turn_about_z_shows_the_same_picture(action, moved):
-    transform = RigidTransform((moved[0], 0.0), moved[1:], (30.0, 100.0, 20.0))
-    matrix, offset_mm = transform.plane_map(transform.inverse_plane(action))
-    np.testing.assert_allclose(matrix, action.matrix, atol=1e-9)
-    np.testing.assert_allclose(offset_mm, action.offset_mm, atol=1e-6)
 
 
 @given(actions, st.tuples(st.floats(0, 100), st.floats(0, 100)))
