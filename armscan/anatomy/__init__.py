@@ -7,6 +7,7 @@ from armscan.anatomy.rewards import (
     AgreementReward,
     LandmarkReward,
     Reward,
+    check_reward,
     check_targets,
     landmark_reward,
 )
@@ -40,6 +41,7 @@ __all__ = [
     "Tissue",
     "TissueClusters",
     "Tissues",
+    "check_reward",
     "check_targets",
     "check_tissues",
     "find_optimal_plane",

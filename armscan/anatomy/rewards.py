@@ -216,3 +216,15 @@ def check_targets(targets: Sequence[int]) -> tuple[int, int, int]:
     """Return the targets as a tuple of three ints, each from 1 to 1000."""
     bones, tendons, artery = check_ints("targets", targets, 3, "(bones, tendons, artery)", at_least=1, at_most=1000)
     return bones, tendons, artery
+
+
+def check_reward(reward: Reward | None, targets: Sequence[int]) -> Reward:
+    """Return a reward given as such, or by the targets of the published one."""
+    targets = check_targets(targets)
+    if reward is None:
+        return LandmarkReward(targets)
+    if targets != PUBLISHED_TARGETS:
+        raise InvalidValueError(f"targets is {targets} beside a reward of its own, but only one of both may be given")
+    if isinstance(reward, type) or not all(callable(getattr(reward, name, None)) for name in ("fit", "score")):
+        raise InvalidValueError(f"reward is {reward!r}, but it must be an object with the methods of Reward")
+    return reward

@@ -8,10 +8,10 @@ from typing import Any, TypeVar
 
 from gymnasium.vector import VectorEnv
 
-from armscan.anatomy import PUBLISHED_TARGETS, check_tissues
+from armscan.anatomy import PUBLISHED_TARGETS, check_reward, check_tissues
 from armscan.envs.env import ArmscanEnv
 from armscan.envs.history import MOST_KEPT, boxes_of, check_exclusions
-from armscan.envs.rules import Rules, Volumes, check_reward
+from armscan.envs.rules import Rules, Volumes
 from armscan.envs.scene import RandomTransform
 from armscan.envs.vector_env import ArmscanVectorEnv
 from armscan.envs.wrappers import BestActionMemory, Env, FrameStack, VectorBestActionMemory, VectorFrameStack

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from armscan.anatomy import (
     PUBLISHED_TARGETS,
-    LandmarkReward,
     Landmarks,
     Reward,
     Scanner,
     Tissues,
-    check_targets,
+    check_reward,
     check_tissues,
 )
 from armscan.envs.actions import COMPONENTS, STOP, ActionBounds, free_components
@@ -243,15 +242,3 @@ def named_volumes(volumes: Volumes) -> dict[str, LabelVolume]:
     if len(named) < len(given):
         raise InvalidValueError(f"volumes holds two of the same name among {listed(v.name for _, v in given)}")
     return named
-
-
-def check_reward(reward: Reward | None, targets: Sequence[int]) -> Reward:
-    """Return a reward given as such, or by the targets of the published one."""
-    targets = check_targets(targets)
-    if reward is None:
-        return LandmarkReward(targets)
-    if targets != PUBLISHED_TARGETS:
-        raise InvalidValueError(f"targets is {targets} beside a reward of its own, but only one of both may be given")
-    if isinstance(reward, type) or not all(callable(getattr(reward, name, None)) for name in ("fit", "score")):
-        raise InvalidValueError(f"reward is {reward!r}, but it must be an object with the methods of Reward")
-    return reward

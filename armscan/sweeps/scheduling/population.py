@@ -238,8 +238,9 @@ def _perturb(value: Any, distribution: BaseDistribution, rng: np.random.Generato
     is_up = bool(rng.integers(2))
     if isinstance(distribution, CategoricalDistribution):
         choices = distribution.choices
-        beside = [place for place in _beside(choices.index(value)) if 0 <= place < len(choices)]
-        return choices[beside[is_up % len(beside)]] if beside else value
+        place = choices.index(value)
+        beside = [*choices[max(0, place - 1) : place], *choices[place + 1 : place + 2]]
+        return beside[is_up % len(beside)] if beside else value
     limits = cast(Any, distribution)
     moved = value * FACTORS[is_up]
     if limits.step:
@@ -249,7 +250,3 @@ def _perturb(value: Any, distribution: BaseDistribution, rng: np.random.Generato
         moved = limits.low + n_steps * limits.step
     moved = min(max(moved, limits.low), limits.high)
     return int(moved) if isinstance(distribution, IntDistribution) else float(moved)
-
-
-def _beside(place: int) -> tuple[int, int]:
-    return place - 1, place + 1

@@ -205,11 +205,16 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
         attempt.opened(None)
     if pruned is not None:
         raise pruned
+    return _metrics(attempt, setup.budget, result) | concluded
+
+
+def _metrics(attempt: Attempt, budget: Budget, result: TrainingResult) -> dict[str, float]:
+    """Return the metrics of a training, without what it has inherited from another trial."""
     before = inherited(attempt, result.reports)
-    best = best_of_generation(result.reports, before, setup.budget.best_by).evaluation.metrics()
+    best = best_of_generation(result.reports, before, budget.best_by).evaluation.metrics()
     n_before, before_s = (before.n_env_steps, before.wall_s) if before is not None else (0, 0.0)
     measured = (result.reports[-1].n_env_steps - n_before, result.wall_s - before_s, float(result.is_solved))
-    return best | dict(zip(TRAINING_METRICS, measured, strict=True)) | concluded
+    return best | dict(zip(TRAINING_METRICS, measured, strict=True))
 
 
 def _begun(
