@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -22,15 +21,14 @@ from armscan.experiment.provenance import place_tags, start_tracking, volume_tag
 from armscan.experiment.results import RunResult
 from armscan.experiment.runner import VIDEO_SEED, log_result, train_agent
 from armscan.stats.bootstrap import interquartile_mean
-from armscan.sweeps.scheduling.state import ENV_STEPS
 from armscan.sweeps.tasks.attempt import STUDY_TAG, Attempt, volumes_of
-from armscan.sweeps.tasks.generation import begin_generation, best_of_generation, inherited
+from armscan.sweeps.tasks.generation import begin_generation
+from armscan.sweeps.tasks.reporter import TRAINING_METRICS, Reporter
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, run_of_study, take_over
 from armscan.tracking.run import PARENT_TAG
 from armscan.training import (
     TEST,
     VALIDATION,
-    Budget,
     EpochReport,
     Evaluation,
     TrainingResult,
@@ -44,51 +42,7 @@ from armscan.utils.retry import RETRY_S
 
 # First seed of the episodes that candidates are compared by, which are played for nothing else.
 SELECTION_SEED = 7 * 10**6
-# Of each training, beside the metrics of its best validation.
-TRAINING_METRICS = (ENV_STEPS, "training_s", "solved")
 Conclude = Callable[[Experiment, TrainingResult, TrackedRun, Path], dict[str, float]]
-
-
-@dataclass
-class _Reporter:
-    """A training callback that reports to the study, with the reports of an earlier attempt."""
-
-    attempt: Attempt
-    seed: int
-    budget: Budget
-    reports: list[EpochReport] = field(default_factory=list)
-
-    def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        for report in earlier:
-            self.on_epoch(report)
-
-    def on_epoch(self, report: EpochReport) -> None:
-        self.reports.append(report)
-        before = inherited(self.attempt, self.reports)
-        if before is not None and report.epoch <= before.epoch:
-            return
-        grid = self.budget.eval_every_env_steps
-        # On the grid: how far the environments of a vector step beyond it says nothing of a trial.
-        so_far = dict(zip(TRAINING_METRICS, (report.n_env_steps // grid * grid, report.wall_s, 0.0), strict=True))
-        self.attempt.report(
-            self._validation().metrics() | so_far,
-            seed=self.seed,
-            n_env_steps=report.n_env_steps,
-            grid=grid,
-            total=self.budget.env_steps,
-            n_inherited=before.n_env_steps if before is not None else 0,
-        )
-
-    def _validation(self) -> Evaluation:
-        """Return the last validation; with several objectives the best, as if the training ended now.
-
-        Pruners of one objective take the best report themselves.
-        """
-        several = len(self.attempt.objectives) > 1
-        return [report for report in self.reports if report.is_best or not several][-1].evaluation
-
-    def on_end(self) -> None:
-        pass
 
 
 class TrainingTask:
@@ -174,7 +128,7 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
     setup = set_up(config)
     folder = attempt.folder / f"seed_{seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    reporter = _Reporter(attempt, seed, setup.budget)
+    reporter = Reporter(attempt, seed, setup.budget)
     pruned, concluded = None, {}
     with folder_lock(folder):
         setup, tracked, earlier = _begun(attempt, seed, setup, config, choices, folder)
@@ -205,16 +159,7 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
         attempt.opened(None)
     if pruned is not None:
         raise pruned
-    return _metrics(attempt, setup.budget, result) | concluded
-
-
-def _metrics(attempt: Attempt, budget: Budget, result: TrainingResult) -> dict[str, float]:
-    """Return the metrics of a training, without what it has inherited from another trial."""
-    before = inherited(attempt, result.reports)
-    best = best_of_generation(result.reports, before, budget.best_by).evaluation.metrics()
-    n_before, before_s = (before.n_env_steps, before.wall_s) if before is not None else (0, 0.0)
-    measured = (result.reports[-1].n_env_steps - n_before, result.wall_s - before_s, float(result.is_solved))
-    return best | dict(zip(TRAINING_METRICS, measured, strict=True))
+    return reporter.metrics(result) | concluded
 
 
 def _begun(

@@ -1,0 +1,73 @@
+"""What a training of a trial reports to its study."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from armscan.sweeps.scheduling.state import ENV_STEPS
+from armscan.sweeps.tasks.attempt import Attempt
+from armscan.sweeps.tasks.generation import best_of_generation, inherited
+from armscan.training import Budget, EpochReport, Evaluation, TrainingResult
+
+# Of each training, beside the metrics of its best validation.
+TRAINING_METRICS = (ENV_STEPS, "training_s", "solved")
+
+
+@dataclass
+class Reporter:
+    """A training callback that reports to the study, with the reports of an earlier attempt.
+
+    Args:
+        attempt: The attempt at the trial.
+        seed: Seed of the training.
+        budget: Budget of the training.
+        reports: Reports of its epochs so far. Default: none.
+    """
+
+    attempt: Attempt
+    seed: int
+    budget: Budget
+    reports: list[EpochReport] = field(default_factory=list)
+
+    def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
+        """Report the epochs of an earlier attempt."""
+        for report in earlier:
+            self.on_epoch(report)
+
+    def on_epoch(self, report: EpochReport) -> None:
+        """Report the validation of an epoch, unless the trial has it from its parent."""
+        self.reports.append(report)
+        before = inherited(self.attempt, self.reports)
+        if before is not None and report.epoch <= before.epoch:
+            return
+        grid = self.budget.eval_every_env_steps
+        # On the grid: how far the environments of a vector step beyond it says nothing of a trial.
+        so_far = dict(zip(TRAINING_METRICS, (report.n_env_steps // grid * grid, report.wall_s, 0.0), strict=True))
+        self.attempt.report(
+            self._validation().metrics() | so_far,
+            seed=self.seed,
+            n_env_steps=report.n_env_steps,
+            grid=grid,
+            total=self.budget.env_steps,
+            n_inherited=before.n_env_steps if before is not None else 0,
+        )
+
+    def on_end(self) -> None:
+        """Report nothing: `metrics` has what the training has reached."""
+
+    def metrics(self, result: TrainingResult) -> dict[str, float]:
+        """Return the metrics of the ended training, without what it has inherited from another trial."""
+        before = inherited(self.attempt, result.reports)
+        best = best_of_generation(result.reports, before, self.budget.best_by).evaluation.metrics()
+        n_before, before_s = (before.n_env_steps, before.wall_s) if before is not None else (0, 0.0)
+        measured = (result.reports[-1].n_env_steps - n_before, result.wall_s - before_s, float(result.is_solved))
+        return best | dict(zip(TRAINING_METRICS, measured, strict=True))
+
+    def _validation(self) -> Evaluation:
+        """Return the last validation; with several objectives the best, as if the training ended now.
+
+        Pruners of one objective take the best report themselves.
+        """
+        several = len(self.attempt.objectives) > 1
+        return [report for report in self.reports if report.is_best or not several][-1].evaluation
