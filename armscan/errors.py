@@ -134,5 +134,5 @@ def few(names: Iterable[object], most: int = 4) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text that is safe to show in a terminal: control characters are spelled out."""
+    """Return a string that is safe to show in a terminal: control characters are spelled out."""
     return CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)

@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import nbformat
@@ -18,6 +19,7 @@ from armscan.cli.main import armscan as program
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 # In the place of what a user fills in.
 PLACEHOLDERS = {
     "FOLDER": ".",
@@ -226,8 +228,20 @@ def test_readme_is_short():
     assert len((ROOT / "README.md").read_text().split()) <= 800
 
 
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_on_the_site_load_nothing_from_elsewhere(notebook, monkeypatch):
+    monkeypatch.syspath_prepend(DOCS / "_ext")
+    from_this_site = import_module("local_plotly").from_this_site
+    outputs = [output for cell in nbformat.read(notebook, as_version=4).cells for output in cell.get("outputs", [])]
+    charts = [html for output in outputs if "plotly" in (html := output.get("data", {}).get("text/html", "").lower())]
+    assert charts
+    for chart in charts:
+        assert "https://cdn" in chart
+        assert not re.search(r"""(src=|import )["']https?:""", from_this_site(chart))
+
+
 @pytest.mark.full
-@pytest.mark.parametrize("notebook", sorted((DOCS / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run_as_they_stand(notebook, tmp_path):
     cells = nbformat.read(notebook, as_version=4)
     assert all(cell.get("outputs", True) for cell in cells.cells[-1:]), "outputs are kept with the notebook"

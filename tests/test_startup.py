@@ -65,7 +65,7 @@ def test_runs_are_listed_and_compared_without_a_library_of_learning(tmp_path):
     (tmp_path / "mlruns.db").touch()
     codes, said, modules = after(tmp_path, "runs list", "report --runs abcd", "evaluate abcd")
     assert codes == [2, 2, 2]
-    assert said.count("no store of MLflow") == 3
+    assert said.count("not an MLflow store") == 3
     assert not LEARNING & modules
 
 

@@ -12,7 +12,7 @@ from armscan.agents.mlp_kernels import Adam, Floats, Weights
 
 
 class AdamVectors:
-    """The weights that an optimiser moves, and its state, as vectors of which torch's tensors are views.
+    """Weights and optimiser state as flat vectors; torch's tensors are views of them.
 
     Network, optimiser and compiled code share this memory: each sees the changes of the others, and torch and compiled
     code may take gradient steps in turn.
@@ -59,7 +59,7 @@ class AdamVectors:
 
 
 def flattened(parameters: list[nn.Parameter]) -> Floats:
-    """Return the values of parameters as one vector, of which they become views."""
+    """Copy parameters into one vector, make them views of it, and return it."""
     vector: Floats = torch.cat([each.detach().reshape(-1) for each in parameters]).numpy()
     for parameter, view in zip(parameters, _views(vector, parameters), strict=True):
         parameter.data = view

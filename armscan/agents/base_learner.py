@@ -17,7 +17,11 @@ from armscan.errors import CheckpointError, DivergedError
 
 
 class BaseLearner(ABC):
-    """A network and what its epochs begin from; `setup` is the agent's."""
+    """Base of learners: a network, with its seed, budget, number of epochs and device.
+
+    Args:
+        setup: Setup of the agent.
+    """
 
     _network: nn.Module
 
@@ -58,7 +62,7 @@ class BaseLearner(ABC):
 
 
 class SupervisedLearner(BaseLearner):
-    """A learner of one network that the environments teach the optimal planes of their episodes.
+    """Learner of one network, supervised with the labelled planes of the episodes.
 
     Every epoch begins with new episodes and draws everything from `seed` and its own number, so that it continues from
     its state bit for bit.
@@ -149,7 +153,7 @@ class SupervisedLearner(BaseLearner):
 
 
 def teacher_of(envs: Any) -> ArmscanVectorEnv:
-    """Return the environments that say where the optimal planes lie."""
+    """Return the environments that tell a supervised learner the labelled planes."""
     assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
     return envs.unwrapped
 

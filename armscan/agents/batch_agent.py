@@ -18,7 +18,7 @@ from armscan.volumes.plane import FloatArray
 
 @runtime_checkable
 class BatchAgent(Protocol):
-    """Chooses planes in many episodes at once: bit for bit those that it chooses when it plays each episode alone."""
+    """Agent that plays many episodes at once; its planes are, bit for bit, those of each episode played alone."""
 
     def begin_all(self, *, seeds: Sequence[int], bounds: Sequence[ActionBounds]) -> None:
         """Begin an episode for each seed; see `Agent.begin`."""
@@ -34,7 +34,7 @@ class BatchAgent(Protocol):
 
 
 class OneAtATime:
-    """Plays each episode with a copy of an agent that acts in one at a time.
+    """Batch agent made of copies of an agent, one for each episode.
 
     Args:
         agent: Agent to copy; it does not change.
@@ -59,5 +59,5 @@ class OneAtATime:
 
 
 def batch_agent(agent: Agent) -> BatchAgent:
-    """Return an agent that plays episodes side by side as the given one plays them one after another."""
+    """Return an agent that plays many episodes at once: the given one, or copies of it, one for each episode."""
     return agent if isinstance(agent, BatchAgent) else OneAtATime(agent)

@@ -13,7 +13,7 @@ CONVOLUTIONS = ((8, 4), (4, 2), (3, 1))
 
 
 def smallest_side_px() -> int:
-    """Return the smallest side, in pixels, of an image of which the convolutions leave a pixel."""
+    """Return the smallest image side, in pixels, of which the convolutions leave at least one pixel."""
     side = 1
     for kernel, stride in reversed(CONVOLUTIONS):
         side = (side - 1) * stride + kernel
@@ -31,7 +31,7 @@ def images_of(space: spaces.Space[Any]) -> dict[str, spaces.Box]:
 
 
 def count_features(box: spaces.Box, filters: Sequence[int]) -> int:
-    """Return how many numbers the convolutions make of an image."""
+    """Return the number of features that the convolutions compute from an image."""
     sides = np.array(box.shape[-2:])
     for kernel, stride in CONVOLUTIONS:
         sides = (sides - kernel) // stride + 1

@@ -96,7 +96,7 @@ def _decode(joined: Pixels, ends: NDArray[np.uint64], pixels: Pixels) -> None:
 
 
 class FrameStore:
-    """Frames of `n_pixels` by id, each for as long as something refers to it."""
+    """Frames of `n_pixels` by ID, each for as long as something refers to it."""
 
     def __init__(self, n_pixels: int) -> None:
         self._n_pixels = n_pixels
@@ -144,12 +144,12 @@ class FrameStore:
                 self._free.append(frame_id)
 
     def decode(self, ids: NDArray[np.int32]) -> Pixels:
-        """Return the frames of these ids, shape (*ids.shape, n_pixels)."""
+        """Return the frames of these IDs, shape (*ids.shape, n_pixels)."""
         frames = [self._frames[frame_id] for frame_id in ids.ravel().tolist()]
         return decode(frames, self._n_pixels).reshape(*ids.shape, self._n_pixels)
 
     def state(self) -> dict[str, Any]:
-        """Return all frames, joined, and which ids are free, as tensors."""
+        """Return all frames, joined, and which IDs are free, as tensors."""
         return {
             "joined": torch.from_numpy(np.frombuffer(bytearray().join(self._frames), dtype=np.uint8)),
             "lengths": torch.tensor([len(frame) for frame in self._frames]),

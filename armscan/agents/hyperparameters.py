@@ -79,7 +79,7 @@ def buffer_capacity(buffer_size: int, num_envs: int, setup: AgentSetup) -> int:
 
 
 def check_collection(n_asked: int, num_envs: int, setup: AgentSetup, *, learning_starts: int = 0) -> int:
-    """Return the environment steps of one collection, if the training has as many.
+    """Return the environment steps of one collection, rounded up to a multiple of `num_envs`.
 
     Args:
         n_asked: Requested number of environment steps.
@@ -88,7 +88,7 @@ def check_collection(n_asked: int, num_envs: int, setup: AgentSetup, *, learning
         learning_starts: Number of environment steps before the first collection.
 
     Raises:
-        InvalidValueError: If it has not.
+        InvalidValueError: If the training has fewer steps.
     """
     n_collected, n_left = round_up(n_asked, num_envs), setup.total_env_steps - learning_starts
     if n_collected > n_left:

@@ -130,7 +130,7 @@ class _ImageStore:
         self._last: list[Seen] = [[] for _ in range(self._n_envs)]
 
     def take_in(self, env: int, image: Pixels, image_next: Pixels) -> tuple[list[int], list[int]]:
-        """Store the images of a transition; return the ids of their frames."""
+        """Store the images of a transition; return the IDs of their frames."""
         seen = list(self._last[env])
         ids, ids_next = (self._ids(part.reshape(self._n_frames, -1), seen) for part in (image, image_next))
         self.frames.hold(ids + ids_next)

@@ -27,7 +27,7 @@ Bounded = Callable[[torch.Tensor], torch.Tensor]
 
 @numba.njit(cache=True, nogil=True)
 def linear_rows(rows: Rows, weights: Rows, bias: Rows) -> Rows:
-    """Return `rows @ weights.T + bias`; each number is summed alone, in the order of the inputs, from its bias on.
+    """Return `rows @ weights.T + bias`; each number is its bias plus the products, added in the order of the inputs.
 
     Args:
         rows: Inputs, shape (n, n_inputs).

@@ -68,10 +68,10 @@ class PlaneModule(Protocol):
 
 
 class LookNetwork(nn.Module):
-    """Convolutions over the images of the latest looks, then linear layers with how these lie to each other.
+    """Convolutions over the images of the latest looks, then linear layers that also take the places of these looks.
 
-    One head says where the wanted plane lies in the frame of the latest look, as `PlaneGeometry.seen_from` does; the
-    other, which changes nothing of the features that it is given, how far off that is to be, in mm and degrees.
+    One head predicts the place of the wanted plane in the frame of the latest look, as `PlaneGeometry.seen_from`
+    defines it. The other predicts the error of that place, in mm and degrees; its gradient does not reach the features.
 
     Args:
         image_shape: Shape of a look's image: tissues, across, depth.

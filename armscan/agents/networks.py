@@ -115,10 +115,14 @@ def is_vector(space: spaces.Space[Any]) -> bool:
 
 
 def check_network(network: NetworkChoice, name: str = "network") -> NetworkChoice:
-    """Return the network, or the choice between some, if it is one; `name` says which it is in messages.
+    """Check that an object is a network, or a choice between networks, and return it.
+
+    Args:
+        network: Object to check.
+        name: Its configuration key, for the message. Default: `network`.
 
     Raises:
-        InvalidValueError: If it cannot say which network takes an observation.
+        InvalidValueError: If it has no method `for_space`.
     """
     if isinstance(network, type) or not callable(getattr(network, "for_space", None)):
         by_name = f"; on the command line network={network} chooses one by its name" if isinstance(network, str) else ""

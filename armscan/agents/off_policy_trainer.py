@@ -12,10 +12,11 @@ from armscan.agents.compiled_sac import CompiledSAC
 
 
 class EvenUpdatesTrainer(OffPolicyTrainer):
-    """Tianshou's trainer, which would round the gradient steps of every collection by itself, and refuse to have none.
+    """Tianshou's trainer, with gradient steps in exact proportion to environment steps.
 
-    Gradient steps that are due are counted from the first collection, so that they follow from the environment steps: a
-    training that continues later takes the same gradient steps as one that was never cut off. No progress bar is shown.
+    Tianshou rounds the gradient steps of every collection separately, and refuses a collection without any. Here the
+    steps due are counted from the first collection on, so a resumed training takes the same gradient steps as one that
+    was never interrupted. No progress bar is shown.
 
     Args:
         algorithm: Algorithm to train.

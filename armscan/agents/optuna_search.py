@@ -22,18 +22,18 @@ SAMPLERS = ("tpe", "cmaes", "gp")
 
 @dataclass(frozen=True, kw_only=True)
 class OptunaSearch:
-    """Optuna as the searcher over the plane: it sees nothing but the rewards of the planes it has asked for.
+    """Search for the plane with an Optuna sampler, which sees only the rewards of the planes it has proposed.
 
-    One study an episode, in memory, begun without knowledge of any other. The start's reward is not told, because no
-    agent is told which plane the start is. With one free component as with more the plane is proposed by the named
-    sampler itself: its CMA-ES takes a single dimension too, which earlier versions of Optuna answered by random planes.
+    Each episode is a new study in memory. The reward of the start is not passed on, because no agent is told which
+    plane the start is. The named sampler proposes every plane, also with one free component: CMA-ES accepts a single
+    dimension, for which earlier versions of Optuna drew random planes.
 
     Raises:
         InvalidValueError: If a value is impossible.
     """
 
     sampler: str = "tpe"
-    """Sampler of Optuna: `tpe`, `cmaes`, or `gp`, which takes some 50 ms per plane where the others take one."""
+    """Sampler of Optuna: `tpe`, `cmaes`, or `gp`, which takes about 50 ms per plane; the others take 1 ms."""
 
     n_startup_trials: int | None = None
     """Number of random planes before the sampler's model is used, 1 or more. None: the sampler's own number, 10 for TPE

@@ -21,7 +21,7 @@ PARTS = {"shares": "obs=slice_metric", "action": "env.flat=null or false"}
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneFinder(FinderParameters):
-    """A network that sees the latest looks of an episode as images and says where the labelled plane lies.
+    """Network that predicts the labelled plane from the images of the latest looks of an episode.
 
     One slice does not hold the last millimetre; slices on either side of the plane do. So each look but the last is
     `offsets_mm` beside the plane as it has been found so far, along its normal, and the last plane is the one found.

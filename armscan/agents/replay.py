@@ -84,7 +84,7 @@ class Replay(VectorReplayBuffer):
             ring._ep_return, ring._ep_len, ring._ep_start_idx = 0.0, 0, ring._insertion_idx
 
     def state(self) -> Tree:
-        """Return all transitions and where each ring continues, for after `cut_off`."""
+        """Return all transitions and the position at which each ring continues; call `cut_off` before."""
         rings = [(ring._insertion_idx, len(ring), int(ring.last_index[0])) for ring in self.buffers]
         return {"transitions": _tensors(self._meta) if len(self) else {}, "rings": rings}
 

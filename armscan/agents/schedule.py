@@ -36,7 +36,7 @@ def read_schedule(where: str, described: Any, total_env_steps: int) -> tuple[Seg
         total_env_steps: Budget of the training, in environment steps; each segment begins before it.
 
     Raises:
-        InvalidValueError: If it is no such list, or its segments are not in order.
+        InvalidValueError: If it is not such a list, or its segments are not in order.
     """
     if described is None:
         return ()

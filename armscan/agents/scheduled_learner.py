@@ -103,5 +103,5 @@ class ScheduledLearner:
         return self._learner.state()
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore what `state` returned, also that of a learner without a schedule; see `Learner.load_state`."""
+        """Restore what `state` returned, or the state of a learner without a schedule; see `Learner.load_state`."""
         self._learner.load_state(state)

@@ -110,7 +110,7 @@ class TianshouLearner(BaseLearner):
 
     @property
     def warm_up_note(self) -> str | None:
-        """Return how many random steps come before the first update, as a text; None if there are none."""
+        """Return how many random steps come before the first update, as a string; None if there are none."""
         return f"{self._learning_starts:,} before the first update" if self._learning_starts else None
 
     def warm_up(self) -> None:

@@ -69,9 +69,11 @@ OPTIONS = {
     help="JSON file of metrics and episodes, or folder of the video.  [default: in evaluations or videos]",
 )
 @click.option(
-    "--success-threshold", type=click.FloatRange(0, 1, min_open=True), help="End episodes above minus this reward."
+    "--success-threshold",
+    type=click.FloatRange(0, 1, min_open=True),
+    help="End an episode when its reward is above minus this value.",
 )
-@click.option("--max-steps", type=click.IntRange(1), help="End episodes after so many steps.")
+@click.option("--max-steps", type=click.IntRange(1), help="Steps after which an episode is truncated.")
 @click.option("--start", type=click.Choice(["middle", "random"]), help="Where episodes start.")
 @clustering_option
 @click.option(
@@ -79,7 +81,7 @@ OPTIONS = {
     default=None,
     help="Take the policy's mean action, or sample its actions.",
 )
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Where the network computes.")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Device on which the network computes.")
 @tracking_option(help="MLflow tracking store of the run and of the evaluation.")
 @click.option(
     "--tracking-experiment",

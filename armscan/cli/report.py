@@ -47,7 +47,7 @@ def report(study: str | None, runs: str | None, out: Path | None, watch: bool, s
     if out is not None:
         nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
         if not nearest.is_dir():
-            raise InvalidValueError(f"--out is {str(out)!r}, but {nearest} is no folder: name one, or a new one")
+            raise InvalidValueError(f"--out is {str(out)!r}, but {nearest} is not a folder: name one, or a new one")
     # Deferred: a mistake on the command line is answered before these are loaded.
     from armscan.reports.runs import compare_runs
 

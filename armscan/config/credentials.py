@@ -62,7 +62,7 @@ def read_password(variable: str) -> str | None:
     try:
         password = Path(file).read_text().rstrip("\n")
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
         raise InvalidValueError(f"{name} is {file!r}, but it cannot be read ({reason})") from None
     if not password:
         raise InvalidValueError(f"{name} is {file!r}, but that file is empty")
@@ -83,7 +83,7 @@ def database_url(uri: str, variable: str) -> URL:
 
 
 def mask_passwords(text: str) -> str:
-    """Return a text, such as a library's error, without the passwords of this process and of any address in it."""
+    """Return a string, such as a library's error, without the passwords of this process and of any address in it."""
     text = ACCOUNT.sub(rf"\1:{MASK}@", text)
     for variable in (STORAGE_PASSWORD, TRACKING_PASSWORD, SERVER_PASSWORD):
         password = os.environ.get(variable, "")

@@ -37,7 +37,7 @@ PHANTOM = "phantom"
 
 
 def to_plain(config: DictConfig | ListConfig) -> dict[str, Any]:
-    """Return a configuration, or a section of one, as plain dictionaries, lists, numbers and texts, all resolved."""
+    """Return a configuration, or a section of one, as plain dictionaries, lists, numbers and strings, all resolved."""
     return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
 
 

@@ -21,7 +21,7 @@ from armscan.utils.files import FULL_DISK
 
 
 def one_line_message(error: BaseException) -> str | None:
-    """Return a user's mistake and the allowed values in one line; None if the error is no user's mistake."""
+    """Return a user's mistake and the allowed values in one line; None if the error is not a user's mistake."""
     text = " ".join(str(error).split())
     if (ours := _ours(error)) is not None:
         return _named(str(ours), text.rpartition("full_key: ")[2])

@@ -85,7 +85,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         targets: Target counts of the published reward: clusters of bones, tendons and artery. Default: (4, 3, 1).
         clustering: Clustering rules: `pixels`, as published; `metric`, for every spacing; or an
             `armscan.anatomy.Tissues`. Default: `pixels`.
-        success_threshold: Threshold of success: a plane whose reward is above -success_threshold succeeds, in (0, 1].
+        success_threshold: Threshold of success, in (0, 1]: a plane whose reward is above -success_threshold succeeds.
             Default: 0.05.
         ends: End of an episode before its last step: `on_reward`, `on_budget` (none) or `on_stop`. Default:
             `on_reward`.

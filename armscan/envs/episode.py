@@ -78,7 +78,7 @@ class Episode:
         return self.n_steps == 0 or not (self.is_terminated or self.is_truncated)
 
 
-# What `info` holds under each key, and the type of its array, None where it is a text, a number or a truth value.
+# What `info` holds under each key, and the type of its array, None where it is a string, a number or a truth value.
 INFO: dict[str, tuple[Callable[[Episode], Any], type[np.generic] | None]] = {
     "volume": (lambda episode: episode.scene.volume.name, None),
     "rotation_deg": (lambda episode: episode.plane.rotation, np.float64),

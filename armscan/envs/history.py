@@ -24,7 +24,15 @@ EnvIds = NDArray[np.int64]
 
 
 def boxes_of(space: spaces.Space[Any], who: str) -> dict[str, spaces.Box]:
-    """Return the boxes of a vector or `Dict` space by name, a single one by `FLAT`; `who` wraps no other space."""
+    """Return the boxes of a vector or `Dict` space by name; the name of a single one is `FLAT`.
+
+    Args:
+        space: Observation space.
+        who: Name of the wrapper, for the message.
+
+    Raises:
+        InvalidValueError: If the space is of another kind.
+    """
     if isinstance(space, spaces.Box) and len(space.shape) == 1:
         return {FLAT: space}
     if isinstance(space, spaces.Dict):
@@ -35,7 +43,7 @@ def boxes_of(space: spaces.Space[Any], who: str) -> dict[str, spaces.Box]:
 
 
 def space_of(boxes: Mapping[str, spaces.Box]) -> spaces.Box | MultiBoxSpace:
-    """Return the space that `boxes_of` takes apart."""
+    """Return the space of these boxes: the inverse of `boxes_of`."""
     return boxes[FLAT] if FLAT in boxes else MultiBoxSpace(boxes)
 
 
@@ -45,7 +53,7 @@ def parts_of(observation: NDArray[Any] | Parts) -> Parts:
 
 
 def observation_of(parts: Parts) -> NDArray[Any] | Parts:
-    """Return the observation that `parts_of` takes apart."""
+    """Return the observation of these parts: the inverse of `parts_of`."""
     return parts.get(FLAT, parts)
 
 

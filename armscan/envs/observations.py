@@ -30,7 +30,7 @@ class SliceGeometry(NamedTuple):
 
 
 def smallest_shape(geometries: Sequence[SliceGeometry]) -> tuple[int, int]:
-    """Return the shape that slices of every geometry have at least."""
+    """Return the largest shape, (across, depth), that fits into the slices of every geometry."""
     return min(g.shape[0] for g in geometries), min(g.shape[1] for g in geometries)
 
 

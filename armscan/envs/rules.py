@@ -129,13 +129,17 @@ class Rules:
     def draw_scenes(
         self, names: Sequence[str], rngs: Sequence[np.random.Generator]
     ) -> list[tuple[Scene, NDArray[np.uint8]]]:
-        """Draw a scene of each named volume with the generator beside it, its optimal plane above -success_threshold.
+        """Draw a scene of each named volume whose labelled plane is rewarded above -success_threshold.
+
+        Args:
+            names: Names of the volumes.
+            rngs: Random generator of each scene.
 
         Returns:
             Each scene, and the slice of its optimal plane.
 
         Raises:
-            OptimalPlaneError: If no motion in a thousand leaves the optimal plane within the bounds and rewarded.
+            OptimalPlaneError: If none of a thousand motions keeps the labelled plane within the bounds and rewarded.
         """
         drawn: dict[int, tuple[Scene, NDArray[np.uint8]]] = {}
         for _ in range(MAX_DRAWS):

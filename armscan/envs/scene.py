@@ -39,10 +39,10 @@ class RandomTransform:
         centre: Fixed point of the rotation: `middle` of the volume, or `first_voxel`, as published, which moves the
             hand out of the picture.
         scale: Largest change of the volume's size in all directions alike, as a share of it, from 0 to 0.3.
-        stretch: Largest change of its size across, along the labelled normal and in depth, each drawn alone, as a share
-            of it, from 0 to 0.3.
-        shear: Largest shift per mm along another axis, from 0 to 0.3: across and in depth with the way along the
-            normal, and with each other.
+        stretch: Largest change of its size across, along the labelled normal and in depth, each drawn separately, as a
+            share of it, from 0 to 0.3.
+        shear: Largest shear, in mm of shift per mm along another axis, from 0 to 0.3: across and depth shift with the
+            position along the labelled normal, and with each other.
         mirror: Whether to mirror an episode's volume, so that it shows the other hand, with probability 0.5.
     """
 

@@ -138,10 +138,11 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
 
     @property
     def optimal_actions(self) -> FloatArray:
-        """The optimal action of each current episode, normalised, shape (num_envs, n_action), to stop there included.
+        """Action to the labelled plane of each current episode, normalised, shape (num_envs, n_action).
 
-        Privileged: neither observations nor `info` give it, and an agent that looked it up would have nothing to find.
-        It is for learning from the labelled planes of training volumes.
+        If agents end episodes themselves (`env.ends=on_stop`), it includes the action to stop there.
+
+        Privileged: neither observations nor `info` contain it. It is for supervised learning on training volumes.
         """
         free = list(self.rules.free)
         optima = np.ones((self.num_envs, len(self.rules.action_names)))

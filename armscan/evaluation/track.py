@@ -106,7 +106,7 @@ def _check_out(out: Path | None) -> None:
     check_out(file, out, "file")
     if out is not None and file.exists() and not _is_report(file):
         raise InvalidValueError(
-            f"--out is {str(file)!r}, but that file is no evaluation, and would be lost: name another"
+            f"--out is {str(file)!r}, but that file is not an evaluation and would be lost: name another"
         )
 
 

@@ -76,7 +76,7 @@ def data_name(data: str | None) -> str:
 
 
 def file_name(text: str) -> str:
-    """Return a text in a form that can name a file."""
+    """Return a string in a form that can name a file."""
     return re.sub(r"[^\w.\-]+", "-", text)
 
 

@@ -18,7 +18,7 @@ BEST_TAG = "best.run"
 
 
 def best_of(runs: Sequence[Run]) -> Run | None:
-    """Return the run with the highest on-plane rate on its test volumes; None if none was evaluated."""
+    """Return the run with the highest on-plane rate on its test volumes; None if no run was evaluated."""
     names = {name for run in runs for name in run.data.metrics if name.startswith(f"{TESTED}{PREFIX}")}
     # By other limits, where the configuration has others.
     usual = f"{TESTED}{ON_PLANE[0].metric}"

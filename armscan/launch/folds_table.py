@@ -27,7 +27,7 @@ TEST_GROUP = TEST.replace(" ", "_")
 
 
 def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
-    """Return one table over the folds of a grid, with the baselines; None if it is no grid of folds.
+    """Return one table over the folds of a grid, with the baselines; None if it is not a grid of folds.
 
     Every subject is tested on once for each seed, so that intervals draw wrists, as those of one run do.
 

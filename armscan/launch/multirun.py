@@ -112,7 +112,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         is_interrupted: Whether the multirun was interrupted.
 
     Returns:
-        The exit code: 0 where every job succeeded, or where this was no multirun; 1 otherwise.
+        The exit code: 0 where every job succeeded, or where this was not a multirun; 1 otherwise.
     """
     if Multirun.folder is None:
         return 0

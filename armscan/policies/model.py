@@ -80,7 +80,7 @@ def is_model(folder: Path) -> bool:
 
 
 def others_in(folder: Path) -> list[str]:
-    """Return the files in a model's folder that are no part of a model."""
+    """Return the files in a model's folder that are not part of a model."""
     found = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     return sorted(found - {*FILES, *(str(Path(file).parent) for file in FILES)})
 

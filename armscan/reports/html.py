@@ -115,7 +115,7 @@ def write_page(
         The HTML file.
 
     Raises:
-        InvalidValueError: If it would replace what is no report's.
+        InvalidValueError: If it would replace files that are not a report's.
     """
     from plotly.offline import get_plotlyjs
 

@@ -78,7 +78,7 @@ def _meant(store: TrackingStore, name: str) -> list[Run]:
     trainings = list(_below(store, run))
     if not trainings:
         raise TrackingError(
-            f"run {run.info.run_id} ({run.info.run_name}) is no training of armscan, and has none below it"
+            f"run {run.info.run_id} ({run.info.run_name}) is not an armscan training, and has none below it"
         )
     return trainings
 
@@ -105,7 +105,7 @@ def _in_experiment(store: TrackingStore, name: str) -> list[Run]:
         raise TrackingError(f"the experiment is {wanted!r}, but in {store.uri!r} there is {there}")
     trainings = [run for run in _runs(store, experiment.experiment_id) if OF_A_TRAINING in run.data.tags]
     if not trainings:
-        raise TrackingError(f"the experiment is {wanted!r}, but in {store.uri!r} it has no training of armscan")
+        raise TrackingError(f"the experiment is {wanted!r}, but in {store.uri!r} it has no armscan training")
     return trainings
 
 

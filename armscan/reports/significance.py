@@ -41,7 +41,7 @@ class Pair:
 
 
 def evaluations_by_seed(group: Group) -> dict[str, Evaluation]:
-    """Return the final evaluations of a group by seed; all folds of a seed are one, in which each wrist is once."""
+    """Return the final evaluations of a group by seed; the folds of a seed are pooled, so each wrist counts once."""
     played: dict[str, list[Evaluation]] = defaultdict(list)
     for training in group.trainings:
         if training.evaluation is not None:

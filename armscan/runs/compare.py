@@ -47,7 +47,7 @@ class Difference:
 
     @property
     def relative(self) -> float:
-        """The largest difference, relative to the first run's value there; infinite if there is nothing to relate."""
+        """Largest difference, as a share of the first run's value at that step; infinite if that is 0 or missing."""
         return abs(self.largest / self.then) if self.largest is not None and self.then else math.inf
 
     def __str__(self) -> str:

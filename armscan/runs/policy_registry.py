@@ -99,7 +99,7 @@ def _check_name(name: str) -> None:
     """Raise `InvalidValueError` for a name that MLflow, or its database, refuses."""
     if not name.strip() or set("/:") & set(name) or name == "." or name.startswith("..") or len(name) > MAX_NAME_CHARS:
         raise InvalidValueError(
-            f"--name is {name!r}, but it must be a text of at most {MAX_NAME_CHARS} characters without '/' and ':', "
+            f"--name is {name!r}, but it must be a string of at most {MAX_NAME_CHARS} characters without '/' and ':', "
             "other than '.', and not beginning with '..'"
         )
 

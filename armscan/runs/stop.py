@@ -31,7 +31,7 @@ def target_of(run: Run) -> Target | None:
     """Return the trial or the study that a run belongs to; None if there is none.
 
     Raises:
-        TrackingError: If its tag is no number of a trial.
+        TrackingError: If its tag is not the number of a trial.
     """
     tags = run.data.tags
     if STUDY_TAG not in tags:

@@ -58,7 +58,7 @@ def check_on_plane(name: str, limits: object) -> tuple[OnPlane, ...]:
         limits: Pairs of mm and degrees.
 
     Raises:
-        InvalidValueError: If they are no list, empty, or a pair is none, not above 0, or there twice.
+        InvalidValueError: If they are not a list, or empty, or a pair is not one, not above 0, or there twice.
     """
     if not isinstance(limits, Sequence) or isinstance(limits, str) or not limits:
         raise InvalidValueError(f"{name} is {limits!r}, but it must be {WANTED}")

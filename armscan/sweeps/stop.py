@@ -69,7 +69,7 @@ def stop_trial(uri: str, name: str, number: int) -> str:
 
 
 def stop_running_trial(storage: Storage, trial_id: int) -> bool:
-    """Stop a trial by its ID in the storage; return false, and does nothing, unless a worker of armscan runs it."""
+    """Stop a trial by its ID in the storage; return False, and do nothing, unless an armscan worker runs it."""
     try:
         trial = storage.optuna.get_trial(trial_id)
         if trial.state != TrialState.RUNNING or LEASE not in trial.user_attrs:

@@ -191,7 +191,7 @@ def run_of_study(
 
 
 def check_run_id(run_id: str) -> None:
-    """Raise `TrackingError` if a text cannot be an MLflow run ID or its beginning."""
+    """Raise `TrackingError` if a string cannot be an MLflow run ID or its beginning."""
     if not ID.fullmatch(run_id):
         raise TrackingError(
             f"the run is {run_id!r}, but it must be an id as MLflow shows it, or its beginning: up to 32 of 0-9 and a-f"

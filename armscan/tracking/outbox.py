@@ -56,7 +56,7 @@ class Address:
 
     def __post_init__(self) -> None:
         if not isinstance(self.run_id, str) or not ID.fullmatch(self.run_id):
-            raise TrackingError(f"{str(self.run_id)[:50]!r} is no ID of a run")
+            raise TrackingError(f"{str(self.run_id)[:50]!r} is not the ID of a run")
 
 
 class OutboxFile:

@@ -49,7 +49,7 @@ def name_of(key: str) -> str:
 
 
 def shortened(text: str, at_most: int, whole_in: str) -> str:
-    """Return a text of at most so many characters; one that is cut ends with the file that has all of it."""
+    """Return a string of at most so many characters; one that is cut ends with the file that has all of it."""
     if len(text) <= at_most:
         return text
     # Of two that begin alike, the sums differ.

@@ -133,7 +133,7 @@ def _check_is_store(uri: str, database: Path) -> None:
         raise TrackingError(f"tracking.uri is {uri!r}, but this store cannot be used: {error}") from error
     if n_found < 3:
         raise TrackingError(
-            f"tracking.uri is {uri!r}, but {database} is no store of MLflow: give the one with the runs"
+            f"tracking.uri is {uri!r}, but {database} is not an MLflow store: give the one with the runs"
         )
 
 
@@ -158,7 +158,7 @@ def absolute(uri: str) -> str:
 def _check_texts(**values: object) -> None:
     for name, value in values.items():
         if not isinstance(value, str) or not value.strip() or value == SQLITE_PREFIX:
-            raise TrackingError(f"tracking.{name} is {value!r}, but it must be a text such as {EXAMPLES[name]!r}")
+            raise TrackingError(f"tracking.{name} is {value!r}, but it must be a string such as {EXAMPLES[name]!r}")
         if len(value) > MAX_TEXT_CHARS:
             raise TrackingError(
                 f"tracking.{name} begins with {value[:N_SHOWN_CHARS]!r} and has {len(value)} characters, but it must "

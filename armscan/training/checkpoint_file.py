@@ -25,7 +25,7 @@ def save_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) ->
     Args:
         path: Place of the file.
         state: State of the learner.
-        facts: Numbers and texts to keep beside the state, such as the number of steps.
+        facts: Numbers and strings to keep beside the state, such as the number of steps.
     """
     import torch
 
@@ -67,7 +67,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     # The checksum matches, so the file is not damaged; torch's readers raise exceptions of many types.
     except Exception as error:
         raise CheckpointError(
-            f"{path}: is no checkpoint: it holds something other than tensors, numbers and texts"
+            f"{path}: is not a checkpoint: it contains something other than tensors, numbers and strings"
         ) from error
 
 

@@ -145,7 +145,7 @@ def _facts(report: EpochReport, provenance: CheckpointProvenance | None) -> dict
 
 
 def _written(reports: Sequence[EpochReport]) -> str:
-    """Return reports as a text, which takes a checkpoint's reader no time; JSON keeps every digit of a number."""
+    """Return reports as a string, which takes a checkpoint's reader no time; JSON keeps every digit of a number."""
     return json.dumps(
         [
             {

@@ -57,7 +57,7 @@ class TrainingDomain:
         )
 
     def to_json(self) -> str:
-        """Return it as a text that `from_json` reads."""
+        """Return it as a string that `from_json` reads."""
         return json.dumps(asdict(self))
 
     @classmethod

@@ -120,7 +120,8 @@ class Evaluation:
             on_plane: Limits as pairs of mm and degrees. Default: those of evaluations that have kept none.
 
         Raises:
-            InvalidValueError: If they are no list, or one of them is none: a value is missing, unknown, or no number.
+            InvalidValueError: If they are not a list, or one of them is not an episode: a value is missing, unknown, or
+                not a number.
         """
         if not isinstance(episodes, list):
             raise InvalidValueError(f"the episodes are a {type(episodes).__name__}, but they must be a list")

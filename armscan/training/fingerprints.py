@@ -27,13 +27,13 @@ def fingerprints_in(record: bytes | Any, where: str) -> Fingerprints:
         where: Place of the record, for errors.
 
     Raises:
-        ChangedVolumesError: If it is no record of volumes.
+        ChangedVolumesError: If it is not a record of volumes.
     """
     reader = TypeAdapter(Fingerprints)
     try:
         return reader.validate_json(record) if isinstance(record, bytes) else reader.validate_python(record)
     except ValidationError as error:
-        raise ChangedVolumesError(f"{where}: is no record of volumes and their fingerprints") from error
+        raise ChangedVolumesError(f"{where}: is not a record of volumes and their fingerprints") from error
 
 
 def check_unchanged(then: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], those_of: str) -> None:

@@ -1,7 +1,7 @@
 """A result in two sentences: on the plane or not, better than random planes or not, and how far off.
 
-The difference to the random agent is paired: the rates of each volume are compared, so that a volume which is easy for
-both does not hide what the agent adds. Its interval is for other volumes; with several trainings for other seeds, too.
+The difference from the random agent is paired: the rates of each volume are compared, so that a volume that is easy
+for both does not hide what the agent adds. Its interval is for other volumes and, with several trainings, other seeds.
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ class MetricEstimates:
         return cls(n_seeds, n_volumes, n_episodes, n_started_solved, found, limits_among(found))
 
     def estimate(self, name: str) -> Estimate:
-        """Return a figure as it is shown: NaN if there is none, a rate without width with Wilson's interval."""
+        """Return a figure as it is shown: NaN if there is none; with Wilson's interval if its own has no width."""
         estimate = self.estimates.get(name, Estimate(math.nan, math.nan, math.nan))
         return self.estimates.get(name + WILSON, estimate) if estimate.low == estimate.high else estimate
 

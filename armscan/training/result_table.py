@@ -26,9 +26,9 @@ MOST_ABREAST = 6
 PADDING_CHARS = 2
 MISSING = "–"
 HOW = (
-    "95 % intervals draw seeds, volumes and episodes; where all episodes of a rate are alike it is Wilson's, which "
-    "takes them as independent. Means are over all episodes, failed ones included; IQM is the mean of the middle half "
-    "of them. On plane: the last plane is this close to the labelled one. Success: the reward accepts the last plane, "
+    "95 % intervals resample seeds, volumes and episodes. If all episodes of a rate are equal, its interval is "
+    "Wilson's, which takes episodes as independent. Means include failed episodes; the IQM is the mean of their middle "
+    "half. On plane: the last plane is this close to the labelled one. Success: the reward accepts the last plane, "
     "which may be another."
 )
 COUNTS = {"episodes": "n_episodes", "started solved": "n_started_solved", "seeds": "n_seeds", "volumes": "n_volumes"}
@@ -43,7 +43,7 @@ class ResultTable:
     Args:
         results: Metrics of each result, by its name, such as `random, test`; the on-plane limits are those of the
             first that has any.
-        facts: Further columns, shown first: a text for each result, by heading.
+        facts: Further columns, shown first: a string for each result, by heading.
         headline: Result in a few sentences, shown above the table on pages and below it in a terminal; see `headline`.
             Default: none.
     """
@@ -178,7 +178,7 @@ def is_known(estimate: Estimate) -> bool:
 
 
 def _cell(result: MetricEstimates, column: Quantity, around: str = "{}") -> tuple[str, str]:
-    """Return a value and its interval as texts."""
+    """Return a value and its interval as strings."""
     estimate = result.estimate(column.metric)
     if not is_known(estimate):
         return MISSING, ""

@@ -123,7 +123,7 @@ def _mp4_writer(file: Path, picture: Picture) -> Generator[None, Picture | None,
 
 
 def outcome(episode: EpisodeResult) -> str:
-    """Return the outcome of an episode as a text."""
+    """Return the outcome of an episode as a string."""
     how = "success" if episode.is_success else "no success"
     steps = "1 step" if episode.n_steps == 1 else f"{episode.n_steps} steps"
     return f"{how} after {steps}, {episode.distance_mm:.1f} mm and {episode.distance_deg:.1f}° from the optimal plane"

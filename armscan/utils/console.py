@@ -18,7 +18,7 @@ def wide_console(log_chars: int = LOG_CHARS) -> Console:
     """Return a console as wide as the terminal; output to a file or pipe has longer lines.
 
     Args:
-        log_chars: Length of the longest line if the output is no terminal and `COLUMNS` is not set. Default: 160.
+        log_chars: Length of the longest line if the output is not a terminal and `COLUMNS` is not set. Default: 160.
     """
     console = Console()
     return console if console.is_terminal or "COLUMNS" in os.environ else Console(width=log_chars)

@@ -26,9 +26,9 @@ def write_csv(file: TextIO, columns: Sequence[str], rows: Iterable[Mapping[str, 
 
 
 def safe_cell(value: Any) -> Any:
-    """Return a value as it stands in a cell: a text that a spreadsheet would compute follows an apostrophe.
+    """Return a value as it stands in a cell: a string that a spreadsheet would compute follows an apostrophe.
 
-    Control characters, which may begin another line, are spelled out. Numbers stay as they are, also as texts.
+    Control characters, which may begin another line, are spelled out. Numbers stay as they are, also as strings.
     """
     if not isinstance(value, str):
         return value

@@ -136,7 +136,7 @@ def _fields(path: Path, header: bytes, separator: str) -> dict[str, str]:
     text = header.decode(errors="surrogateescape").replace("\r\n", "\n")
     # The reading library takes some of them for the end of a line or of the text.
     if re.search(r"[\0-\x08\x0b-\x1f\x7f]", text):
-        raise VolumeError(f"{path}: the header is damaged: it holds bytes that are no text")
+        raise VolumeError(f"{path}: the header is damaged: it contains bytes that are not text")
     lines = [re.split(rf"\s*{separator}\s*", line.strip(), maxsplit=1) for line in text.split("\n")]
     return {line[0]: line[1] for line in reversed(lines) if len(line) == 2}
 

@@ -46,7 +46,7 @@ class LabelMap:
         others: `background` makes every other value background; None refuses a file with other values.
 
     Raises:
-        InvalidValueError: If a source is neither a whole number nor a text, stands twice, or a landmark (bones,
+        InvalidValueError: If a source is neither a whole number nor a string, stands twice, or a landmark (bones,
             tendons, artery) has none.
     """
 

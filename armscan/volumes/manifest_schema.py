@@ -18,13 +18,13 @@ from armscan.volumes.plane import ManipulatorAction
 
 def _printable(text: str) -> str:
     if printable(text) != text:
-        raise InvalidValueError(f"holds {text!r}, but a text must be without control characters")
+        raise InvalidValueError(f"holds {text!r}, but a string must be without control characters")
     return text
 
 
 def _subjects(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list | tuple) or not value or not all(isinstance(name, str) and name for name in value):
-        raise InvalidValueError(f"a split is {value!r}, but it must be a list of at least one subject (texts)")
+        raise InvalidValueError(f"a split is {value!r}, but it must be a list of at least one subject (strings)")
     return tuple(value)
 
 
@@ -63,7 +63,7 @@ class VolumeEntry(_Settings):
     rotation: Rotation | None = None
     translation: Translation | None = None
     score: Score | None = None
-    subject: Text | None = Field(default=None, min_length=1, description="a text that is not empty (quote numbers)")
+    subject: Text | None = Field(default=None, min_length=1, description="a string that is not empty (quote numbers)")
     exclude: bool | Annotated[Text, Field(min_length=1)] = Field(default=False, description="true, false or the reason")
     crop_mm: Annotated[Crop | None, BeforeValidator(check_crop)] = None
 
@@ -143,5 +143,5 @@ def _in_one_line(error: ValidationError, path: Path) -> str:
     if not place:
         return f"{whole}is {received}, but it must be an object with some of {known}"
     field = model.model_fields.get(str(place[0]))
-    allowed = (field.description if field else None) or "a text"
+    allowed = (field.description if field else None) or "a string"
     return f"{key}{place[0]} is {received}, but it must be {allowed}"

@@ -149,7 +149,7 @@ def limit_bytes() -> float:
     """Return how large a folder of volumes may become: `$ARMSCAN_CACHE_GIB`, default: 16.
 
     Raises:
-        InvalidValueError: If that is no number of 0 or more.
+        InvalidValueError: If that is not a number of 0 or more.
     """
     word = os.environ.get(LIMIT_VARIABLE) or str(DEFAULT_GIB)
     try:

@@ -51,7 +51,7 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
     if not isinstance(volume, LabelVolume) or not isinstance(action, ManipulatorAction) or not isinstance(name, str):
         raise InvalidValueError(
             f"volume, action and name are {volume!r}, {action!r} and {name!r}, but they must be a LabelVolume, a "
-            "ManipulatorAction and a text"
+            "ManipulatorAction and a string"
         )
     if not path.name.endswith(MARKUP_SUFFIX):
         raise MarkupError(f"{path}: a markups file must end in {MARKUP_SUFFIX}, or Slicer does not know it as one")

@@ -133,7 +133,7 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
     try:
         if not path.is_file():
             raise VolumeError(f"{path}: there is no such file")
-        # A name may hold any bytes; by one that is no text SimpleITK would end the process.
+        # A name may hold any bytes; by one that is not text SimpleITK would end the process.
         str(path).encode()
         CHECKS[suffix](path)
         if suffix == SEGMENTATION_SUFFIX:
@@ -141,7 +141,7 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
             return _image(labels, matrix, path), found
         stored = SimpleITK.ReadImage(str(path))
     except UnicodeEncodeError as error:
-        raise VolumeError(f"{str(path)!a}: the file's name must be a text in UTF-8") from error
+        raise VolumeError(f"{str(path)!a}: the file's name must be valid UTF-8") from error
     except OSError as error:
         raise VolumeError(f"{path}: the file cannot be read ({error.strerror or error})") from error
     except RuntimeError as error:

@@ -42,7 +42,7 @@ class LabelVolume:
 
     Raises:
         VolumeError: Naming the volume, if the labels are not a 3-D array of the labels above, a landmark is missing,
-            the spacing is not finite and positive, or the way back is no position and axes at right angles.
+            the spacing is not finite and positive, or the way back is not a position and axes at right angles.
     """
 
     labels: NDArray[np.uint8]
@@ -54,10 +54,10 @@ class LabelVolume:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
-            raise VolumeError(f"the name of a volume is {self.name!r}, but it must be a text")
+            raise VolumeError(f"the name of a volume is {self.name!r}, but it must be a string")
         if printable(self.name) != self.name:
             raise VolumeError(
-                f"the name of a volume is {self.name!r}, but it must be a text without control characters"
+                f"the name of a volume is {self.name!r}, but it must be a string without control characters"
             )
         object.__setattr__(self, "labels", _checked_labels(self.labels, self.name))
         object.__setattr__(self, "spacing", _checked_spacing(self.spacing, self.name))
@@ -199,7 +199,7 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
     try:
         labels = np.asarray(labels)
     except ValueError as error:
-        raise VolumeError(f"{name}: the labels are no array ({error})") from error
+        raise VolumeError(f"{name}: the labels are not an array ({error})") from error
     if labels.ndim != 3 or 0 in labels.shape:
         raise VolumeError(f"{name}: the image has shape {labels.shape}, but a labelmap must be 3-D and not empty")
     whole = check_whole(labels, name)

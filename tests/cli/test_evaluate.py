@@ -91,7 +91,7 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         ),
         (
             [run_id, "--episodes=1", "--out=volumes.json"],
-            "--out is 'volumes.json', but that file is no evaluation, and",
+            "--out is 'volumes.json', but that file is not an evaluation",
         ),
         (["--agent=nobody"], "agent is 'nobody', but it must be "),
         (["--agent=sac", *FEW], "sac has to be trained first: give the RUN that has trained one"),

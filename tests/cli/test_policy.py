@@ -131,7 +131,7 @@ def test_bad_words_are_answered_in_one_line_and_change_nothing(answer, tmp_path)
         (["export", run, "--out=file"], "--out is 'file', but something else is there, and would be lost"),
         (["export", run, "--out=file/in/it"], "file/in/it: the model cannot be written (Not a directory)"),
         *(
-            (["register", run, f"--name={bad}"], f"--name is '{bad}', but it must be a text")
+            (["register", run, f"--name={bad}"], f"--name is '{bad}', but it must be a string")
             for bad in ("a/b", "a:b", "..", " ", "")
         ),
         (["register", run, f"--name={'a' * 257}"], "--name is 'aaa"),

@@ -121,7 +121,7 @@ def test_record_of_volumes_that_is_none_is_one_line(armscan, tmp_path, record):
     store_of(tmp_path).log_artifact(run_id, str(tmp_path / VOLUMES_FILE))
     store_of(tmp_path).set_tag(run_id, SHA256_TAGS[VOLUMES_FILE], sha256(record.encode()))
     code, _, errors = answered(armscan, "evaluate", run_id)
-    line = f"error: run {run_id}: its {VOLUMES_FILE}: is no record of volumes and their fingerprints"
+    line = f"error: run {run_id}: its {VOLUMES_FILE}: is not a record of volumes and their fingerprints"
     assert (code, errors) == (2, line)
 
 

@@ -141,7 +141,7 @@ def test_password_comes_from_a_file_where_the_environment_names_one(tmp_path, mo
     assert read_password("ARMSCAN_STORAGE_PASSWORD") == "a b"
     (tmp_path / "empty").write_text("\n")
     (tmp_path / "binary").write_bytes(b"\xff")
-    for name, reason in (("empty", "is empty"), ("binary", "it is no text")):
+    for name, reason in (("empty", "is empty"), ("binary", "it is not text")):
         monkeypatch.setenv("ARMSCAN_STORAGE_PASSWORD_FILE", str(tmp_path / name))
         with pytest.raises(InvalidValueError, match=f"ARMSCAN_STORAGE_PASSWORD_FILE is .*{name}.*{reason}"):
             read_password("ARMSCAN_STORAGE_PASSWORD")

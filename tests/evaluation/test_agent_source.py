@@ -85,7 +85,7 @@ def with_nan(weights, facts):
             "best.pt: holds all of a training, as last.pt does",
         ),
         (lambda weights, facts: ({"other": 1}, facts), "the checkpoint is another agent's or network's"),
-        (lambda weights, facts: ([1], facts), "best.pt: is no checkpoint: it holds something other"),
+        (lambda weights, facts: ([1], facts), "best.pt: is not a checkpoint: it contains something other"),
         (with_nan, "best.pt: holds weights that are not finite, in "),
     ],
 )

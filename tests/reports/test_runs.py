@@ -192,9 +192,12 @@ def test_report_of_runs_answers_mistakes_in_one_line(answer, runs, tmp_path):
             [f"--runs={evaluation}"],
             f"run {evaluation} is an evaluation, but runs are compared: give the run that it is of",
         ),
-        ([f"--runs={other}"], f"run {other} (other) is no training of armscan, and has none below it"),
+        ([f"--runs={other}"], f"run {other} (other) is not an armscan training, and has none below it"),
         (["--runs=a", "--tracking=sqlite:///nowhere.db"], "tracking.uri is 'sqlite:///nowhere.db', but there is no "),
-        (["--runs=a", "--out=/dev/null/a"], "--out is '/dev/null/a', but /dev/null is no folder: name one, or a new"),
+        (
+            ["--runs=a", "--out=/dev/null/a"],
+            "--out is '/dev/null/a', but /dev/null is not a folder: name one",
+        ),
     ]
     for words, line in words_and_lines:
         code, _, errors = answer(*words)
@@ -204,7 +207,7 @@ def test_report_of_runs_answers_mistakes_in_one_line(answer, runs, tmp_path):
     file = tmp_path / "there.txt"
     file.write_text("mine")
     assert answer(f"--runs={runs.ids('sac')[0]}", f"--out={file}")[2].startswith(
-        f"error: --out is '{file}', but {file} is no "
+        f"error: --out is '{file}', but {file} is not a folder"
     )
     assert [each.read_text() for each in tmp_path.iterdir()] == ["mine"]
 

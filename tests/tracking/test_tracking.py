@@ -254,7 +254,7 @@ def test_existing_store_is_not_made_of_a_database_with_something_else(tmp_path):
     empty.touch()
     for database in (other, empty):
         before = database.read_bytes()
-        with pytest.raises(TrackingError, match=f"{database} is no store of MLflow: give the one with the runs"):
+        with pytest.raises(TrackingError, match=f"{database} is not an MLflow store: give the one with the runs"):
             open_existing_store(f"sqlite:///{database}")
         assert database.read_bytes() == before
 

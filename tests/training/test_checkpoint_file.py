@@ -106,7 +106,7 @@ def test_checkpoint_runs_no_code_from_the_file(tmp_path, capsys, is_zipped):
     else:
         pickle.dump({"state": Malicious(), "facts": {}}, file, protocol=2)
     (tmp_path / "a.pt").write_bytes(with_a_right_sum(file.getvalue()))
-    with pytest.raises(CheckpointError, match="something other than tensors, numbers and texts"):
+    with pytest.raises(CheckpointError, match="something other than tensors, numbers and strings"):
         load_checkpoint(tmp_path / "a.pt")
     assert capsys.readouterr().out == ""
 
@@ -116,7 +116,7 @@ def test_checkpoint_that_holds_something_else_is_refused(tmp_path, content):
     file = io.BytesIO()
     torch.save(content, file)
     (tmp_path / "a.pt").write_bytes(with_a_right_sum(file.getvalue()))
-    with pytest.raises(CheckpointError, match="is no checkpoint"):
+    with pytest.raises(CheckpointError, match="is not a checkpoint"):
         load_checkpoint(tmp_path / "a.pt")
 
 
@@ -133,5 +133,5 @@ def test_state_that_no_learner_takes_is_refused(tmp_path, error):
     with pytest.raises(CheckpointError, match=r"last\.pt: does not hold the state of this agent: "):
         resume_from_checkpoint(Learner(), tmp_path, CheckpointProvenance())
     save_checkpoint(tmp_path / "last.pt", {}, facts | {"volumes": [3]})
-    with pytest.raises(ChangedVolumesError, match=r"last\.pt: is no record of volumes"):
+    with pytest.raises(ChangedVolumesError, match=r"last\.pt: is not a record of volumes"):
         resume_from_checkpoint(Learner(), tmp_path, CheckpointProvenance())

@@ -150,7 +150,7 @@ def both(tmp_path_factory):
             ["--storage=mysql://me@there/db"],
             "--storage is 'mysql://me@there/db', but it must be a file, sqlite:///FILE",
         ),
-        (["--storage=other"], "--storage is '{here}/other', but that file is no journal of Optuna"),
+        (["--storage=other"], "--storage is '{here}/other', but that file is not an Optuna journal"),
         (["--tracking=sqlite:///nowhere.db"], "--tracking is 'sqlite:///nowhere.db', but there are no runs there"),
         (
             ["--tracking=sqlite:///other"],

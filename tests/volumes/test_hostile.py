@@ -202,7 +202,7 @@ def test_a_manifest_that_repeats_itself_without_end_is_refused_at_once(write_lab
     "name", ["\x1b[31mred\x1b[0m", "bell\a", "over\rwritten", "two\nlines", "\u202eback", "\x9b1m"]
 )
 def test_control_characters_of_names_are_spelled_out(write_labelmap, tmp_path, name):
-    with pytest.raises(VolumeError, match="must be a text without control characters") as caught:
+    with pytest.raises(VolumeError, match="must be a string without control characters") as caught:
         LabelVolume(make_tiny_volume().labels, (1.0, 1.0, 1.0), name)
     messages = [str(caught.value), str(ArmscanError(f"{name} is wrong"))]
     with pytest.raises(VolumeError) as caught:

@@ -127,7 +127,7 @@ def test_read_volume_refuses_a_file_that_gives_no_spacing(write_labelmap):
 def test_read_volume_refuses_a_name_that_is_no_text(write_labelmap):
     path = write_labelmap("wrist.nrrd")
     renamed = path.rename(path.with_name("wrist\udcff.nrrd"))
-    with pytest.raises(VolumeError, match=r"wrist\\udcff\.nrrd': the file's name must be a text in UTF-8"):
+    with pytest.raises(VolumeError, match=r"wrist\\udcff\.nrrd': the file's name must be valid UTF-8"):
         read_volume(renamed)
 
 

@@ -190,7 +190,7 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
 
 
 def _judgement(judgement: Judgement) -> str:
-    """Return the result in a sentence, and the differences to the control."""
+    """Return the result in a sentence, and the differences from the control."""
     notes = "".join(f"<p>Note: {html.escape(note)}.</p>" for note in judgement.notes)
     said = f"<p><strong>{html.escape(judgement.result)}</strong></p>{notes}"
     if not judgement.differences:

@@ -207,7 +207,7 @@ def searched_values(trial: FrozenTrial | Trial) -> Values:
 
 
 def lineage(trials: Sequence[FrozenTrial], last: FrozenTrial) -> Iterator[FrozenTrial]:
-    """Yield the trials that a trial continues from, the first generation first, and itself."""
+    """Yield the ancestors of a trial, the first generation first, then the trial itself."""
     parent = last.user_attrs.get(PARENT)
     if parent is not None:
         yield from lineage(trials, trials[parent])

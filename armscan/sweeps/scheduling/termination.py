@@ -21,7 +21,7 @@ class Termination:
         study: The study in its storage.
         storage: The storage.
         find_reason: Function that returns why a study ends, None if it continues. It may take seconds.
-        asked: Trials and terminator asked for, as a text; an ended study continues if it has changed.
+        asked: Trials and terminator asked for, as a string; an ended study continues if it has changed.
     """
 
     def __init__(

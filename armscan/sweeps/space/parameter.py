@@ -137,7 +137,7 @@ class Parameter:
 
 
 def as_kept(value: Any) -> Value:
-    """Return a value as Optuna stores it: a number or a text, a list as the text that Hydra reads."""
+    """Return a value as Optuna stores it: a number or a string, a list as the string that Hydra reads."""
     kept: Value = written(value) if isinstance(value, list | tuple | Mapping) else value
     return kept
 
@@ -164,7 +164,7 @@ def written(value: Any) -> str:
         return f"[{','.join(map(written, value))}]"
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{key}:{written(each)}" for key, each in value.items()) + "}"
-    # Neither that of a list, nor one in which nothing but a text is read.
+    # Neither that of a list, nor one in which nothing but a string is read.
     if isinstance(value, str) and not value.startswith(("[", "{")) and not PLAIN_TEXT.fullmatch(value):
         return QuotedString(value, Quote.single).with_quotes()
     return str(value)

@@ -37,7 +37,7 @@ Number = Annotated[int, Field(ge=0, le=LARGEST, description="a whole number of a
 ScheduledKey = Annotated[str, Field(pattern=r"^(from_env_steps|agent\.[a-z]\w*)$")]
 Segment = dict[ScheduledKey, bool | int | Annotated[float, Field(allow_inf_nan=False)]]
 # Without what no path can have.
-Text = Annotated[str, Field(pattern=r"^[^\x00]*$", description="a text")]
+Text = Annotated[str, Field(pattern=r"^[^\x00]*$", description="a string")]
 
 
 class _Attributes(Section):
@@ -49,15 +49,15 @@ class _Attributes(Section):
 class StudyAttributes(_Attributes):
     """User attributes of a study; the names are those of `armscan.sweeps.study.study` and of the scheduler."""
 
-    space: dict[str, str] = Field(description="texts by the names of keys")
+    space: dict[str, str] = Field(description="strings by the names of keys")
     fixed_config: dict[str, Any] = Field(description="values by the names of keys")
     objectives: dict[str, str] = Field(description="directions by the names of metrics")
     mlflow_run: Text = ""
     note_sha256: Text = ""
     stop: Text = ""
     forgiven: list[Number] = Field(default=[], description="a list of numbers of trials")
-    terminated: dict[str, Text] = Field(default={}, description="texts by their names")
-    begun_with: list[Text] = Field(default=[], description="a list of texts")
+    terminated: dict[str, Text] = Field(default={}, description="strings by their names")
+    begun_with: list[Text] = Field(default=[], description="a list of strings")
 
 
 class _Lease(_Attributes):

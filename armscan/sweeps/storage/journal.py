@@ -36,7 +36,7 @@ def open_journal(path: Path, *, is_written: bool) -> CheckedJournal:
 
     Raises:
         OSError: If no file can be used there.
-        StudyError: If the file is no journal, or if a line of it but the last was lost or changed.
+        StudyError: If the file is not a journal, or if a line of it but the last was lost or changed.
     """
     journal = JournalFile(path)
     if is_written:
@@ -45,7 +45,7 @@ def open_journal(path: Path, *, is_written: bool) -> CheckedJournal:
     # Before the repair, which would damage any other file. A journal may be empty, or torn in its first line.
     with path.open("rb") as file:
         if not BEGINNING.startswith(file.read(len(BEGINNING))):
-            raise StudyError("that file is no journal of Optuna")
+            raise StudyError("that file is not an Optuna journal")
     if is_written:
         with journal.locked():
             pass
@@ -53,7 +53,7 @@ def open_journal(path: Path, *, is_written: bool) -> CheckedJournal:
         return CheckedJournal(journal)
     # Raised for a line that cannot be read.
     except UNREADABLE as error:
-        raise StudyError(f"that file is no journal of Optuna: {error}") from error
+        raise StudyError(f"that file is not an Optuna journal: {error}") from error
 
 
 class CheckedJournal(JournalStorage):

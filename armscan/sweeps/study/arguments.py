@@ -57,7 +57,7 @@ class StudyCommand:
 
     @property
     def launching(self) -> list[str]:
-        """The words that the workers are launched with."""
+        """Words of the command line that launches the workers."""
         is_chosen = any(word.startswith(f"{LAUNCHER}=") for word in self.words)
         return [*self.words, *([] if is_chosen else [f"{LAUNCHER}={USUAL_LAUNCHER}"])]
 

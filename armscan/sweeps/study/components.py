@@ -65,7 +65,7 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
         path = Path(folder).absolute()
         there = next(each for each in (path, *path.parents) if each.exists())
         if not there.is_dir():
-            raise StudyError(f"study.{name} is {folder!r}, but {str(there)!r} is no folder")
+            raise StudyError(f"study.{name} is {folder!r}, but {str(there)!r} is not a folder")
     task: Any = make("task", settings.task, object)
     if missing := [name for name in TASK_MEMBERS if not hasattr(task, name)]:
         raise InvalidValueError(f"study.task is {settings.task['_target_']}, which has no {missing[0]}, as a task must")

@@ -34,7 +34,7 @@ class Constraint:
 
     @classmethod
     def read(cls, text: Any) -> Self:
-        """Return the constraint of a text such as `training_s <= 60`.
+        """Return the constraint of a string such as `training_s <= 60`.
 
         Raises:
             InvalidValueError: If the text is none.

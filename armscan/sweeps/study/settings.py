@@ -45,7 +45,7 @@ def _target(described: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _objectives(objectives: Any) -> Any:
-    """Return the direction of each metric, of texts such as `minimize mean_steps`."""
+    """Return the direction of each metric, from strings such as `minimize mean_steps`."""
     if isinstance(objectives, list):
         directions = {name: direction for direction, _, name in (str(each).partition(" ") for each in objectives)}
         return directions if len(directions) == len(objectives) else None
@@ -65,7 +65,7 @@ def _without_repetition(given: tuple[T, ...]) -> tuple[T, ...]:
 Name = Annotated[str, BeforeValidator(lambda name: check_study_name("study.name", name))]
 Other = Annotated[str, BeforeValidator(lambda name: check_study_name("study.warm_start", name))]
 # Not blank, and without what no path can have.
-Place = Annotated[str, Field(pattern=r"^[^\x00]*[^\s\x00][^\x00]*$", description="a text that says where")]
+Place = Annotated[str, Field(pattern=r"^[^\x00]*[^\s\x00][^\x00]*$", description="a string that says where")]
 Target = Annotated[
     Mapping[str, Any], AfterValidator(_target), Field(description="a section with a _target_, the name of a class")
 ]

@@ -78,7 +78,7 @@ def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.
 
 
 def described(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the description of a study, by which it is compared."""
+    """Return what a study's storage keeps of its settings, to compare it with the same study started again."""
     of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
     if settings.constraints:
         of_trials["study.constraints"] = list(map(str, settings.constraints))

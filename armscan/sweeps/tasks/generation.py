@@ -15,7 +15,7 @@ from armscan.utils.files import RUN_FILE
 
 
 def begin_generation(attempt: Attempt, setup: Experiment, folder: Path, *, run_id: str) -> list[EpochReport]:
-    """Restore an untrained agent as the parent of a trial left its own; the first generation has no parent.
+    """Restore the parent trial's last checkpoint into an untrained agent; do nothing in the first generation.
 
     Args:
         attempt: The attempt at the trial.

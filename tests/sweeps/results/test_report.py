@@ -238,7 +238,7 @@ def test_report_needs_only_to_read_the_storage(answer, tmp_path):
         ),
         (["--study=../a"], "error: --study is '../a', but it must begin with a letter, a digit or _"),
         (["--study=foreign"], "error: --study is 'foreign', but that one in '/"),
-        (["--study=a", "--out=/dev/null/a"], "error: --out is '/dev/null/a', but /dev/null is no folder"),
+        (["--study=a", "--out=/dev/null/a"], "error: --out is '/dev/null/a', but /dev/null is not a folder"),
         (["--runs=a", "--watch"], "error: --watch is given, but it is for --study, and this report is of --runs"),
         (["--study=a", "--foo=1"], "error: No such option '--foo'."),
         (["--study=a", "foo"], "error: Got unexpected extra argument (foo)"),

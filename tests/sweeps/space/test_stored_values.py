@@ -53,5 +53,5 @@ def test_value_outside_the_space_is_refused_in_one_line(name, value):
 
 @pytest.mark.parametrize("run_id", ["../../x", "/etc/passwd", "a/b", "", ".", "a\0", 3, None, "a" * 65])
 def test_run_of_a_trial_that_is_no_id_names_no_file(tmp_path, run_id):
-    with pytest.raises(TrackingError, match="is no ID of a run"):
+    with pytest.raises(TrackingError, match="is not the ID of a run"):
         file_of(tmp_path, run_id)

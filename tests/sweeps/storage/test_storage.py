@@ -94,7 +94,7 @@ def test_storage_that_cannot_be_used_is_refused_in_one_line(uri, line):
 )
 def test_storage_refuses_a_file_that_is_no_journal_and_leaves_it_as_it_is(tmp_path, contents):
     (tmp_path / "a").write_text(contents)
-    with pytest.raises(StudyError, match="that file is no journal of Optuna"):
+    with pytest.raises(StudyError, match="that file is not an Optuna journal"):
         open_storage(str(tmp_path / "a"))
     assert (tmp_path / "a").read_text() == contents
 
