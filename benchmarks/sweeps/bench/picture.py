@@ -29,7 +29,7 @@ def draw(ranks: pd.DataFrame, races: Mapping[int, Races], keys: Mapping[str, Key
         path: The file.
         title: Title of the picture.
     """
-    figure = Figure(figsize=(14, 4.6), layout="constrained")
+    figure = Figure(figsize=(14, 5.6), layout="constrained")
     FigureCanvasAgg(figure)
     left, middle, right = figure.subplots(1, 3)
     _draw_ranks(left, ranks)
@@ -73,7 +73,8 @@ def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[str, Choice
     axes.set_ylim(bottom=0)
     axes.set_title(title)
     axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=7)
+    # Below, because it would hide the races.
+    axes.legend(fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
 
 
 def _draw_keys(axes: Axes, keys: Mapping[str, Key]) -> None:
