@@ -12,8 +12,8 @@ from armscan.agents.protocols import AgentSetup
 from armscan.envs.actions import COMPONENTS, ActionBounds
 from armscan.envs.rules import Observed
 from armscan.errors import InvalidValueError, listed
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_float
-from armscan.volumes.plane import FloatArray
 
 ROTATIONS = ("rz", "rx")
 MOST_SWEPT = 2

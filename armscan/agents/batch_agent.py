@@ -13,7 +13,7 @@ from armscan.agents.protocols import Agent
 from armscan.envs.actions import ActionBounds
 from armscan.envs.history import rows_of
 from armscan.envs.rules import Observed
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 
 @runtime_checkable

@@ -11,8 +11,8 @@ import numpy as np
 from armscan.agents.protocols import AgentSetup
 from armscan.envs.actions import STOP, ActionBounds
 from armscan.envs.rules import Observed
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_choice, check_int
-from armscan.volumes.plane import FloatArray
 
 if TYPE_CHECKING:
     from optuna.samplers import BaseSampler

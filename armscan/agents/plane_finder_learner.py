@@ -22,7 +22,7 @@ from armscan.envs.history import rows_of
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import reset_each
 from armscan.errors import InvalidValueError
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 # What the names of phantoms begin with.
 PHANTOM = "phantom-"

@@ -20,7 +20,7 @@ from armscan.agents.supervised_buffer import SupervisedBuffer
 from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import reset_each
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 # Of normalised actions: 10 ** -2.5 is half a millimetre along an arm of 300 mm, or a third of a degree.
 LOG_SPREADS = (-2.5, -0.5)

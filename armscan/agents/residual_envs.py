@@ -15,7 +15,7 @@ from torch import Tensor
 from armscan.agents.look_network import Estimate, FinderModule, looks_of
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import reset_each
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 DrawVolumes = Callable[[np.random.Generator, int], dict[str, Any] | None]
 

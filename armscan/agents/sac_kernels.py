@@ -27,7 +27,7 @@ from armscan.agents.mlp_kernels import (
     linear,
     linear_gradient,
 )
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 # As Tianshou has them: bounds of the logarithm of the spread, and what keeps the logarithm of 1 - tanh(x)^2 finite.
 LOG_STD_MIN, LOG_STD_MAX, EPS = F(-20.0), F(2.0), np.finfo(np.float32).eps

@@ -11,7 +11,7 @@ from armscan.agents.batch_agent import batch_agent
 from armscan.agents.protocols import Learner
 from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 if TYPE_CHECKING:
     from armscan.agents.policy import Policy

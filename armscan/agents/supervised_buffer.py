@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from armscan.envs.history import boxes_of, observation_of, parts_of
 from armscan.envs.rules import Observed
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 
 class SupervisedBuffer:

@@ -14,7 +14,7 @@ from tianshou.env import BaseVectorEnv
 from armscan.envs.history import Mask
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import ArmscanVectorEnv, reset_each
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 Ids = int | list[int] | NDArray[np.int64] | None
 

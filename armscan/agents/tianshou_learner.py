@@ -28,7 +28,7 @@ from armscan.agents.step_collector import StepCollector
 from armscan.agents.tianshou_envs import TianshouVectorEnv
 from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 # Tianshou measures how long it takes on the wall clock, and raises an error where that is turned back meanwhile.
 for _module in (algorithm_base, collector, tianshou.trainer):

@@ -18,8 +18,9 @@ from armscan.anatomy.rewards import PUBLISHED_TARGETS, LandmarkReward, Reward
 from armscan.anatomy.scanner import Scanner
 from armscan.anatomy.tissues import Tissues, check_tissues
 from armscan.errors import InvalidValueError, OptimalPlaneError
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_float
-from armscan.volumes.plane import FloatArray, ManipulatorAction, shift_into
+from armscan.volumes.plane import ManipulatorAction, shift_into
 from armscan.volumes.volume import LabelVolume
 
 MAX_PLANES = 1_000_000

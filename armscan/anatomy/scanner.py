@@ -15,7 +15,8 @@ from armscan.anatomy.clustering import bounding_boxes, summarise_label
 from armscan.anatomy.connected_components import WORD, IntArray, Pixels
 from armscan.anatomy.landmarks import Landmarks
 from armscan.anatomy.tissues import N_TISSUES, Tissues
-from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.utils.arrays import FloatArray
+from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.rigid_transform import NO_MAPS, mapped_plane
 from armscan.volumes.slicing import sample_plane
 from armscan.volumes.volume import LabelVolume

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.errors import InvalidValueError, listed
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_float, check_numbers
-from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.volumes.plane import ManipulatorAction
 
 COMPONENTS = ("rz", "rx", "tx", "ty")
 PROJECTIONS: dict[str, tuple[str, ...]] = {

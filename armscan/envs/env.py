@@ -13,9 +13,10 @@ from armscan.envs.episode import Episode, begin, check_actions, info_of, wanted_
 from armscan.envs.rules import Observed, Rules, Volumes
 from armscan.envs.scene import Scene
 from armscan.errors import ResetNeededError
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_choice, check_int
 from armscan.volumes import LabelVolume
-from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.volumes.plane import ManipulatorAction
 
 if TYPE_CHECKING:
     from armscan.envs.window import Window

@@ -12,8 +12,9 @@ from armscan.envs.observations import View
 from armscan.envs.rules import ON_REWARD, ON_STOP, Rules
 from armscan.envs.scene import Scene
 from armscan.errors import InvalidValueError, listed
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_choice
-from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.volumes.plane import ManipulatorAction
 
 
 class Episode:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from armscan.anatomy import PUBLISHED_TARGETS, USUAL_PIXEL_MM, Landmarks, TissueClusters, Tissues, check_targets
 from armscan.envs.spaces import Parts
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_bool
-from armscan.volumes.plane import FloatArray
 
 # Of bones, tendons and artery, at the usual pixel size.
 USUAL_AREAS_PX = (3000.0, 1000.0, 100.0)

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from armscan.envs.observations import View
+from armscan.utils.arrays import FloatArray
 from armscan.volumes import LANDMARK_LABELS
-from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.rigid_transform import RigidTransform
 from armscan.volumes.volume import LabelVolume
 

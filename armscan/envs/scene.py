@@ -9,9 +9,10 @@ import numpy as np
 
 from armscan.envs.actions import ActionBounds
 from armscan.errors import InvalidValueError, OptimalPlaneError
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_bool, check_choice, check_float
 from armscan.volumes.deformation import DeformingTransform
-from armscan.volumes.plane import FloatArray, ManipulatorAction, plane_distance, shift_into
+from armscan.volumes.plane import ManipulatorAction, plane_distance, shift_into
 from armscan.volumes.rigid_transform import NO_MAPS, RigidTransform, mapped_plane
 from armscan.volumes.volume import LabelVolume
 

@@ -14,8 +14,8 @@ from armscan.envs.episode import INFO, Episode, begin, check_actions, look, want
 from armscan.envs.history import EnvIds, Mask
 from armscan.envs.rules import Observed, Rules, Volumes
 from armscan.errors import InvalidValueError, ResetNeededError
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_int
-from armscan.volumes.plane import FloatArray
 
 MOST_ENVS = 65536
 VectorStep = tuple[Observed, FloatArray, Mask, Mask, dict[str, Any]]

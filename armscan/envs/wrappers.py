@@ -29,7 +29,7 @@ from armscan.envs.rules import Observed
 from armscan.envs.spaces import Parts
 from armscan.envs.vector_env import VectorStep, reset_each, step_each
 from armscan.errors import InvalidValueError
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 Env = gym.Env[Any, FloatArray]
 # Of the one environment that is wrapped.

@@ -24,8 +24,8 @@ from armscan.policies.model import ONNX_FILE, Arrays, arrays_of, model_sha256, w
 from armscan.tracking import TrackedRun
 from armscan.tracking.client import reason_in
 from armscan.training.episode_results import Env
+from armscan.utils.arrays import FloatArray
 from armscan.utils.files import CONFIG_FILE, POLICY_FOLDER
-from armscan.volumes.plane import FloatArray
 
 # The run's tag that says whether there is a model of it.
 POLICY_TAG = "policy"

@@ -11,7 +11,7 @@ from armscan.reports.groups import Group
 from armscan.reports.load import Series, TrackedTraining
 from armscan.stats.aggregation import Band, band_over_seeds
 from armscan.training.metric_display import bounds_of
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 # What curves are drawn over, and how a series says it.
 AXES: dict[str, Callable[[Series], FloatArray]] = {

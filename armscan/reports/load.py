@@ -21,8 +21,8 @@ from armscan.tracking.histories import History, metric_histories
 from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
 from armscan.training import TEST, Evaluation
+from armscan.utils.arrays import FloatArray
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE, sha256
-from armscan.volumes.plane import FloatArray
 
 WALL = "wall_s"
 VALIDATION = {

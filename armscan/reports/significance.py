@@ -17,7 +17,7 @@ from armscan.stats.bootstrap import Estimate
 from armscan.training import Evaluation, MetricEstimates
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import beside_random
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 # Rate of the leading limits, and metrics of `Evaluation.metrics`, that groups are compared by; true where higher is
 # better.

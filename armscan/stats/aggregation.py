@@ -14,7 +14,7 @@ import numpy as np
 from armscan.errors import InvalidValueError
 from armscan.stats.bootstrap import LEVEL, Estimate
 from armscan.stats.paired import crossed_mean
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 # With fewer seeds a band would be wider than a chart.
 FEWEST_SEEDS = 3

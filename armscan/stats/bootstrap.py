@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.errors import InvalidValueError
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 LEVEL = 0.95
 N_RESAMPLES = 2000

@@ -16,7 +16,7 @@ import numpy as np
 
 from armscan.errors import InvalidValueError
 from armscan.stats.bootstrap import LEVEL, Estimate
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 
 def paired_difference(ours: FloatArray, theirs: FloatArray) -> Estimate:

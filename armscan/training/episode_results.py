@@ -13,7 +13,7 @@ import gymnasium as gym
 from armscan.envs.rules import Observed
 from armscan.errors import InvalidValueError
 from armscan.stats.on_plane import ON_PLANE, OnPlane, check_on_plane
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 # What evaluations are called by, after the volumes that they are on.
 TRAINING, VALIDATION, TEST = "training volumes", "validation volumes", "test volumes"

@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from armscan.errors import InvalidValueError
-from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.utils.arrays import FloatArray
+from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.rigid_transform import RigidTransform
 
 

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from armscan.errors import InvalidValueError, MarkupError
+from armscan.utils.arrays import FloatArray
 from armscan.utils.files import atomic_write
 from armscan.utils.validation import check_path
-from armscan.volumes.plane import FloatArray, ManipulatorAction, shift_into
+from armscan.volumes.plane import ManipulatorAction, shift_into
 from armscan.volumes.slicer_plane import read_slicer_plane
 from armscan.volumes.volume import LabelVolume
 

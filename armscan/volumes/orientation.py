@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from armscan.errors import InvalidValueError
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_numbers
-from armscan.volumes.plane import FloatArray
 
 AXES = "xyz"
 # Each world axis runs from the first towards the second: right, left, anterior, posterior, inferior, superior.

@@ -9,11 +9,9 @@ from typing import Self
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_numbers
-
-FloatArray = NDArray[np.float64]
 
 
 @numba.njit(cache=True)

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.errors import InvalidValueError, VolumeError, listed
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_choice, check_path
 from armscan.volumes.header_checks import CHECKS
 from armscan.volumes.labelmap import Found, LabelMap, check_landmarks, map_values
 from armscan.volumes.orientation import AXES, Crop, check_axes, check_crop, check_orientation, orientation_of
-from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.segmentation import OVERLAPS, SEGMENTATION_SUFFIX, read_segmentation
 from armscan.volumes.summary import StoredFile, missing_sources
 from armscan.volumes.volume import LabelVolume

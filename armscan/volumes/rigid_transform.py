@@ -10,8 +10,9 @@ import numba
 import numpy as np
 
 from armscan.errors import InvalidValueError
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_numbers
-from armscan.volumes.plane import FloatArray, ManipulatorAction, rotation_matrix, wrap_deg
+from armscan.volumes.plane import ManipulatorAction, rotation_matrix, wrap_deg
 
 LARGEST_SHIFT_MM = 1e6
 # The maps of a volume as it was read; see `RigidTransform.maps`.

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.errors import VolumeError, listed
+from armscan.utils.arrays import FloatArray
 from armscan.volumes.labelmap import BACKGROUND, TISSUE_LABELS, Found, LabelMap, count_values, replaced, shown
-from armscan.volumes.plane import FloatArray
 
 SEGMENTATION_SUFFIX = ".seg.nrrd"
 OVERLAPS = ("refuse", "first", "last")

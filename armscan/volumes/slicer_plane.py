@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from armscan.errors import InvalidValueError, MarkupError, listed
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_numbers
-from armscan.volumes.plane import FloatArray
 
 # From the file's coordinates to LPS.
 TO_LPS = {"LPS": np.array([1.0, 1.0, 1.0]), "RAS": np.array([-1.0, -1.0, 1.0])}

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.errors import InvalidValueError, VolumeError, printable
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_int, check_numbers
 from armscan.volumes.labelmap import ALLOWED_LABELS, LABEL_NAMES, LANDMARK_LABELS, check_whole, shown
-from armscan.volumes.plane import FloatArray, ManipulatorAction
+from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.rigid_transform import RigidTransform
 from armscan.volumes.slicing import clearance, occupied_depths, sample_plane
 

@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_choice, check_seed
 from armscan.volumes.phantom.tube import Tube, fill_tube
 from armscan.volumes.phantom.varied import draw_varied_wrist
 from armscan.volumes.phantom.wrist import draw_wrist
-from armscan.volumes.plane import FloatArray, ManipulatorAction, shift_into
+from armscan.volumes.plane import ManipulatorAction, shift_into
 from armscan.volumes.volume import LabelVolume
 
 SHAPE = (360, 800, 80)

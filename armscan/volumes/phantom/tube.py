@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 Y, X, Z, RADIUS_X, RADIUS_Z = range(5)
 

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from armscan.utils.arrays import FloatArray
 from armscan.volumes.phantom.tube import RADIUS_X, Tube, X, Y, Z
 from armscan.volumes.phantom.wrist import draw_parts
-from armscan.volumes.plane import FloatArray
 
 # Of version 1, in mm along the arm: half of the distal row, middle and half of the proximal one, where the long bones
 # on either side begin, and where tendons are seen to part and to close up.

@@ -16,7 +16,7 @@ from armscan.config.compose import compose, of_run
 from armscan.sweeps.space.parameter import Value, as_kept
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.tasks.attempt import config_sha256
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 # Of the Sobol sequence's scrambling.
 SEED = 0

@@ -10,7 +10,7 @@ import optuna
 from optuna.importance import FanovaImportanceEvaluator, PedAnovaImportanceEvaluator, get_param_importances
 
 from armscan.stats.bootstrap import Estimate
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.design import places_of, sobol, values_at
 from benchmarks.sweeps.bench.surrogate import Surrogate
 from benchmarks.sweeps.bench.table import Curves

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from armscan.stats.bootstrap import Estimate
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.replay import Rule, scores_of, search
 from benchmarks.sweeps.bench.seed_rules import MOST_SEEDS, SeedRule, allocation, fixed, friedman_race, halving, t_race
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate

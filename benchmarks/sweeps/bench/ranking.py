@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from armscan.stats.aggregation import band_over_seeds, probability_of_improvement
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.replay import Rule, choose, scores_of, search
 from benchmarks.sweeps.bench.surrogate import Surrogate
 

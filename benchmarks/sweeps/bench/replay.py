@@ -17,7 +17,7 @@ from armscan.config.compose import compose
 from armscan.stats.bootstrap import interquartile_mean
 from armscan.sweeps.scheduling.race import race
 from armscan.sweeps.space.parameter import Value
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 # Of one study, a sampler that proposes pruned points again and again must not go on for ever.

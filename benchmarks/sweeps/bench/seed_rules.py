@@ -13,7 +13,7 @@ from scipy.stats import rankdata
 
 from armscan.stats.bootstrap import LEVEL
 from armscan.sweeps.scheduling.race import DROP_LEVEL, PRIOR_DF
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 
 # Seeds that are simulated for each configuration: no rule takes more.
 MOST_SEEDS = 24

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import ttest_ind
 
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.surrogate import Surrogate
 
 N_SEEDS = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 30, 50)

@@ -21,7 +21,7 @@ from scipy.stats import spearmanr
 from sklearn.ensemble import ExtraTreesRegressor
 
 from armscan.sweeps.space.space import Space
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.design import places_of, sobol, values_at
 from benchmarks.sweeps.bench.table import Curves
 

@@ -13,8 +13,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from armscan.sweeps.space.space import Space
+from armscan.utils.arrays import FloatArray
 from armscan.utils.files import atomic_write
-from armscan.volumes.plane import FloatArray
 from benchmarks.sweeps.bench.design import Design, places_of
 
 FOLDER = Path(__file__).parent / "tables"

@@ -14,7 +14,7 @@ from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.warm_start import N_ENQUEUED
-from armscan.volumes.plane import FloatArray
+from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.replay import Rule, Search, search
 from benchmarks.sweeps.bench.surrogate import Surrogate
 from benchmarks.sweeps.bench.table import Curves
