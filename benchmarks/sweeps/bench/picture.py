@@ -54,7 +54,7 @@ def _draw_ranks(axes: Axes, ranks: pd.DataFrame) -> None:
     axes.set_xlim(left=0)
     axes.set_title("what a study chooses, by sampler and pruner")
     axes.grid(alpha=0.3)
-    axes.legend()
+    axes.legend(ncols=3, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.12))
 
 
 def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[str, Choices], *, title: str) -> None:
