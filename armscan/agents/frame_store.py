@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
+
+from armscan.utils.compilation import cached_njit
 
 Pixels = NDArray[np.uint8]
 NO_FRAME = 0
@@ -40,7 +41,7 @@ def decode(frames: list[bytes], n_pixels: int) -> Pixels:
 
 
 # Positions are unsigned: indices that might be negative would cost more than all the rest.
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def _encode(pixels: Pixels, buffer: Pixels) -> int:
     """Write the runs; return how many bytes they are, the number of pixels where it would be as many or more."""
     n_pixels, n_bytes, i = np.uint64(pixels.size), np.uint64(0), np.uint64(0)
@@ -67,7 +68,7 @@ def _encode(pixels: Pixels, buffer: Pixels) -> int:
         n_bytes += three
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def _decode(joined: Pixels, ends: NDArray[np.uint64], pixels: Pixels) -> None:
     """Fill frames from their runs; `ends` says where each one's end in `joined`."""
     n_pixels, at = np.uint64(pixels.shape[1]), np.uint64(0)

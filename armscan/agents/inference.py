@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -20,12 +19,13 @@ from armscan.agents.compute import Compute
 from armscan.agents.policy import batch_of
 from armscan.envs.history import observation_of, parts_of, rows_of
 from armscan.envs.rules import Observed
+from armscan.utils.compilation import cached_njit
 
 Rows = NDArray[np.float32]
 Bounded = Callable[[torch.Tensor], torch.Tensor]
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def linear_rows(rows: Rows, weights: Rows, bias: Rows) -> Rows:
     """Return `rows @ weights.T + bias`; each number is its bias plus the products, added in the order of the inputs.
 

@@ -9,17 +9,18 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from armscan.utils.compilation import cached_njit
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 F = np.float32
 # Arrays are copied by loops: at an assignment to a slice, Numba compiles the text of its shape error, for two seconds.
 # Sums may be reordered, so that loops over them are vectorised. NaN stays NaN: a training that diverges must show it.
-compiled = numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"}, boundscheck=False
+fast_njit = cached_njit(
+    nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"}, boundscheck=False
 )
 
 
@@ -50,14 +51,14 @@ class Layers(NamedTuple):
     gradient: Floats
 
 
-@compiled
+@fast_njit
 def layer_view(values: Floats, sizes: Ints, n_rows: int, which: int) -> Floats:
     """Return a view of one layer, shape (n_rows, sizes[which])."""
     start = n_rows * sizes[:which].sum()
     return values[start : start + n_rows * sizes[which]].reshape(n_rows, sizes[which])
 
 
-@compiled
+@fast_njit
 def linear(x: Floats, weights: Floats, start: int, out: Floats, is_hidden: bool) -> int:
     """Fill a layer's values, of a hidden one after ReLU; returns where the next layer's weights start."""
     n_out: int = out.shape[1]
@@ -71,7 +72,7 @@ def linear(x: Floats, weights: Floats, start: int, out: Floats, is_hidden: bool)
     return end + n_out
 
 
-@compiled
+@fast_njit
 def linear_gradient(x: Floats, d_out: Floats, gradient: Floats, start: int) -> None:
     """Fill the gradient of a layer's weights."""
     n_out, end = d_out.shape[1], start + d_out.shape[1] * x.shape[1]
@@ -83,14 +84,14 @@ def linear_gradient(x: Floats, d_out: Floats, gradient: Floats, start: int) -> N
             d_bias[j] += d_out[i, j]
 
 
-@compiled
+@fast_njit
 def input_gradient(d_out: Floats, weights: Floats, start: int, d_x: Floats) -> None:
     """Fill the gradient of a layer's input."""
     n_out, n_in = d_out.shape[1], d_x.shape[1]
     np.dot(d_out, weights[start : start + n_out * n_in].reshape(n_out, n_in), d_x)
 
 
-@compiled
+@fast_njit
 def forward(weights: Floats, layers: Layers, n_rows: int) -> int:
     """Fill the hidden layers; returns where the weights of the first head start."""
     start: int = 0
@@ -100,7 +101,7 @@ def forward(weights: Floats, layers: Layers, n_rows: int) -> int:
     return start
 
 
-@compiled
+@fast_njit
 def backward(weights: Weights, layers: Layers, n_rows: int, start: int, of_input: bool) -> None:
     """Fill the gradient of the input, or else of all hidden layers' weights, from that of the last layer's values."""
     for which in range(layers.sizes.size - 1, 0, -1):
@@ -118,7 +119,7 @@ def backward(weights: Weights, layers: Layers, n_rows: int, start: int, of_input
             input_gradient(d_out, weights.values, start, d_x)
 
 
-@compiled
+@fast_njit
 def adam_step(weights: Weights, settings: Adam) -> None:
     """Take a step of Adam, as torch's."""
     for i in range(weights.steps.size):

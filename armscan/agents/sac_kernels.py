@@ -20,7 +20,7 @@ from armscan.agents.mlp_kernels import (
     Weights,
     adam_step,
     backward,
-    compiled,
+    fast_njit,
     forward,
     input_gradient,
     layer_view,
@@ -73,7 +73,7 @@ class Agent(NamedTuple):
     tau: float
 
 
-@compiled
+@fast_njit
 def _act(actor: Weights, layers: Layers, noise: Floats) -> Drawn:
     """Draw an action for each observation that the first of the actor's layers holds."""
     n, n_free = noise.shape
@@ -93,7 +93,7 @@ def _act(actor: Weights, layers: Layers, noise: Floats) -> Drawn:
     return Drawn(log_std, std, actions, log_prob)
 
 
-@compiled
+@fast_njit
 def _judge(critic: Floats, layers: Layers, obs: Floats, actions: Floats, values: Floats) -> int:
     """Fill a critic's values, shape (n, 1); returns where the weights of its head start."""
     n, n_obs = obs.shape
@@ -106,7 +106,7 @@ def _judge(critic: Floats, layers: Layers, obs: Floats, actions: Floats, values:
     return head
 
 
-@compiled
+@fast_njit
 def _critic_gradient(critic: Weights, layers: Layers, head: int, d_values: Floats, of_input: bool) -> None:
     """Fill the gradient of a critic's input, or else of its weights, from that of its values."""
     n, last = d_values.shape[0], layers.sizes.size - 1
@@ -116,7 +116,7 @@ def _critic_gradient(critic: Weights, layers: Layers, head: int, d_values: Float
     backward(critic, layers, n, head, of_input)
 
 
-@compiled
+@fast_njit
 def _update_critic(critic: Weights, layers: Layers, adam: Adam, obs: Floats, actions: Floats, returns: Floats) -> float:
     """Take a gradient step of a critic; returns its loss."""
     n = returns.size
@@ -132,7 +132,7 @@ def _update_critic(critic: Weights, layers: Layers, adam: Adam, obs: Floats, act
     return loss / n
 
 
-@compiled
+@fast_njit
 def _update_actor(
     agent: Agent, layers: Layers, critic_layers: Layers, noise: Floats, alpha: np.float32
 ) -> tuple[float, float]:
@@ -169,7 +169,7 @@ def _update_actor(
     return loss / n, mean_log_prob / n
 
 
-@compiled
+@fast_njit
 def _actor_gradient(actor: Weights, layers: Layers, d_mean: Floats, d_log_std: Floats) -> None:
     """Fill the gradient of an actor's weights from that of its two heads."""
     n, n_free, last = d_mean.shape[0], d_mean.shape[1], layers.sizes.size - 1
@@ -187,7 +187,7 @@ def _actor_gradient(actor: Weights, layers: Layers, d_mean: Floats, d_log_std: F
     backward(actor, layers, n, mean_head, False)
 
 
-@compiled
+@fast_njit
 def _update_coefficient(entropy: Entropy, mean_log_prob: float) -> float:
     """Take a gradient step of the entropy coefficient; returns its loss."""
     deficit = entropy.target + mean_log_prob
@@ -197,7 +197,7 @@ def _update_coefficient(entropy: Entropy, mean_log_prob: float) -> float:
     return loss
 
 
-@compiled
+@fast_njit
 def _returns(
     transitions: Transitions,
     index: Ints,
@@ -218,7 +218,7 @@ def _returns(
     return returns
 
 
-@compiled
+@fast_njit
 def _take(rows: Floats, index: Ints, out: Floats) -> None:
     """Fill a batch with its rows."""
     for i in range(index.size):
@@ -226,7 +226,7 @@ def _take(rows: Floats, index: Ints, out: Floats) -> None:
             out[i, j] = rows[index[i], j]
 
 
-@compiled
+@fast_njit
 def update(
     transitions: Transitions,
     indices: Ints,

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armscan.anatomy.connected_components import WORD, IntArray, Pixels, RunArray, Runs, find_runs, number_runs
+from armscan.utils.compilation import cached_njit
 
 
 def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -> IntArray:
@@ -30,13 +30,13 @@ def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -
     return n_inside[n_inside > 0] - 1
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def count_disc_pixels(half_widths: IntArray) -> int:
     """Return how many pixels a disc has, its middle included."""
     return int(2 * np.sum(2 * half_widths + 1) - (2 * half_widths[0] + 1))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _find_core(mask: Pixels, stride: int, margin: int, half_widths: IntArray, min_samples: int, zero: Any) -> Pixels:
     """Return 0 or 1 for each pixel but the margins of a flat mask: whether it is a core pixel.
 
@@ -72,7 +72,7 @@ def _find_core(mask: Pixels, stride: int, margin: int, half_widths: IntArray, mi
     return core
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _reached(shape: tuple[int, int], runs: Runs, numbers: RunArray, half_widths: IntArray, n_clusters: int) -> RunArray:
     """Return for each pixel the lowest cluster with a core pixel within eps, `n_clusters` where there is none."""
     (n_rows, n_cols), (starts, stops, first_run) = shape, runs
@@ -89,7 +89,7 @@ def _reached(shape: tuple[int, int], runs: Runs, numbers: RunArray, half_widths:
     return reached
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def bounding_boxes(slice_xz: Pixels, labels: IntArray) -> IntArray:
     """Return for each label its first row, row after the last, first column and column after the last, shape (n, 4).
 
@@ -117,7 +117,7 @@ def bounding_boxes(slice_xz: Pixels, labels: IntArray) -> IntArray:
     return boxes
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _ends(found: Pixels, bit: np.uint8) -> tuple[int, int]:
     """Return the first place that has the bit, and that after the last; 0 and 0 if none has."""
     first, stop = 0, found.size
@@ -130,7 +130,7 @@ def _ends(found: Pixels, bit: np.uint8) -> tuple[int, int]:
     return first, stop
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _cluster(
     slice_xz: Pixels, label: int, box: IntArray, half_widths: IntArray, min_samples: int
 ) -> tuple[Pixels, RunArray, IntArray]:
@@ -203,7 +203,7 @@ def cluster_label(
     return image, sums[:, 1:] / sums[:, :1], sums[:, 0].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def summarise_label(
     slice_xz: Pixels,
     label: int,

@@ -5,9 +5,10 @@ Two runs in rows d apart touch when the gap between them is at most the disc's h
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from armscan.utils.compilation import cached_njit
 
 IntArray = NDArray[np.int64]
 RunArray = NDArray[np.int32]
@@ -18,7 +19,7 @@ Pixels = NDArray[np.uint8]
 WORD = 8
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def find_runs(image: Pixels, n_cols: int, are_joined: bool) -> Runs:
     """Return the runs of pixels of a binary image; where neighbours in a row are not joined, each pixel is one.
 
@@ -48,7 +49,7 @@ def find_runs(image: Pixels, n_cols: int, are_joined: bool) -> Runs:
     return starts[:n_runs], stops[:n_runs], first_run
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def _find_root(parents: IntArray, run: int) -> int:
     while parents[run] != run:
         parents[run] = parents[parents[run]]
@@ -56,7 +57,7 @@ def _find_root(parents: IntArray, run: int) -> int:
     return run
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def number_runs(runs: Runs, half_widths: IntArray) -> tuple[RunArray, int]:
     """Return the component of each run, from 0 in the order of their first runs, and how many there are."""
     starts, stops, first_run = runs

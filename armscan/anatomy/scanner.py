@@ -16,6 +16,7 @@ from armscan.anatomy.connected_components import WORD, IntArray, Pixels
 from armscan.anatomy.landmarks import Landmarks
 from armscan.anatomy.tissues import N_TISSUES, Tissues
 from armscan.utils.arrays import FloatArray
+from armscan.utils.compilation import cached_njit
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.rigid_transform import NO_MAPS, mapped_plane
 from armscan.volumes.slicing import sample_plane
@@ -27,7 +28,7 @@ Depths = NDArray[np.int32]
 N_AT_ONCE = 4
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def _look(
     labels_yxz: Pixels,
     occupied: Depths,
@@ -53,7 +54,7 @@ def _look(
         summarise_label(slice_xz, label, boxes[tissue], widths, min_samples[which, tissue], landmarks[tissue])
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def _look_all(
     volumes: Sequence[tuple[Pixels, Depths]],
     which: IntArray,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from armscan.envs.observations import SliceGeometry, View
 from armscan.envs.spaces import Parts
 from armscan.errors import InvalidValueError
+from armscan.utils.compilation import cached_njit
 from armscan.utils.validation import check_float, check_numbers
 from armscan.volumes import LANDMARK_LABELS
 
@@ -90,7 +90,7 @@ def _overlaps(n: int, size_mm: float, m: int, pixel_mm: float) -> Overlaps:
     return first, np.where(pixels < m, np.maximum(shares, 0.0), 0.0).astype(np.float32)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _pool(slice_xz: NDArray[np.uint8], across: Overlaps, depth: Overlaps, image: NDArray[np.uint8]) -> None:
     """Fill an image with the share of each pixel that bones, tendons and artery, labels 1 to 3, take."""
     (first_row, row_shares), (first_col, col_shares) = across, depth

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
 
-import numba
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from armscan.anatomy import PUBLISHED_TARGETS, USUAL_PIXEL_MM, Landmarks, TissueClusters, Tissues, check_targets
 from armscan.envs.spaces import Parts
 from armscan.utils.arrays import FloatArray
+from armscan.utils.compilation import cached_njit
 from armscan.utils.validation import check_bool
 
 # Of bones, tendons and artery, at the usual pixel size.
@@ -166,7 +166,7 @@ class ClusterObservation:
         return zero, scale
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _normalise(landmarks: FloatArray, zero: FloatArray, scale: FloatArray, features: NDArray[np.float32]) -> None:
     """Fill the features, shape (n, 12), of summaries of clusters, shape (n, 3, 4): 0 where a tissue is absent."""
     n_numbers = landmarks.shape[2]

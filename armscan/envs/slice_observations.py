@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from armscan.envs.observations import SliceGeometry, View, smallest_shape
 from armscan.envs.spaces import Parts
 from armscan.errors import InvalidValueError
+from armscan.utils.compilation import cached_njit
 from armscan.utils.validation import check_ints
 from armscan.volumes import LABEL_NAMES, LANDMARK_LABELS
 
@@ -51,7 +51,7 @@ class _FramedSlice:
         return view.slice_xz[first[0] : first[0] + crop[0], first[1] : first[1] + crop[1]]
 
 
-@numba.njit(cache=True, nogil=True)
+@cached_njit(nogil=True)
 def _reduce(image: NDArray[np.uint8], reduced: NDArray[np.uint8]) -> None:
     """Fill each pixel with the highest value of the pixels that it stands for."""
     (n_rows, n_cols), (m_rows, m_cols) = image.shape, reduced.shape

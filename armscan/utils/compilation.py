@@ -1,14 +1,52 @@
-"""A line in the log when code is compiled for the first time on a machine, because that takes a while."""
+"""Functions that Numba compiles: their cache, and a line in the log when they are compiled, which takes a while."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
+import numba
 from numba.core.event import Event, Listener, install_listener
 
 from armscan.utils.log import log
+
+PACKAGE = Path(__file__).parents[1]
+Function = TypeVar("Function", bound=Callable[..., Any])
+# A module whose attributes no type checker sees.
+CONFIG: Any = numba.config
+
+
+def cached_njit(**options: Any) -> Callable[[Function], Function]:
+    """Return `numba.njit`, with a cache that is new when any compiled function of armscan has changed.
+
+    Numba itself compares only the file of a function, not those of the compiled functions that it calls, and would go
+    on with their old code.
+
+    Args:
+        options: Options of `numba.njit` beside `cache`.
+    """
+
+    def compiled(function: Function) -> Function:
+        # The user's own setting, such as NUMBA_CACHE_DIR, is put back for the functions of others.
+        before = CONFIG.CACHE_DIR
+        CONFIG.CACHE_DIR = str(Path(before or PACKAGE / "__pycache__") / f"armscan-{_sources_sha256()}")
+        try:
+            return cast(Function, numba.njit(cache=True, **options)(function))
+        finally:
+            CONFIG.CACHE_DIR = before
+
+    return compiled
+
+
+@cache
+def _sources_sha256() -> str:
+    """Return the SHA-256 of all files with compiled functions, its first 16 digits."""
+    sources = (file.read_bytes() for file in sorted(PACKAGE.rglob("*.py")))
+    return sha256(b"".join(source for source in sources if b"njit" in source)).hexdigest()[:16]
 
 
 @contextmanager

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
-import numba
 import numpy as np
 
 from armscan.utils.arrays import FloatArray
+from armscan.utils.compilation import cached_njit
 from armscan.utils.validation import check_numbers
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def rotation_matrix(rz_deg: float, rx_deg: float) -> FloatArray:
     """Return Rz(rz) Rx(rx), 3 x 3: a rotation about X, then one about Z."""
     cos_z, sin_z = math.cos(math.radians(rz_deg)), math.sin(math.radians(rz_deg))
@@ -132,7 +132,7 @@ def plane_distance(
     return abs(offset_mm), math.degrees(math.acos(min(1.0, abs(cos))))
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _offset_and_cosine(
     rotation: tuple[float, float],
     translation: tuple[float, float],

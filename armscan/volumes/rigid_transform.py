@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 
 from armscan.errors import InvalidValueError
 from armscan.utils.arrays import FloatArray
+from armscan.utils.compilation import cached_njit
 from armscan.utils.validation import check_numbers
 from armscan.volumes.plane import ManipulatorAction, rotation_matrix, wrap_deg
 
@@ -19,7 +19,7 @@ LARGEST_SHIFT_MM = 1e6
 NO_MAPS = np.empty((0, 3, 4))
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def _composed(
     outer: FloatArray, outer_mm: FloatArray, inner: FloatArray, inner_mm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -34,7 +34,7 @@ def _composed(
     return matrix, offset_mm
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def mapped_plane(
     maps: FloatArray, rotation: tuple[float, float], translation: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:

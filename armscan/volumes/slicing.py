@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from armscan.utils.compilation import cached_njit
 from armscan.utils.prefetch import prefetch
 
 # Rows that are looked up together, after those voxels of the next ones are asked for; pixels between two of these.
@@ -25,7 +25,7 @@ Lines = tuple[Line, Line, Line]
 Axis = tuple[float, float, float, float]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def occupied_depths(labels_yxz: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Return the depths that a volume's labels occupy: the first, and that after the last, of each block of columns.
 
@@ -48,7 +48,7 @@ def occupied_depths(labels_yxz: NDArray[np.uint8]) -> NDArray[np.int32]:
     return depths
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def sample_plane(
     labels_yxz: NDArray[np.uint8],
     occupied: NDArray[np.int32],
@@ -103,7 +103,7 @@ def clearance(
     return free if free > SMALLEST_CLEARANCE else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _sample(
     labels_yxz: NDArray[np.uint8],
     occupied: NDArray[np.int32],
@@ -154,7 +154,7 @@ def _sample(
             _read(voxels, places[i % (2 * N_ROWS), start:stop], slice_xz[i, start:stop])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _axis(
     axis: int, matrix: NDArray[np.float64], offset_mm: NDArray[np.float64], spacing_mm: float, s_z: float
 ) -> Axis:
@@ -162,7 +162,7 @@ def _axis(
     return matrix[axis, 0], offset_mm[axis], spacing_mm, matrix[axis, 2] * s_z / spacing_mm
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _lines(axes: tuple[Axis, Axis, Axis], across_mm: float) -> Lines:
     """Return the positions, on each axis, of the pixels of a row that begins so far across."""
     (m_x, b_x, s_x, step_x), (m_y, b_y, s_y, step_y), (m_z, b_z, s_z, step_z) = axes
@@ -173,7 +173,7 @@ def _lines(axes: tuple[Axis, Axis, Axis], across_mm: float) -> Lines:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _within_occupied(
     ends: tuple[Lines, Lines], occupied: NDArray[np.int32], shape: tuple[int, int, int], n_depth: int
 ) -> tuple[int, int]:
@@ -192,7 +192,7 @@ def _within_occupied(
     return min(start, start_last), max(stop, stop_last)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _blocks(first: Line, last: Line, n_voxels: int, n_depth: int) -> tuple[int, int]:
     """Return the range of blocks on an axis that pixels of rows from `first` to `last` lie in."""
     farthest = n_depth - 1
@@ -203,7 +203,7 @@ def _blocks(first: Line, last: Line, n_voxels: int, n_depth: int) -> tuple[int, 
     return int(max(lowest, 0.0)) // BLOCK, int(min(highest, n_voxels - 1.0)) // BLOCK + 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _are_inside(ends: tuple[Lines, Lines], shape: tuple[int, int, int], start: int, stop: int) -> bool:
     """Return whether the pixels from `start` to before `stop` of all rows lie in the volume, as those at the ends."""
     for lines in ends:
@@ -214,7 +214,7 @@ def _are_inside(ends: tuple[Lines, Lines], shape: tuple[int, int, int], start: i
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _find_places(lines: Lines, shape: tuple[int, int, int], along: NDArray[np.float64], places: NDArray[Any]) -> None:
     """Fill the places of voxels, those of the pixels with the numbers `along` of a row."""
     (first_x, step_x), (first_y, step_y), (first_z, step_z) = lines
@@ -225,7 +225,7 @@ def _find_places(lines: Lines, shape: tuple[int, int, int], along: NDArray[np.fl
         places[k] = (y * n_x + x) * n_z + np.floor(first_z + step_z * along[k])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _read(voxels: NDArray[np.uint8], places: NDArray[Any], row: NDArray[np.uint8]) -> None:
     """Fill a part of a row of a slice."""
     for k in range(places.size):
@@ -233,7 +233,7 @@ def _read(voxels: NDArray[np.uint8], places: NDArray[Any], row: NDArray[np.uint8
         row[k] = voxels[np.uint64(places[k])]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _within(line: Line, lowest: int, highest: int, start: int, stop: int) -> tuple[int, int]:
     """Return which of the pixels from `start` to before `stop` lie in voxels from `lowest` to before `highest`."""
     first, step = line
@@ -245,7 +245,7 @@ def _within(line: Line, lowest: int, highest: int, start: int, stop: int) -> tup
     return start, _first_beyond(line, leaves, start, stop)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit(nogil=True, error_model="numpy")
 def _first_beyond(line: Line, limit: float, start: int, stop: int) -> int:
     """Return the first pixel that has passed a limit, from which on positions are at least it; `stop` if none has."""
     first, step = line

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from armscan.utils.arrays import FloatArray
+from armscan.utils.compilation import cached_njit
 
 Y, X, Z, RADIUS_X, RADIUS_Z = range(5)
 
@@ -87,7 +87,7 @@ class Tube:
         return Tube(self.label, self.nodes * factor)
 
 
-@numba.njit(cache=True)
+@cached_njit()
 def fill_tube(
     labels_xyz: NDArray[np.uint8],
     spacing_mm: tuple[float, float, float],

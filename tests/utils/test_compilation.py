@@ -1,0 +1,66 @@
+import os
+import shutil
+import subprocess
+import sys
+
+import numba
+import pytest
+
+from armscan.utils.compilation import PACKAGE, cached_njit
+
+CALLER = """
+from armscan.utils.compilation import cached_njit
+from armscan.callee import callee
+
+
+@cached_njit()
+def caller():
+    return callee() + 1
+
+
+print(caller(), sum(caller.stats.cache_hits.values()))
+"""
+CALLEE = "from armscan.utils.compilation import cached_njit\n\n\n@cached_njit()\ndef callee():\n    return {}\n"
+
+
+@pytest.fixture
+def called(tmp_path):
+    """Write what a compiled function of another file returns; return what its compiled caller returns, and its hits."""
+    package = tmp_path / "armscan"
+    shutil.copytree(PACKAGE / "utils", package / "utils", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("__init__.py", "errors.py"):
+        shutil.copy(PACKAGE / name, package / name)
+    (package / "__init__.py").write_text("")
+    (package / "caller.py").write_text(CALLER)
+    variables = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+
+    def run(returned):
+        (package / "callee.py").write_text(CALLEE.format(returned))
+        command = [sys.executable, "-m", "armscan.caller"]
+        env = variables | {"PYTHONPATH": str(tmp_path)}
+        said = subprocess.run(command, cwd=tmp_path, env=env, check=True, capture_output=True, text=True).stdout
+        return tuple(map(int, said.split()))
+
+    return run
+
+
+def test_a_compiled_function_is_cached(called):
+    assert called(1) == (2, 0)
+    assert called(1) == (2, 1)
+
+
+def test_a_compiled_function_follows_a_change_of_another_that_it_calls(called):
+    assert called(1) == (2, 0)
+    assert called(2) == (3, 0)
+
+
+def test_the_cache_of_other_compiled_functions_stays_where_it_was():
+    before = vars(numba.config)["CACHE_DIR"]
+
+    @cached_njit()
+    def three():
+        return 3
+
+    assert three() == 3
+    assert vars(numba.config)["CACHE_DIR"] == before
+    assert "armscan-" in three.stats.cache_path
