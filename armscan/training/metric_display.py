@@ -1,4 +1,4 @@
-"""How metrics are shown: their titles, formats and bounds, and their values and intervals as strings."""
+"""Display of metrics: titles, formats and bounds; values and intervals as strings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How metrics are shown: titles, bounds, and values as strings."""
+"""Display of metrics: titles, bounds, and values as strings."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What a training of a trial reports to its study."""
+"""Training callback that reports to the trial's study."""
 
 from __future__ import annotations
 
