@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from armscan.utils.arrays import FloatArray
 from armscan.utils.compilation import cached_njit
 from armscan.utils.prefetch import prefetch
 
@@ -53,8 +54,8 @@ def sample_plane(
     labels_yxz: NDArray[np.uint8],
     occupied: NDArray[np.int32],
     spacing_mm: tuple[float, float, float],
-    matrix: NDArray[np.float64],
-    offset_mm: NDArray[np.float64],
+    matrix: FloatArray,
+    offset_mm: FloatArray,
     slice_xz: NDArray[np.uint8],
 ) -> None:
     """Fill a slice with the voxels nearest to its points.
@@ -81,8 +82,8 @@ def sample_plane(
 
 def clearance(
     spacing_mm: tuple[float, float, float],
-    matrix: NDArray[np.float64],
-    offset_mm: NDArray[np.float64],
+    matrix: FloatArray,
+    offset_mm: FloatArray,
     shape: tuple[int, int],
 ) -> float:
     """Return how far each number of a plane's matrix and offset may be off without changing a voxel of its slice.
@@ -108,8 +109,8 @@ def _sample(
     labels_yxz: NDArray[np.uint8],
     occupied: NDArray[np.int32],
     spacing_mm: tuple[float, float, float],
-    matrix: NDArray[np.float64],
-    offset_mm: NDArray[np.float64],
+    matrix: FloatArray,
+    offset_mm: FloatArray,
     places: NDArray[Any],
     slice_xz: NDArray[np.uint8],
 ) -> None:
@@ -155,9 +156,7 @@ def _sample(
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def _axis(
-    axis: int, matrix: NDArray[np.float64], offset_mm: NDArray[np.float64], spacing_mm: float, s_z: float
-) -> Axis:
+def _axis(axis: int, matrix: FloatArray, offset_mm: FloatArray, spacing_mm: float, s_z: float) -> Axis:
     """Return what `_lines` requires of an axis with this spacing; steps of pixels in depth are `s_z` mm long."""
     return matrix[axis, 0], offset_mm[axis], spacing_mm, matrix[axis, 2] * s_z / spacing_mm
 
@@ -215,7 +214,7 @@ def _are_inside(ends: tuple[Lines, Lines], shape: tuple[int, int, int], start: i
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def _find_places(lines: Lines, shape: tuple[int, int, int], along: NDArray[np.float64], places: NDArray[Any]) -> None:
+def _find_places(lines: Lines, shape: tuple[int, int, int], along: FloatArray, places: NDArray[Any]) -> None:
     """Fill the places of voxels, those of the pixels with the numbers `along` of a row."""
     (first_x, step_x), (first_y, step_y), (first_z, step_z) = lines
     n_x, n_z = float(shape[0]), float(shape[2])

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from benchmarks.sweeps.bench.replay import Rule, search
-from benchmarks.sweeps.bench.warm_start import Target, best_that_fit, replays, share_of_trials
+from benchmarks.sweeps.bench.warm_start import SimulatedSweep, best_that_fit, replays, share_of_trials
 
 pytestmark = pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
 RULE = Rule("tpe", "none")
@@ -13,20 +13,20 @@ def test_the_best_settings_that_fit_are_tried_first(surrogate):
     found = search(surrogate, "sac_y", RULE, n_trainings=20, seed=0)
     space = surrogate.space
     fitting = best_that_fit(found, space)
-    assert fitting == [each.values for each in found.candidates[:5]]
+    assert list(fitting) == [each.values for each in found.candidates[:5]]
     begun = search(surrogate, "sac_y", RULE, n_trainings=20, seed=1, enqueued=fitting)
     first = sorted(begun.candidates, key=lambda each: each.number)[:5]
-    assert [each.values for each in first] == fitting
+    assert [each.values for each in first] == list(fitting)
 
 
 def test_values_outside_of_the_space_are_left_out(surrogate):
     found = search(surrogate, "sac_y", RULE, n_trainings=20, seed=0)
     outside = tuple(replace(each, values=each.values | {"agent.lr": 1.0}) for each in found.candidates)
-    assert best_that_fit(replace(found, candidates=outside), surrogate.space) == []
+    assert best_that_fit(replace(found, candidates=outside), surrogate.space) == ()
 
 
 def test_a_warm_start_from_the_same_space_saves_trials(surrogate):
-    target = Target("sac_y", surrogate, RULE, 40)
+    target = SimulatedSweep("sac_y", surrogate, RULE, 40)
     studies = replays(target, target, 8)
     share = share_of_trials(studies)
     assert share.low <= share.value <= share.high

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -155,7 +155,9 @@ def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], stor
     if difference is None:
         taken = tuple(_taken(name, trial, chosen, settings.space) for trial, chosen in fitting)
         return Beginning(SOURCE.format(name), f"{told}{len(taken)} taken with their values{left}", taken)
-    first = _best_different(source, {trial.number: chosen for trial, chosen in fitting if chosen})
+    settings_of = {trial.number: chosen for trial, chosen in fitting if chosen}
+    best = best_trials(source, NO_LIMIT)
+    first = first_different(settings_of[trial.number] for trial in best if trial.number in settings_of)
     told += f"none taken with its value, because {difference}; the settings of the best {len(first)} are tried first"
     return Beginning(SOURCE.format(name), told + left, (), first)
 
@@ -199,10 +201,13 @@ def _plain(flat: Mapping[str, Any]) -> dict[str, Value]:
     return {key: as_kept(json.loads(value) if is_list[key] else value) for key, value in flat.items()}
 
 
-def _best_different(source: optuna.Study, chosen: Mapping[int, dict[str, Value]]) -> tuple[dict[str, Value], ...]:
-    """Return the different settings of a study's best trials, among those with the numbers in `chosen`."""
-    best = [chosen[trial.number] for trial in best_trials(source, NO_LIMIT) if trial.number in chosen]
-    return tuple({json.dumps(each, sort_keys=True): each for each in reversed(best)}.values())[::-1][:N_ENQUEUED]
+def first_different(settings: Iterable[dict[str, Value]]) -> tuple[dict[str, Value], ...]:
+    """Return the first five different settings, those that a warm start tries first."""
+    first: list[dict[str, Value]] = []
+    for each in settings:
+        if len(first) < N_ENQUEUED and each not in first:
+            first.append(each)
+    return tuple(first)
 
 
 def _taken(name: str, trial: FrozenTrial, chosen: dict[str, Value], space: Space) -> FrozenTrial:

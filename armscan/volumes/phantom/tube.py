@@ -91,9 +91,9 @@ class Tube:
 def fill_tube(
     labels_xyz: NDArray[np.uint8],
     spacing_mm: tuple[float, float, float],
-    matrix: NDArray[np.float64],
-    origin_mm: NDArray[np.float64],
-    nodes: NDArray[np.float64],
+    matrix: FloatArray,
+    origin_mm: FloatArray,
+    nodes: FloatArray,
     label: int,
 ) -> None:
     """Label the background voxels of a volume that lie in a tube.

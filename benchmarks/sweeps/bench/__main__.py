@@ -17,8 +17,8 @@ from pathlib import Path
 import optuna
 
 from benchmarks.sweeps.bench.collect import collect
-from benchmarks.sweeps.bench.report import report
-from benchmarks.sweeps.bench.warm_start import Target, replays, share_of_trials
+from benchmarks.sweeps.bench.report import report, with_interval
+from benchmarks.sweeps.bench.warm_start import SimulatedSweep, replays, share_of_trials
 
 
 def main() -> None:
@@ -48,9 +48,9 @@ def main() -> None:
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.simplefilter("ignore")
     if given.command == "warm-start":
-        studies = replays(Target.of(given.source), Target.of(given.target), given.studies)
+        studies = replays(SimulatedSweep.of(given.source), SimulatedSweep.of(given.target), given.studies)
         print(studies.to_string())
-        print("trials with a warm start, of those without: {:.2f} ({:.2f} to {:.2f})".format(*share_of_trials(studies)))
+        print(f"trials with a warm start, of those without: {with_interval(share_of_trials(studies), '.2f')}")
     else:
         report(
             given.sweep,

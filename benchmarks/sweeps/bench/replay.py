@@ -39,6 +39,10 @@ class Rule:
     n_seeds: int = 1
 
 
+# The rule of a study of armscan by default.
+DEFAULT = Rule("tpe", "median")
+
+
 @dataclass(frozen=True)
 class Candidate:
     """A trial that ran to its end.

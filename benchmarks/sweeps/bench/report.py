@@ -12,13 +12,11 @@ from benchmarks.sweeps.bench.importance import Key, keys_of
 from benchmarks.sweeps.bench.picture import draw
 from benchmarks.sweeps.bench.races import FIXED, N_SEEDS, RACES, Choices, Comparison, candidates_of, choices_of, compare
 from benchmarks.sweeps.bench.ranking import ranked, rules, studies_of
-from benchmarks.sweeps.bench.replay import Rule
+from benchmarks.sweeps.bench.replay import DEFAULT
 from benchmarks.sweeps.bench.seeds import chance_of_good, needed_seeds, power_of
 from benchmarks.sweeps.bench.surrogate import Surrogate, fit_of
 from benchmarks.sweeps.bench.table import Curves
 
-# What a study of armscan does by default.
-DEFAULT = Rule("tpe", "median")
 # Candidates of the races, beside the control: those of the default study, and more.
 TOP_KS = (3, 8)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,15 +14,15 @@ from armscan.config.compose import compose
 from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.space.space import Space
-from armscan.sweeps.study.warm_start import N_ENQUEUED
+from armscan.sweeps.study.warm_start import first_different
 from armscan.utils.arrays import FloatArray
-from benchmarks.sweeps.bench.replay import Rule, Search, search
+from benchmarks.sweeps.bench.replay import DEFAULT, Rule, Search, search
 from benchmarks.sweeps.bench.surrogate import Surrogate
 from benchmarks.sweeps.bench.table import Curves
 
 
-class Target(NamedTuple):
-    """A sweep whose studies begin with the best settings of another one.
+class SimulatedSweep(NamedTuple):
+    """A sweep, and how its studies are simulated.
 
     Args:
         sweep: Name of the sweep.
@@ -36,15 +37,15 @@ class Target(NamedTuple):
     n_trainings: int
 
     @classmethod
-    def of(cls, sweep: str) -> Target:
+    def of(cls, sweep: str) -> SimulatedSweep:
         """Return a sweep with the table of its trainings, and with the seeds and the number of trials that it has."""
         study = compose([f"sweep={sweep}"]).study
         n_seeds = len(study.seeds)
-        rule = Rule("tpe", "median", n_seeds)
+        rule = replace(DEFAULT, n_seeds=n_seeds)
         return cls(sweep, Surrogate.of(Curves.read(sweep)), rule, study.n_trials * n_seeds)
 
 
-def replays(source: Target, target: Target, n_studies: int) -> pd.DataFrame:
+def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> pd.DataFrame:
     """Simulate each study cold and with a warm start from a study of the source, with the same seeds.
 
     Args:
@@ -66,14 +67,10 @@ def replays(source: Target, target: Target, n_studies: int) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def best_that_fit(found: Search, space: Space) -> list[dict[str, Value]]:
+def best_that_fit(found: Search, space: Space) -> tuple[dict[str, Value], ...]:
     """Return the different settings of the best trials whose values lie in a space, as a study's warm start does."""
-    fitting = []
-    for each in found.candidates:
-        chosen, misfit = space.fit(each.values, partly=True)
-        if chosen and misfit is None and chosen not in fitting:
-            fitting.append(chosen)
-    return fitting[:N_ENQUEUED]
+    fits = (space.fit(each.values, partly=True) for each in found.candidates)
+    return first_different(chosen for chosen, misfit in fits if chosen and misfit is None)
 
 
 def share_of_trials(studies: pd.DataFrame) -> Estimate:
@@ -87,7 +84,7 @@ def share_of_trials(studies: pd.DataFrame) -> Estimate:
     return Estimate(float(share(*samples)), *map(float, drawn.confidence_interval))
 
 
-def _search(target: Target, seed: int, enqueued: Sequence[Mapping[str, Value]] = ()) -> Search:
+def _search(target: SimulatedSweep, seed: int, enqueued: Sequence[Mapping[str, Value]] = ()) -> Search:
     sweep, surrogate, rule, n_trainings = target
     return search(surrogate, sweep, rule, n_trainings=n_trainings, seed=seed, enqueued=enqueued)
 
