@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from armscan.utils.processes import collect_garbage_rarely, limit_threads
+from armscan.utils.processes import collect_garbage_rarely, limit_threads, no_garbage_collection
 
 limit_threads()
 collect_garbage_rarely()
@@ -56,7 +56,8 @@ def run(config: DictConfig) -> None:
     print(f"preparing data={invocation.choices['data']}, agent={invocation.choices['agent']}{made}", flush=True)
     try:
         # Deferred: a mistake on the command line should be answered before torch and the like are loaded.
-        from armscan.experiment.runner import run_experiment
+        with no_garbage_collection():
+            from armscan.experiment.runner import run_experiment
 
         run_experiment(config, invocation)
     except KeyboardInterrupt as error:

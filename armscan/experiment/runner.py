@@ -43,6 +43,7 @@ from armscan.utils.files import (
     folder_lock,
     named_if_full,
 )
+from armscan.utils.processes import no_garbage_collection
 
 # First seeds of the episodes that are played for each purpose, so that none is played for two; see also `results`.
 VALIDATION_SEED, VIDEO_SEED = 10**6, 4 * 10**6
@@ -58,11 +59,13 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     """
     check_keys(config)
     job = invocation.job
+    told = compilation_told(COMPILING, lambda dispatcher: dispatcher.py_func.__module__.startswith(OF_ENVIRONMENT))
     with folder_lock(invocation.folder):
         check_free(invocation.folder)
-        with compilation_told(COMPILING, lambda dispatcher: dispatcher.py_func.__module__.startswith(OF_ENVIRONMENT)):
-            setup = set_up(config)
-        tracked = start_tracking(config, invocation, setup)
+        with no_garbage_collection():
+            with told:
+                setup = set_up(config)
+            tracked = start_tracking(config, invocation, setup)
         return run_tracked(setup, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
 
 
@@ -123,10 +126,11 @@ def run_tracked(
         record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)
         keep_results(tracked, result, reached, folder)
         if isinstance(setup.agent, Learner):
-            # Deferred: exporting a policy loads more than training does, and is the last that a run does.
-            from armscan.policies.build import save_policy
+            with no_garbage_collection():
+                # Deferred: exporting a policy loads more than training does, and is the last that a run does.
+                from armscan.policies.build import save_policy
 
-            save_policy(setup.agent, setup.test_env, tracked, folder, tell)
+                save_policy(setup.agent, setup.test_env, tracked, folder, tell)
     if job_label is None:
         files = (RESULTS_PAGE, *((LEARNING_CURVE_FILE,) if result else ()), VIDEO_FILE)
         print_where_to_look(folder, tracking_uri, files=files)

@@ -1,11 +1,12 @@
 """Measure evaluation of episodes side by side against the same episodes one by one, in one run.
 
-    python -m benchmarks.speed.evaluation [PART-OF-A-NAME ...]
+    python -m benchmarks.speed.evaluation [--before CHECKOUT] [PART-OF-A-NAME ...]
 
 Each agent plays a validation (48 episodes) or a final evaluation (200) on phantoms, one by one and side by side, in
 turn; the episodes must be the same to the bit. The first column is how policies were asked before: one by one, through
 Tianshou. Measured is the processor time of one core; the figures to quote are the ratios, each the median over the
-rounds.
+rounds. With `--before`, another process plays as many episodes with the code of that checkout, and an agent that it has
+trained itself.
 """
 
 from __future__ import annotations
@@ -15,24 +16,29 @@ import os
 for _variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ[_variable] = "1"
 
+import argparse
+import json
 import statistics
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from tianshou.data import Batch
 
+# Only what an earlier checkout has, too; the rest is imported where it is used.
 from armscan.agents import MLP, PPO, SAC, Agent, AgentSetup, Compute, Exhaustive, Learner, OptunaSearch, Random
-from armscan.agents.policy import batch_of
-from armscan.agents.tianshou_learner import TianshouLearner
 from armscan.envs import EnvFactory
-from armscan.envs.actions import ActionBounds
 from armscan.training import Evaluation, evaluate
-from armscan.training.episodes import play
-from armscan.utils.log import silence_libraries
 from armscan.volumes import load_phantoms
+
+if TYPE_CHECKING:
+    from armscan.agents.tianshou_learner import TianshouLearner
+    from armscan.envs.actions import ActionBounds
 
 N_ROUNDS, SEED = 3, 10**6
 VOLUMES = range(8)
@@ -81,6 +87,8 @@ class ThroughTianshou:
 
     def act(self, observation, reward: float):
         """Return the policy's action."""
+        from armscan.agents.policy import batch_of
+
         with torch.no_grad():
             result = self._policy(Batch(obs=batch_of([observation]), info=Batch()))
         return np.asarray(self._policy.map_action(result.act.numpy())[0])
@@ -88,6 +96,8 @@ class ThroughTianshou:
 
 def one_by_one(agent: Agent, env, n_episodes: int) -> Evaluation:
     """Play the episodes of `evaluate` one after another."""
+    from armscan.training.episodes import play
+
     names = list(env.get_wrapper_attr("volumes"))
     return Evaluation(tuple(play(agent, env, names[i % len(names)], SEED + i) for i in range(n_episodes)))
 
@@ -99,30 +109,77 @@ def measured(task) -> tuple[float, Evaluation]:
     return time.process_time() - start_s, evaluation
 
 
-def main(words: list[str]) -> None:
-    """Measure every case and print its row."""
+def serve() -> None:
+    """Answer each case that is asked for with the seconds and the mean steps of its evaluation."""
+    torch.set_num_threads(1)
+    players = {}
+    for line in sys.stdin:
+        env_factory, algorithm, n_env_steps, n_episodes = CASES[case := json.loads(line)]
+        if case not in players:
+            players[case] = made(env_factory, algorithm, n_env_steps), env_factory.make_env(load_phantoms(VOLUMES))
+            # Compiles.
+            evaluate(*players[case], n_episodes=2, seed=0)
+        seconds, evaluation = measured(partial(evaluate, *players[case], n_episodes=n_episodes, seed=SEED))
+        print(json.dumps([seconds, evaluation.mean_steps]), flush=True)
+
+
+def measure(case: str, before: Callable[[str], list[float]] | None) -> str:
+    """Return the row of a case.
+
+    Args:
+        case: Name of the case.
+        before: Returns the seconds and the mean steps of the code before; None without another checkout.
+    """
+    from armscan.agents.tianshou_learner import TianshouLearner
+
+    env_factory, algorithm, n_env_steps, n_episodes = CASES[case]
+    agent, env = made(env_factory, algorithm, n_env_steps), env_factory.make_env(load_phantoms(VOLUMES))
+    # Compiles.
+    evaluate(agent, env, n_episodes=2, seed=0)
+    rounds, n_steps = [], float("nan")
+    slow = ThroughTianshou(agent) if isinstance(agent, TianshouLearner) else agent
+    for _ in range(N_ROUNDS):
+        slow_s, _ = measured(partial(one_by_one, slow, env, n_episodes))
+        alone_s, alone = measured(partial(one_by_one, agent, env, n_episodes))
+        together_s, together = measured(partial(evaluate, agent, env, n_episodes=n_episodes, seed=SEED))
+        assert together == alone, "the episodes differ"
+        before_s = []
+        if before:
+            seconds, n_steps = before(case)
+            before_s.append(seconds)
+        rounds.append((together_s, alone_s, slow_s, *before_s))
+    together_s, alone_s, *others_s = (statistics.median(each) for each in zip(*rounds, strict=True))
+    cells = [f"{together.mean_steps:.1f}", f"{together_s:.2f}", f"{alone_s:.2f}"]
+    for place, other_s in enumerate(others_s, start=2):
+        cells += [f"{other_s:.2f}", f"{statistics.median(each[place] / each[0] for each in rounds):.1f}"]
+    return " | ".join(("", case, *cells, *([f"{n_steps:.1f}"] if before else []), "")).strip()
+
+
+def main() -> None:
+    """Print the table, or play episodes for another process that does."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--before", type=Path, metavar="CHECKOUT", help="Another checkout to measure beside this one.")
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("parts", nargs="*", help="Parts of the names of cases. Default: all cases.")
+    given = parser.parse_args()
+    if given.serve:
+        serve()
+        return
+    from armscan.utils.log import silence_libraries
+    from benchmarks.speed.checkouts import ask, end, start
+
     silence_libraries()
     torch.set_num_threads(1)
-    print("| agent | mean steps | through Tianshou, s | one by one, s | side by side, s | times as fast as the first |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for name, (env_factory, algorithm, n_env_steps, n_episodes) in CASES.items():
-        if words and not any(word in name for word in words):
-            continue
-        agent, env = made(env_factory, algorithm, n_env_steps), env_factory.make_env(load_phantoms(VOLUMES))
-        # Compiles.
-        evaluate(agent, env, n_episodes=2, seed=0)
-        rounds = []
-        before = ThroughTianshou(agent) if isinstance(agent, TianshouLearner) else agent
-        for _ in range(N_ROUNDS):
-            before_s, _ = measured(partial(one_by_one, before, env, n_episodes))
-            alone_s, alone = measured(partial(one_by_one, agent, env, n_episodes))
-            together_s, together = measured(partial(evaluate, agent, env, n_episodes=n_episodes, seed=SEED))
-            assert together == alone, "the episodes differ"
-            rounds.append((before_s, alone_s, together_s))
-        ratio = statistics.median(before_s / together_s for before_s, _, together_s in rounds)
-        seconds = " | ".join(f"{statistics.median(each):.2f}" for each in zip(*rounds, strict=True))
-        print(f"| {name} | {together.mean_steps:.1f} | {seconds} | {ratio:.1f} |", flush=True)
+    columns = ["agent", "mean steps", "side by side, s", "one by one, s", "through Tianshou, s", "ratio"]
+    process = start(__file__, given.before) if given.before else None
+    columns += ["before, s", "ratio", "its mean steps"] if process else []
+    print(f"| {' | '.join(columns)} |\n|{' --- |' * len(columns)}")
+    for case in CASES:
+        if not given.parts or any(part in case for part in given.parts):
+            print(measure(case, partial(ask, process) if process else None), flush=True)
+    if process:
+        end(process)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

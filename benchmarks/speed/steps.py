@@ -11,16 +11,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).resolve().parents[2]
 N_STEPS = 2000
 CASES: dict[str, tuple[int, dict[str, Any]]] = {
     "one environment": (1, {}),
@@ -44,12 +41,15 @@ def main() -> None:
     if given.serve:
         serve()
         return
-    processes = [_process(each.resolve()) for each in (HERE, given.before) if each]
+    # Deferred: a process that serves another checkout has that checkout's benchmarks.
+    from benchmarks.speed.checkouts import HERE, ask, end, start
+
+    processes = [start(__file__, each) for each in (HERE, given.before) if each]
     for case in CASES:
         for process in processes:
-            _ask(process, case)
+            ask(process, case)
     print("| | us a step | before | ratio | least | most |\n| --- | --- | --- | --- | --- | --- |")
-    rounds = [{case: [_ask(each, case) for each in processes] for case in CASES} for _ in range(given.rounds)]
+    rounds = [{case: [ask(each, case) for each in processes] for case in CASES} for _ in range(given.rounds)]
     for case in CASES:
         medians = [statistics.median(each[case][which] for each in rounds) for which in range(len(processes))]
         ratios = sorted(each[case][-1] / each[case][0] for each in rounds)
@@ -58,23 +58,7 @@ def main() -> None:
             f"| {ratios[0]:.2f} | {ratios[-1]:.2f} |"
         )
     for process in processes:
-        process.stdin.close()
-        process.wait()
-
-
-def _process(checkout: Path) -> Any:
-    return subprocess.Popen(
-        [sys.executable, __file__, "--serve"],
-        env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-
-
-def _ask(process: Any, case: str) -> float:
-    print(json.dumps(case), file=process.stdin, flush=True)
-    return float(process.stdout.readline())
+        end(process)
 
 
 def serve() -> None:

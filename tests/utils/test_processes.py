@@ -4,7 +4,7 @@ import gc
 import subprocess
 from pathlib import Path
 
-from armscan.utils.processes import child_command
+from armscan.utils.processes import child_command, no_garbage_collection
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,3 +24,13 @@ def test_child_that_is_interrupted_while_it_imports_ends_as_interrupted(tmp_path
     ended = subprocess.run(child_command("slow_import", "run"), cwd=tmp_path, capture_output=True, text=True)
     assert ended.returncode == 130
     assert not ended.stderr
+
+
+def test_objects_made_without_garbage_collection_are_never_looked_through_again():
+    try:
+        with no_garbage_collection():
+            assert not gc.isenabled()
+        assert gc.isenabled()
+        assert gc.get_freeze_count() > 0
+    finally:
+        gc.unfreeze()
