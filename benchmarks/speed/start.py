@@ -1,4 +1,4 @@
-"""Processor time of commands until they answer, and of a run until its first training step, in fresh processes.
+"""Processor time of commands until they answer, and of a run until it trains, in fresh processes.
 
     python -m benchmarks.speed.start [--before CHECKOUT]
 
@@ -21,17 +21,9 @@ from pathlib import Path
 N_PROCESSES = 3
 HERE = Path(__file__).resolve().parents[2]
 RUN = "import sys; from armscan.__main__ import main; sys.exit(main())"
-# Ends a run where its learner would take the first step.
-UNTIL_TRAINING = """
-import os, sys
-import armscan.agents.tianshou_learner as learner
-learner.TianshouLearner.warm_up = lambda self: os._exit(0)
-sys.argv = ["armscan", *sys.argv[1:]]
-from armscan.run import main
-main()
-"""
 VOLUMES = str(HERE / "tests" / "data" / "volumes")
 STUDY = ("run", "-m", "sweep=sac_y", "study.workers=1")
+UNTIL_IT_TRAINS = (("run",), "training for at most")
 # A command, and the beginning of the line that ends it; None if it ends by itself.
 COMMANDS = {
     "first line of `run`": (("run",), ""),
@@ -47,7 +39,7 @@ COMMANDS = {
     "`ui`, without its servers": (("ui", "--mlflow-port", "5998", "--dashboard-port", "5999"), "runs "),
     "`data inspect`, four volumes": (("data", "inspect", VOLUMES), None),
     "MLflow alone, its store opened": (None, None),
-    "`run`, until the first training step": ((), None),
+    "`run`, until it trains": UNTIL_IT_TRAINS,
 }
 STORE = "from mlflow import MlflowClient; MlflowClient('sqlite:///mlruns.db').search_experiments()"
 
@@ -58,10 +50,10 @@ def processor_s(checkout: Path, folder: str, words: tuple[str, ...] | None, unti
     Args:
         checkout: Folder of the code.
         folder: Working folder.
-        words: Words of the command; none for a run until its first training step, None for MLflow alone.
+        words: Words of the command; None for MLflow alone.
         until: Beginning of the printed line at which the process is killed; None, if it ends by itself.
     """
-    program = STORE if words is None else (RUN if words else UNTIL_TRAINING)
+    program = STORE if words is None else RUN
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with subprocess.Popen(
         [sys.executable, "-c", program, *(words or ())],
@@ -89,7 +81,7 @@ def main() -> None:
     print(f"| processor seconds | {' | '.join(checkouts)} |\n| --- |{' ---: |' * len(checkouts)}")
     with tempfile.TemporaryDirectory() as folder:
         for checkout in checkouts.values():
-            processor_s(checkout, folder, (), None)
+            processor_s(checkout, folder, *UNTIL_IT_TRAINS)
         for name, command in COMMANDS.items():
             rounds = [[processor_s(each, folder, *command) for each in checkouts.values()] for _ in range(N_PROCESSES)]
             least = (min(column) for column in zip(*rounds, strict=True))
