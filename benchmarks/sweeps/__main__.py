@@ -2,6 +2,8 @@
 
     python -m benchmarks.sweeps compare [folder=FOLDER] [trials=60] [shortest_s=6] [longest_s=30]
                                         the workers' time spent in trials, beside Hydra's own Optuna sweeper
+    python -m benchmarks.sweeps same_budget [folder=FOLDER] [replicates=4] [seeds=4]
+                                        what both find with the same processor time, by real trainings
     python -m benchmarks.sweeps idle [folder=FOLDER] [trials=60] [shortest_s=1] [longest_s=5]
                                         the same of armscan alone, with trials that are over soon
     python -m benchmarks.sweeps beside [folder=FOLDER] [trials=4]
@@ -9,10 +11,16 @@
     python -m benchmarks.sweeps kill [folder=FOLDER] [trials=200] [every_s=20] [storage=journal]
                                         200 trials, workers killed, the storage (or sqlite, postgresql) away twice
 
-But for `beside`, trials only wait (`benchmarks/sweeps/sleeping.py`), so that four workers can be had on two cores.
+But for `same_budget` and `beside`, trials only wait (`benchmarks/sweeps/sleeping.py`), so that four workers can be had
+on two cores.
 """
 
 from __future__ import annotations
+
+import os
+
+# Before the libraries that start threads are imported.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
 import tempfile
@@ -25,8 +33,15 @@ from benchmarks.sweeps.compare_sweepers import compare
 from benchmarks.sweeps.kill_workers import kill
 from benchmarks.sweeps.occupancy import idle
 from benchmarks.sweeps.overhead import beside
+from benchmarks.sweeps.same_budget import same_budget
 
-MEASURES: dict[str, Callable[..., None]] = {"compare": compare, "idle": idle, "beside": beside, "kill": kill}
+MEASURES: dict[str, Callable[..., None]] = {
+    "compare": compare,
+    "same_budget": same_budget,
+    "idle": idle,
+    "beside": beside,
+    "kill": kill,
+}
 
 
 def main(words: list[str]) -> None:

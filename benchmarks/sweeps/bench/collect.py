@@ -75,6 +75,31 @@ def trained_rows(words: Sequence[str], training: Mapping[str, Any], values: dict
         training: Columns that every row has, such as the seed.
         values: Values of the configuration by name.
     """
+    recorder = _Recorder()
+    result, tested = train_and_test([*words], values, int(training["seed"]), [recorder])
+    last = {
+        "volumes": TEST,
+        "env_steps": result.best.n_env_steps,
+        "processor_s": recorder.epochs[-1]["processor_s"],
+        **_shortened(tested.metrics()),
+    }
+    return [{**training, **epoch, **values} for epoch in (*recorder.epochs, last)]
+
+
+def train_and_test(
+    words: Sequence[str], values: Mapping[str, Any], seed: int, callbacks: Sequence[Any] = ()
+) -> tuple[Any, Any]:
+    """Train a configuration with a seed to its end as a trial would, and evaluate its best epoch on the test volumes.
+
+    Args:
+        words: Overrides of the configuration, as on the command line.
+        values: Values of the configuration by name.
+        seed: Seed of the training.
+        callbacks: Callbacks of the training. Default: none.
+
+    Returns:
+        The result of the training, and the evaluation.
+    """
     from armscan.config.compose import compose_run
     from armscan.experiment.build import build_experiment
     from armscan.experiment.results import TEST_VOLUMES_SEED
@@ -85,20 +110,12 @@ def trained_rows(words: Sequence[str], training: Mapping[str, Any], values: dict
     from armscan.utils.log import silence_libraries
 
     silence_libraries()
-    config, _ = compose_run([*words, *overrides_of(values), f"seed={training['seed']}"])
+    config, _ = compose_run([*words, *overrides_of(values), f"seed={seed}"])
     setup = build_experiment(config, volumes_of(config))
-    recorder = _Recorder()
     with tempfile.TemporaryDirectory() as folder:
-        result = train_agent(setup, Path(folder), [recorder], run_id="bench", tell=lambda _: None)
-    seed = TEST_VOLUMES_SEED + setup.seed
-    tested = evaluate(setup.agent, setup.test_env, n_episodes=setup.n_episodes, seed=seed, on_plane=setup.on_plane)
-    last = {
-        "volumes": TEST,
-        "env_steps": result.best.n_env_steps,
-        "processor_s": recorder.epochs[-1]["processor_s"],
-        **_shortened(tested.metrics()),
-    }
-    return [{**training, **epoch, **values} for epoch in (*recorder.epochs, last)]
+        result = train_agent(setup, Path(folder), callbacks, run_id="bench", tell=lambda _: None)
+    episodes = {"n_episodes": setup.n_episodes, "seed": TEST_VOLUMES_SEED + setup.seed, "on_plane": setup.on_plane}
+    return result, evaluate(setup.agent, setup.test_env, **episodes)
 
 
 @dataclass

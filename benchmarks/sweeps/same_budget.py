@@ -1,0 +1,180 @@
+"""Compare the configurations that armscan and Hydra's Optuna sweeper find with the same processor time.
+
+    python -m benchmarks.sweeps same_budget [folder=FOLDER] [replicates=4] [seeds=4]
+
+A replicate is a search by each, with the replicate's number as the seed of its sampler. Both have the same space, try
+the same presets first and train one trial at a time, to the same objective (`benchmarks.sweeps.searches`):
+
+- armscan: a study with its default sampler, pruner and choice. The search ends when what is left of the budget is used
+  by the first round of the race: each candidate's own processor time, and for the default configuration the mean. The
+  race goes on until the budget is used, and what it names is the choice after its last complete round of seeds.
+- Hydra's Optuna sweeper: its default sampler. The best value when the budget is used is its answer.
+
+A trial begins as long as the budget is not used, and then runs to its end. What each names and the default
+configuration are trained with seeds that nothing else has used, and judged by the objective on the test volumes. Each
+result is a line of `results.jsonl`, so that the same command goes on after an end; a search that was cut off begins
+again. `replicates=0` prints the table of what is there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from statistics import fmean
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from armscan.stats.paired import paired_difference
+from armscan.utils.arrays import FloatArray
+from armscan.utils.log import silence_libraries
+from benchmarks.sweeps.bench.collect import train_and_test
+from benchmarks.sweeps.bench.report import markdown, with_interval
+from benchmarks.sweeps.searches import NAME, WITHOUT_END, Answer, search_by_armscan, search_by_hydra
+
+
+class Task(NamedTuple):
+    """A sweep, and the processor seconds of a search: some 20 whole trials."""
+
+    words: tuple[str, ...]
+    budget_s: float
+
+
+TASKS = {
+    "sac_y": Task(("sweep=sac_y",), 175.0),
+    "sac_zy": Task(("sweep=sac_zy", "training.env_steps=8000", "training.eval_every_env_steps=1000"), 250.0),
+}
+ARMSCAN, HYDRA, DEFAULT = "armscan", "hydra", "default"
+Search = Callable[[Sequence[str], float, Path], Answer]
+SEARCHES: dict[str, Search] = {ARMSCAN: search_by_armscan, HYDRA: search_by_hydra}
+# The first seed of the judgement, above those of studies.
+FIRST_SEED, SEEDS_APART = 5000, 100
+OBJECTIVE = "mean_steps"
+SHORT = ("training.env_steps=3000", "training.eval_every_env_steps=1000")
+Row = dict[str, Any]
+
+
+class Results:
+    """Results in a file, a line of JSON each."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self.rows: list[Row] = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+    def find(self, **known: Any) -> Row | None:
+        """Return the first row with these cells."""
+        return next((row for row in self.rows if known.items() <= row.items()), None)
+
+    def add(self, **row: Any) -> Row:
+        """Append a row."""
+        with self._file.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        self.rows.append(row)
+        return row
+
+
+def same_budget(folder: Path, *, replicates: int = 4, seeds: int = 4) -> None:
+    """Search and judge what is missing, and print the table after each replicate."""
+    silence_libraries()
+    results = Results(folder / "results.jsonl")
+    with contextlib.chdir(folder):
+        for replicate in range(replicates):
+            for name in TASKS:
+                _replicate(results, name, replicate, seeds)
+            print(table(results.rows), flush=True)
+    if not replicates:
+        print(table(results.rows))
+
+
+def _replicate(results: Results, name: str, replicate: int, n_seeds: int) -> None:
+    task, known = TASKS[name], {"task": name, "replicate": replicate}
+    # In turn the first.
+    for side in (ARMSCAN, HYDRA) if replicate % 2 else (HYDRA, ARMSCAN):
+        if results.find(side=side, **known) is None:
+            # A process's first trial imports and compiles what the others find.
+            _search(ARMSCAN, [*task.words, *SHORT], 0.1, replicate)
+            answer = _search(side, task.words, task.budget_s, replicate)
+            print(name, replicate, side, answer, flush=True)
+            results.add(**known, side=side, **asdict(answer))
+    answers = {DEFAULT: {}, **{side: results.find(side=side, **known)["values"] for side in SEARCHES}}
+    for seed in range(FIRST_SEED + SEEDS_APART * replicate, FIRST_SEED + SEEDS_APART * replicate + n_seeds):
+        for values in answers.values():
+            if results.find(task=name, values=values, seed=seed) is None:
+                _, tested = train_and_test(task.words, values, seed)
+                scores = {volume: each.metrics()[OBJECTIVE] for volume, each in tested.by_volume().items()}
+                results.add(**known, values=values, seed=seed, scores=scores)
+
+
+def _search(side: str, words: Sequence[str], budget_s: float, seed: int) -> Answer:
+    folder = Path(NAME)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    places = (f"study.storage={folder}/optuna.journal", f"study.folder={folder}", f"study.artifacts={folder}/artifacts")
+    words = [*words, *places, f"study.name={NAME}", f"study.n_trials={WITHOUT_END}", f"study.seed={seed}"]
+    return SEARCHES[side](words, budget_s, folder)
+
+
+def scores_of(rows: Sequence[Row], task: str) -> dict[str, FloatArray]:
+    """Return the mean scores over the seeds of each side and the default, shape (replicates, volumes).
+
+    Args:
+        rows: Rows of the results; a replicate without all scores of a seed is left out.
+        task: Name of the task.
+    """
+    scores: dict[str, list[FloatArray]] = {DEFAULT: [], **{side: [] for side in SEARCHES}}
+    of_task = [row for row in rows if row["task"] == task]
+    for replicate in sorted({row["replicate"] for row in of_task}):
+        own = [row for row in of_task if row["replicate"] == replicate]
+        answers = {DEFAULT: {}, **{row["side"]: row["values"] for row in own if "side" in row}}
+        trained: dict[str, dict[int, list[float]]] = {
+            side: {row["seed"]: [*row["scores"].values()] for row in own if "seed" in row and row["values"] == values}
+            for side, values in answers.items()
+        }
+        seeds = set.intersection(*map(set, trained.values()))
+        if answers.keys() == scores.keys() and seeds:
+            for side, of_seeds in trained.items():
+                scores[side].append(np.mean([of_seeds[seed] for seed in seeds], axis=0))
+    return {side: np.array(each) for side, each in scores.items()}
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return the table of the results in Markdown."""
+    columns = {name: column for name in TASKS if (column := _column(rows, name))}
+    names = next(iter(columns.values()), {})
+    return markdown(["", *columns], [[name, *(column[name] for column in columns.values())] for name in names])
+
+
+def _column(rows: Sequence[Row], task: str) -> Mapping[str, str]:
+    scores = scores_of(rows, task)
+    n_replicates = len(scores[DEFAULT])
+    if not n_replicates:
+        return {}
+    of = {side: [row for row in rows if row["task"] == task and row.get("side") == side] for side in SEARCHES}
+
+    def mean(side: str, name: str) -> str:
+        return f"{fmean(row[name] for row in of[side]):.1f}"
+
+    def less(ours: str, theirs: str) -> str:
+        return with_interval(paired_difference(scores[ours], scores[theirs]))
+
+    signs = np.sign((scores[ARMSCAN] - scores[HYDRA]).mean(axis=1))
+    named = ", ".join(f"{mean(side, 'processor_s')}" for side in SEARCHES)
+    return {
+        "replicates": f"{n_replicates}",
+        "processor s: armscan, Hydra's": named,
+        "trials of armscan, of them pruned; trainings of its race": (
+            f"{mean(ARMSCAN, 'n_trials')}, {mean(ARMSCAN, 'n_pruned')}; {mean(ARMSCAN, 'n_raced')}"
+        ),
+        "trials of Hydra's": mean(HYDRA, "n_trials"),
+        "mean steps: default, armscan, Hydra's": ", ".join(f"{each.mean():.3f}" for each in scores.values()),
+        "armscan less Hydra's": less(ARMSCAN, HYDRA),
+        "armscan less default": less(ARMSCAN, DEFAULT),
+        "Hydra's less default": less(HYDRA, DEFAULT),
+        "replicates in which armscan is better, equal, worse": ", ".join(
+            str((signs == sign).sum()) for sign in (-1, 0, 1)
+        ),
+    }

@@ -1,0 +1,211 @@
+"""A search by armscan and one by Hydra's Optuna sweeper, each with a budget of processor time, both in this process.
+
+The processor time of a trial is that of this process while the trial's task runs, all threads together: building,
+training, validating, tracking and reporting. Neither side is charged for a start of a process, nor for its sampler.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import optuna
+import yaml
+from omegaconf import OmegaConf
+from optuna.distributions import BaseDistribution, CategoricalDistribution
+from optuna.trial import TrialState
+
+from armscan.config.defaults import to_plain
+from armscan.sweeps.scheduling.race import Scores, race
+from armscan.sweeps.scheduling.scheduler import Plan, TrialScheduler
+from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.space.parameter import Value
+from armscan.sweeps.study.arguments import fixed_by
+from armscan.sweeps.study.components import read_settings
+from armscan.sweeps.study.final_eval import settings_of
+from armscan.sweeps.study.open import OpenedStudy, Phase, open_for_work
+from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.study.warm_start import beginnings
+from armscan.sweeps.tasks.attempt import Attempt
+from armscan.sweeps.workers.heartbeat import Heartbeat
+from armscan.sweeps.workers.worker import Worker
+from benchmarks.sweeps.compare_sweepers import HYDRA_OPTUNA, environment
+
+NAME, WITHOUT_END = "search", 10**6
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """What a search names, and what it took.
+
+    Args:
+        values: Values of the best configuration by their keys; none for the default configuration.
+        processor_s: Processor seconds of its trials.
+        n_trials: Trials of the search.
+        n_pruned: Pruned ones among them.
+        n_raced: Trainings of the choice among candidates.
+    """
+
+    values: Mapping[str, Value]
+    processor_s: float
+    n_trials: int
+    n_pruned: int = 0
+    n_raced: int = 0
+
+
+class Meter:
+    """Measures the processor time of trials.
+
+    Args:
+        budget_s: Processor seconds after which no trial begins.
+    """
+
+    def __init__(self, budget_s: float) -> None:
+        self.budget_s, self.used_s = budget_s, 0.0
+        # Of each trial that ran to its end, by its number.
+        self.whole_s: dict[int, float] = {}
+
+    def is_used(self, kept_s: float = 0.0) -> bool:
+        """Return whether the budget is used, but for these processor seconds."""
+        return self.used_s + kept_s >= self.budget_s
+
+    def timed(self, run: Callable[[Attempt], dict[str, float]]) -> Callable[[Attempt], dict[str, float]]:
+        """Return a task that is measured."""
+
+        def timed(attempt: Attempt) -> dict[str, float]:
+            start_s = time.process_time()
+            try:
+                metrics = run(attempt)
+                self.whole_s[attempt.trial.number] = time.process_time() - start_s
+                return metrics
+            finally:
+                self.used_s += time.process_time() - start_s
+
+        return timed
+
+
+class BudgetedScheduler(TrialScheduler):
+    """A scheduler that claims no trial once the budget is used."""
+
+    def __init__(self, phase: Phase, is_used: Callable[[], bool], plan: Plan | None) -> None:
+        before = phase.scheduler
+        super().__init__(before.study, before.storage, before.limits, plan)
+        self._is_used = is_used
+
+    def end(self, state: StudyState) -> str | None:
+        """See `TrialScheduler.end`."""
+        return "the budget is used" if self._is_used() else super().end(state)
+
+
+def search_by_armscan(words: Sequence[str], budget_s: float, folder: Path) -> Answer:
+    """Search by a study of armscan until the rest of the budget is what the first round of its race will take."""
+    opened = _opened(words, folder)
+    assert opened.final_eval is not None
+    meter, final = Meter(budget_s), opened.final_eval
+    _add_presets(words, opened, opened.search.scheduler.study)
+
+    def first_round_s() -> float:
+        of_candidates = [meter.whole_s.get(number, fmean(meter.whole_s.values())) for number in final.candidates()]
+        return sum(of_candidates) * final.settings.min_seeds / len(opened.settings.seeds)
+
+    _work(opened.search, words, meter, lambda: meter.is_used(first_round_s()))
+    _work(opened.finals[0], words, meter, meter.is_used, final.missing_of_selection)
+    searched = final.search.get_trials()
+    chosen = chosen_of(final.scores(), final.selection_seeds, final.settings.min_seeds)
+    number = best_trials(final.search, 1)[0].number if chosen is None else chosen
+    n_pruned = sum(trial.state == TrialState.PRUNED for trial in searched)
+    n_raced = len(final.selection.get_trials(states=(TrialState.COMPLETE,)))
+    return Answer(settings_of(searched, number), meter.used_s, len(searched), n_pruned, n_raced)
+
+
+def chosen_of(scores: Scores, seeds: Sequence[int], min_seeds: int) -> int | None:
+    """Return the choice of a race by its complete rounds; None if not even the first seed's is complete.
+
+    Args:
+        scores: See `race`.
+        seeds: All seeds of the race.
+        min_seeds: Seeds of the first round; if it is not complete, as many as are.
+    """
+    of_rounds = (race(scores, seeds[:n], min_seeds=min(n, min_seeds)) for n in range(len(seeds), 0, -1))
+    return next((each.chosen for each in of_rounds if each.chosen is not None), None)
+
+
+def search_by_hydra(words: Sequence[str], budget_s: float, folder: Path) -> Answer:
+    """Search by Hydra's Optuna sweeper, whose trials are trained as those of a study without a pruner."""
+    words = [*words, "study/pruner=none", "study.final_eval.top_k=0"]
+    opened, meter = _opened(words, folder), Meter(budget_s)
+    study, storage = opened.search.scheduler.study, f"sqlite:///{folder.absolute()}/hydra.db"
+    _add_presets(words, opened, optuna.create_study(study_name=NAME, storage=storage))
+    (folder / "trained.yaml").write_text(yaml.safe_dump(_hydra_config(opened, folder, storage)))
+    command = [environment(), HYDRA_OPTUNA / "trained.py", "-m", "--config-dir", folder, "--config-name", "trained"]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with (folder / "hydra.log").open("w") as log, subprocess.Popen(command, stderr=log, **pipes) as process:
+        for line in process.stdout or ():
+            if meter.is_used():
+                process.terminate()
+                break
+            study.enqueue_trial(fixed_by(json.loads(line)))
+            # A plan without trials: those that are enqueued are all.
+            _work(opened.search, words, meter, lambda: False, list)
+            print(study.get_trials()[-1].values[0], file=process.stdin, flush=True)
+    assert meter.is_used(), f"the sweeper ended early: see {folder / 'hydra.log'}"
+    return Answer(best_trials(study, 1)[0].params, meter.used_s, len(study.get_trials()))
+
+
+def _opened(words: Sequence[str], folder: Path) -> OpenedStudy:
+    return open_for_work(*read_settings(words), words)
+
+
+def _work(
+    phase: Phase, words: Sequence[str], meter: Meter, is_used: Callable[[], bool], plan: Plan | None = None
+) -> None:
+    scheduler = BudgetedScheduler(phase, is_used, plan)
+    heartbeat = Heartbeat(
+        scheduler, NAME, is_told_to_leave=lambda: False, leave=lambda: None, on_death=phase.close_runs_of
+    )
+    budgeted = dataclasses.replace(phase, scheduler=scheduler, run=meter.timed(phase.run))
+    with heartbeat.running():
+        Worker(budgeted, words, heartbeat).work()
+
+
+def _add_presets(words: Sequence[str], opened: OpenedStudy, study: optuna.Study) -> None:
+    for beginning in beginnings(opened.settings, words, to_plain(opened.config), None):
+        for values in beginning.enqueued:
+            study.enqueue_trial(values)
+
+
+def _hydra_config(opened: OpenedStudy, folder: Path, storage: str) -> dict[str, Any]:
+    parameters = {each.name: each.distribution for each in opened.settings.space.parameters}
+    values = OmegaConf.create()
+    for name in parameters:
+        OmegaConf.update(values, name, None)
+    sweeper = {
+        "study_name": NAME,
+        "storage": storage,
+        "n_trials": WITHOUT_END,
+        "n_jobs": 1,
+        "direction": next(iter(opened.settings.objectives.values())),
+        "sampler": {"seed": opened.settings.seed},
+        "params": {name: swept(distribution) for name, distribution in parameters.items()},
+    }
+    sweep = {"dir": str(folder / "hydra"), "subdir": "."}
+    return {
+        "defaults": ["_self_", {"override hydra/sweeper": "optuna"}],
+        "hydra": {"output_subdir": None, "sweep": sweep, "sweeper": sweeper},
+        **to_plain(values),
+    }
+
+
+def swept(distribution: BaseDistribution) -> str:
+    """Return a distribution as Hydra's sweeper is given it."""
+    if isinstance(distribution, CategoricalDistribution):
+        return f"choice({','.join(map(str, distribution.choices))})"
+    drawn: Any = distribution
+    interval = f"interval({drawn.low},{drawn.high})"
+    return f"tag(log,{interval})" if drawn.log else interval
