@@ -2,8 +2,9 @@
 
     python -m benchmarks.sweeps same_budget [folder=FOLDER] [replicates=4] [seeds=4]
 
-A replicate is a search by each, with the replicate's number as the seed of its sampler. Both have the same space, try
-the same presets first and train one trial at a time, to the same objective (`benchmarks.sweeps.searches`):
+A replicate is a search by each, with the replicate's number as the seed of its sampler and seeds of its own for the
+trainings. Both have the same space, try the same presets first and train one trial at a time with the same seeds, to the
+same objective (`benchmarks.sweeps.searches`):
 
 - armscan: a study with its default sampler, pruner and choice. The search ends when what is left of the budget is used
   by the first round of the race: each candidate's own processor time, and for the default configuration the mean. The
@@ -38,21 +39,22 @@ from benchmarks.sweeps.searches import NAME, WITHOUT_END, Answer, search_by_arms
 
 
 class Task(NamedTuple):
-    """A sweep, and the processor seconds of a search: some 20 whole trials."""
+    """A sweep, the number of seeds of its trials, and the processor seconds of a search: some 20 whole trials."""
 
     words: tuple[str, ...]
+    n_seeds: int
     budget_s: float
 
 
 TASKS = {
-    "sac_y": Task(("sweep=sac_y",), 175.0),
-    "sac_zy": Task(("sweep=sac_zy", "training.env_steps=8000", "training.eval_every_env_steps=1000"), 250.0),
+    "sac_y": Task(("sweep=sac_y",), 1, 175.0),
+    "sac_zy": Task(("sweep=sac_zy", "training.env_steps=8000", "training.eval_every_env_steps=1000"), 2, 250.0),
 }
 ARMSCAN, HYDRA, DEFAULT = "armscan", "hydra", "default"
 Search = Callable[[Sequence[str], float, Path], Answer]
 SEARCHES: dict[str, Search] = {ARMSCAN: search_by_armscan, HYDRA: search_by_hydra}
-# The first seed of the judgement, above those of studies.
-FIRST_SEED, SEEDS_APART = 5000, 100
+# The first seed of the judgement; those of searches begin at 0, those of races 1000 above.
+FIRST_SEED, SEEDS_APART = 5000, 10
 OBJECTIVE = "mean_steps"
 SHORT = ("training.env_steps=3000", "training.eval_every_env_steps=1000")
 Row = dict[str, Any]
@@ -96,8 +98,8 @@ def _replicate(results: Results, name: str, replicate: int, n_seeds: int) -> Non
     for side in (ARMSCAN, HYDRA) if replicate % 2 else (HYDRA, ARMSCAN):
         if results.find(side=side, **known) is None:
             # A process's first trial imports and compiles what the others find.
-            _search(ARMSCAN, [*task.words, *SHORT], 0.1, replicate)
-            answer = _search(side, task.words, task.budget_s, replicate)
+            _search(ARMSCAN, task._replace(words=(*task.words, *SHORT), budget_s=0.1), replicate)
+            answer = _search(side, task, replicate)
             print(name, replicate, side, answer, flush=True)
             results.add(**known, side=side, **asdict(answer))
     answers = {DEFAULT: {}, **{side: results.find(side=side, **known)["values"] for side in SEARCHES}}
@@ -109,35 +111,37 @@ def _replicate(results: Results, name: str, replicate: int, n_seeds: int) -> Non
                 results.add(**known, values=values, seed=seed, scores=scores)
 
 
-def _search(side: str, words: Sequence[str], budget_s: float, seed: int) -> Answer:
+def _search(side: str, task: Task, replicate: int) -> Answer:
     folder = Path(NAME)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     places = (f"study.storage={folder}/optuna.journal", f"study.folder={folder}", f"study.artifacts={folder}/artifacts")
-    words = [*words, *places, f"study.name={NAME}", f"study.n_trials={WITHOUT_END}", f"study.seed={seed}"]
-    return SEARCHES[side](words, budget_s, folder)
+    seeds = [SEEDS_APART * replicate + each for each in range(task.n_seeds)]
+    words = [*task.words, *places, f"study.name={NAME}", f"study.n_trials={WITHOUT_END}"]
+    return SEARCHES[side]([*words, f"study.seed={replicate}", f"study.seeds={seeds}"], task.budget_s, folder)
 
 
 def scores_of(rows: Sequence[Row], task: str) -> dict[str, FloatArray]:
-    """Return the mean scores over the seeds of each side and the default, shape (replicates, volumes).
+    """Return the mean scores over the seeds of the default and of each side, shape (replicates, volumes).
 
     Args:
-        rows: Rows of the results; a replicate without all scores of a seed is left out.
+        rows: Rows of the results. A replicate counts once a seed of it has all scores, with such seeds alone.
         task: Name of the task.
     """
-    scores: dict[str, list[FloatArray]] = {DEFAULT: [], **{side: [] for side in SEARCHES}}
+    scores: dict[str, list[FloatArray]] = {side: [] for side in (DEFAULT, *SEARCHES)}
     of_task = [row for row in rows if row["task"] == task]
     for replicate in sorted({row["replicate"] for row in of_task}):
         own = [row for row in of_task if row["replicate"] == replicate]
         answers = {DEFAULT: {}, **{row["side"]: row["values"] for row in own if "side" in row}}
-        trained: dict[str, dict[int, list[float]]] = {
-            side: {row["seed"]: [*row["scores"].values()] for row in own if "seed" in row and row["values"] == values}
+        trained = {
+            side: {row["seed"]: row["scores"] for row in own if "seed" in row and row["values"] == values}
             for side, values in answers.items()
         }
         seeds = set.intersection(*map(set, trained.values()))
         if answers.keys() == scores.keys() and seeds:
             for side, of_seeds in trained.items():
-                scores[side].append(np.mean([of_seeds[seed] for seed in seeds], axis=0))
+                by_volume = [[score for _, score in sorted(of_seeds[seed].items())] for seed in seeds]
+                scores[side].append(np.mean(by_volume, axis=0))
     return {side: np.array(each) for side, each in scores.items()}
 
 
@@ -153,27 +157,26 @@ def _column(rows: Sequence[Row], task: str) -> Mapping[str, str]:
     n_replicates = len(scores[DEFAULT])
     if not n_replicates:
         return {}
-    of = {side: [row for row in rows if row["task"] == task and row.get("side") == side] for side in SEARCHES}
 
     def mean(side: str, name: str) -> str:
-        return f"{fmean(row[name] for row in of[side]):.1f}"
+        of_side = [row[name] for row in rows if row["task"] == task and row.get("side") == side]
+        return f"{fmean(of_side[:n_replicates]):.1f}"
 
     def less(ours: str, theirs: str) -> str:
         return with_interval(paired_difference(scores[ours], scores[theirs]))
 
     signs = np.sign((scores[ARMSCAN] - scores[HYDRA]).mean(axis=1))
-    named = ", ".join(f"{mean(side, 'processor_s')}" for side in SEARCHES)
     return {
         "replicates": f"{n_replicates}",
-        "processor s: armscan, Hydra's": named,
-        "trials of armscan, of them pruned; trainings of its race": (
+        "processor s of each search: armscan, Hydra": ", ".join(mean(side, "processor_s") for side in SEARCHES),
+        "trials: armscan, of them pruned; trainings of its race": (
             f"{mean(ARMSCAN, 'n_trials')}, {mean(ARMSCAN, 'n_pruned')}; {mean(ARMSCAN, 'n_raced')}"
         ),
-        "trials of Hydra's": mean(HYDRA, "n_trials"),
-        "mean steps: default, armscan, Hydra's": ", ".join(f"{each.mean():.3f}" for each in scores.values()),
-        "armscan less Hydra's": less(ARMSCAN, HYDRA),
+        "trials: Hydra": mean(HYDRA, "n_trials"),
+        "mean steps: default, armscan, Hydra": ", ".join(f"{each.mean():.3f}" for each in scores.values()),
+        "armscan less Hydra": less(ARMSCAN, HYDRA),
         "armscan less default": less(ARMSCAN, DEFAULT),
-        "Hydra's less default": less(HYDRA, DEFAULT),
+        "Hydra less default": less(HYDRA, DEFAULT),
         "replicates in which armscan is better, equal, worse": ", ".join(
             str((signs == sign).sum()) for sign in (-1, 0, 1)
         ),

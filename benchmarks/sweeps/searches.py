@@ -18,7 +18,7 @@ from typing import Any
 import optuna
 import yaml
 from omegaconf import OmegaConf
-from optuna.distributions import BaseDistribution, CategoricalDistribution
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
 from optuna.trial import TrialState
 
 from armscan.config.defaults import to_plain
@@ -103,9 +103,9 @@ class BudgetedScheduler(TrialScheduler):
         return "the budget is used" if self._is_used() else super().end(state)
 
 
-def search_by_armscan(words: Sequence[str], budget_s: float, folder: Path) -> Answer:
+def search_by_armscan(words: Sequence[str], budget_s: float, _: Path) -> Answer:
     """Search by a study of armscan until the rest of the budget is what the first round of its race will take."""
-    opened = _opened(words, folder)
+    opened = open_for_work(*read_settings(words), words)
     assert opened.final_eval is not None
     meter, final = Meter(budget_s), opened.final_eval
     _add_presets(words, opened, opened.search.scheduler.study)
@@ -139,7 +139,7 @@ def chosen_of(scores: Scores, seeds: Sequence[int], min_seeds: int) -> int | Non
 def search_by_hydra(words: Sequence[str], budget_s: float, folder: Path) -> Answer:
     """Search by Hydra's Optuna sweeper, whose trials are trained as those of a study without a pruner."""
     words = [*words, "study/pruner=none", "study.final_eval.top_k=0"]
-    opened, meter = _opened(words, folder), Meter(budget_s)
+    opened, meter = open_for_work(*read_settings(words), words), Meter(budget_s)
     study, storage = opened.search.scheduler.study, f"sqlite:///{folder.absolute()}/hydra.db"
     _add_presets(words, opened, optuna.create_study(study_name=NAME, storage=storage))
     (folder / "trained.yaml").write_text(yaml.safe_dump(_hydra_config(opened, folder, storage)))
@@ -156,10 +156,6 @@ def search_by_hydra(words: Sequence[str], budget_s: float, folder: Path) -> Answ
             print(study.get_trials()[-1].values[0], file=process.stdin, flush=True)
     assert meter.is_used(), f"the sweeper ended early: see {folder / 'hydra.log'}"
     return Answer(best_trials(study, 1)[0].params, meter.used_s, len(study.get_trials()))
-
-
-def _opened(words: Sequence[str], folder: Path) -> OpenedStudy:
-    return open_for_work(*read_settings(words), words)
 
 
 def _work(
@@ -203,9 +199,9 @@ def _hydra_config(opened: OpenedStudy, folder: Path, storage: str) -> dict[str, 
 
 
 def swept(distribution: BaseDistribution) -> str:
-    """Return a distribution as Hydra's sweeper is given it."""
+    """Return a distribution as Hydra's sweeper is given it; no sweep here has a range of whole numbers."""
     if isinstance(distribution, CategoricalDistribution):
         return f"choice({','.join(map(str, distribution.choices))})"
-    drawn: Any = distribution
-    interval = f"interval({drawn.low},{drawn.high})"
-    return f"tag(log,{interval})" if drawn.log else interval
+    assert isinstance(distribution, FloatDistribution)
+    interval = f"interval({distribution.low},{distribution.high})"
+    return f"tag(log,{interval})" if distribution.log else interval
