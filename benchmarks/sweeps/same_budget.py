@@ -3,8 +3,8 @@
     python -m benchmarks.sweeps same_budget [folder=FOLDER] [replicates=4] [seeds=4]
 
 A replicate is a search by each, with the replicate's number as the seed of its sampler and seeds of its own for the
-trainings. Both have the same space, try the same presets first and train one trial at a time with the same seeds, to the
-same objective (`benchmarks.sweeps.searches`):
+trainings. Both have the same space, try the same presets first and train one trial at a time, with the same seeds, to
+the same objective (`benchmarks.sweeps.searches`):
 
 - armscan: a study with its default sampler, pruner and choice. The search ends when what is left of the budget is used
   by the first round of the race: each candidate's own processor time, and for the default configuration the mean. The
