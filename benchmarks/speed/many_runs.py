@@ -21,9 +21,9 @@ from pathlib import Path
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, RunTag
 
+from benchmarks.speed.checkouts import HERE
 from tests.support.mlflow_server import mlflow_server
 
-HERE = Path(__file__).resolve().parents[2]
 SMALL = (
     "training.env_steps=2000",
     "training.eval_every_env_steps=500",

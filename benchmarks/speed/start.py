@@ -18,8 +18,9 @@ import sys
 import tempfile
 from pathlib import Path
 
+from benchmarks.speed.checkouts import HERE
+
 N_PROCESSES = 3
-HERE = Path(__file__).resolve().parents[2]
 RUN = "import sys; from armscan.__main__ import main; sys.exit(main())"
 VOLUMES = str(HERE / "tests" / "data" / "volumes")
 STUDY = ("run", "-m", "sweep=sac_y", "study.workers=1")

@@ -19,7 +19,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parents[2]
+from benchmarks.speed.checkouts import HERE
+
 CASES = {"default": ["training.solved=null"], "make_run": [], "best_full": ["experiment=best_full"]}
 SHORT = ["training.env_steps=2500", "training.eval_every_env_steps=500", "evaluation.episodes=8"]
 PROGRAM = """

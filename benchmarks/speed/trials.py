@@ -15,7 +15,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parents[2]
+from benchmarks.speed.checkouts import HERE
+
 # Python imports this at the start of each process, the worker's included, whose module it waits for.
 SITE = """
 import importlib.util, os, sys, time

@@ -2,24 +2,25 @@
 
     python -m benchmarks.sweeps same_budget [folder=FOLDER] [replicates=4] [seeds=4]
 
-A replicate is a search by each, with the replicate's number as the seed of its sampler and seeds of its own for the
-trainings. Both have the same space, try the same presets first and train one trial at a time, with the same seeds, to
-the same objective (`benchmarks.sweeps.searches`):
+In each replicate both search once. The replicate's number is the seed of both samplers, and trainings have seeds of
+their own. Both sides have the same space, presets, training seeds and objective, and train one trial at a time
+(`benchmarks.sweeps.searches`):
 
-- armscan: a study with its default sampler, pruner and choice. The search ends when what is left of the budget is used
-  by the first round of the race: each candidate's own processor time, and for the default configuration the mean. The
-  race goes on until the budget is used, and what it names is the choice after its last complete round of seeds.
-- Hydra's Optuna sweeper: its default sampler. The best value when the budget is used is its answer.
+- armscan: a study with its default sampler, pruner and choice. The search ends when the rest of the budget is needed
+  for the first round of the race: the processor time of each candidate, and the mean of all trials for the default
+  configuration. The race then uses the rest. The last seed with a score for every candidate decides.
+- Hydra's Optuna sweeper: its default sampler. The trial with the best value is the result.
 
-A trial begins as long as the budget is not used, and then runs to its end. What each names and the default
-configuration are trained with seeds that nothing else has used, and judged by the objective on the test volumes. Each
-result is a line of `results.jsonl`, so that the same command goes on after an end; a search that was cut off begins
-again. `replicates=0` prints the table of what is there.
+While budget is left, another trial begins; it always runs to its end. Both results and the default configuration are
+then trained with new seeds, and judged by the objective on the test volumes. Each outcome is a line of `results.jsonl`:
+the same command continues after an interruption, and repeats only the search that was cut off. `replicates=0` prints
+the table of all results so far.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +36,7 @@ from armscan.utils.arrays import FloatArray
 from armscan.utils.log import silence_libraries
 from benchmarks.sweeps.bench.collect import train_and_test
 from benchmarks.sweeps.bench.report import markdown, with_interval
-from benchmarks.sweeps.searches import NAME, WITHOUT_END, Answer, search_by_armscan, search_by_hydra
+from benchmarks.sweeps.searches import NAME, WITHOUT_END, SearchResult, search_by_armscan, search_by_hydra
 
 
 class Task(NamedTuple):
@@ -51,7 +52,7 @@ TASKS = {
     "sac_zy": Task(("sweep=sac_zy", "training.env_steps=8000", "training.eval_every_env_steps=1000"), 2, 250.0),
 }
 ARMSCAN, HYDRA, DEFAULT = "armscan", "hydra", "default"
-Search = Callable[[Sequence[str], float, Path], Answer]
+Search = Callable[[Sequence[str], float, Path], SearchResult]
 SEARCHES: dict[str, Search] = {ARMSCAN: search_by_armscan, HYDRA: search_by_hydra}
 # The first seed of the judgement; those of searches begin at 0, those of races 1000 above.
 FIRST_SEED, SEEDS_APART = 5000, 10
@@ -80,7 +81,7 @@ class Results:
 
 
 def same_budget(folder: Path, *, replicates: int = 4, seeds: int = 4) -> None:
-    """Search and judge what is missing, and print the table after each replicate."""
+    """Make the searches and trainings that are missing, and print the table after each replicate."""
     silence_libraries()
     results = Results(folder / "results.jsonl")
     with contextlib.chdir(folder):
@@ -94,24 +95,30 @@ def same_budget(folder: Path, *, replicates: int = 4, seeds: int = 4) -> None:
 
 def _replicate(results: Results, name: str, replicate: int, n_seeds: int) -> None:
     task, known = TASKS[name], {"task": name, "replicate": replicate}
-    # In turn the first.
+    # They take turns in searching first.
     for side in (ARMSCAN, HYDRA) if replicate % 2 else (HYDRA, ARMSCAN):
         if results.find(side=side, **known) is None:
-            # A process's first trial imports and compiles what the others find.
-            _search(ARMSCAN, task._replace(words=(*task.words, *SHORT), budget_s=0.1), replicate)
-            answer = _search(side, task, replicate)
-            print(name, replicate, side, answer, flush=True)
-            results.add(**known, side=side, **asdict(answer))
-    answers = {DEFAULT: {}, **{side: results.find(side=side, **known)["values"] for side in SEARCHES}}
+            _warm_up(name)
+            result = _search(side, task, replicate)
+            print(name, replicate, side, result, flush=True)
+            results.add(**known, side=side, **asdict(result))
+    best = {DEFAULT: {}, **{side: results.find(side=side, **known)["values"] for side in SEARCHES}}
     for seed in range(FIRST_SEED + SEEDS_APART * replicate, FIRST_SEED + SEEDS_APART * replicate + n_seeds):
-        for values in answers.values():
+        for values in best.values():
             if results.find(task=name, values=values, seed=seed) is None:
                 _, tested = train_and_test(task.words, values, seed)
                 scores = {volume: each.metrics()[OBJECTIVE] for volume, each in tested.by_volume().items()}
                 results.add(**known, values=values, seed=seed, scores=scores)
 
 
-def _search(side: str, task: Task, replicate: int) -> Answer:
+@functools.cache
+def _warm_up(name: str) -> None:
+    """Train a short trial: the first one of a process imports and compiles."""
+    task = TASKS[name]
+    _search(ARMSCAN, task._replace(words=(*task.words, *SHORT), budget_s=0.1), replicate=0)
+
+
+def _search(side: str, task: Task, replicate: int) -> SearchResult:
     folder = Path(NAME)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
@@ -122,23 +129,23 @@ def _search(side: str, task: Task, replicate: int) -> Answer:
 
 
 def scores_of(rows: Sequence[Row], task: str) -> dict[str, FloatArray]:
-    """Return the mean scores over the seeds of the default and of each side, shape (replicates, volumes).
+    """Return mean scores over seeds of the default configuration and of each side, shape (n_replicates, n_volumes).
 
     Args:
-        rows: Rows of the results. A replicate counts once a seed of it has all scores, with such seeds alone.
+        rows: Rows of the results. Only seeds with all scores count, and replicates with such a seed.
         task: Name of the task.
     """
     scores: dict[str, list[FloatArray]] = {side: [] for side in (DEFAULT, *SEARCHES)}
     of_task = [row for row in rows if row["task"] == task]
     for replicate in sorted({row["replicate"] for row in of_task}):
         own = [row for row in of_task if row["replicate"] == replicate]
-        answers = {DEFAULT: {}, **{row["side"]: row["values"] for row in own if "side" in row}}
+        best = {DEFAULT: {}, **{row["side"]: row["values"] for row in own if "side" in row}}
         trained = {
             side: {row["seed"]: row["scores"] for row in own if "seed" in row and row["values"] == values}
-            for side, values in answers.items()
+            for side, values in best.items()
         }
         seeds = set.intersection(*map(set, trained.values()))
-        if answers.keys() == scores.keys() and seeds:
+        if best.keys() == scores.keys() and seeds:
             for side, of_seeds in trained.items():
                 by_volume = [[score for _, score in sorted(of_seeds[seed].items())] for seed in seeds]
                 scores[side].append(np.mean(by_volume, axis=0))

@@ -1,4 +1,4 @@
-"""A search by armscan and one by Hydra's Optuna sweeper, each with a budget of processor time, both in this process.
+"""Searches by armscan and by Hydra's Optuna sweeper with a budget of processor time; both train in this process.
 
 The processor time of a trial is that of this process while the trial's task runs, all threads together: building,
 training, validating, tracking and reporting. Neither side is charged for a start of a process, nor for its sampler.
@@ -41,15 +41,15 @@ NAME, WITHOUT_END = "search", 10**6
 
 
 @dataclasses.dataclass(frozen=True)
-class Answer:
-    """What a search names, and what it took.
+class SearchResult:
+    """Best configuration of a search, and its cost.
 
     Args:
-        values: Values of the best configuration by their keys; none for the default configuration.
-        processor_s: Processor seconds of its trials.
-        n_trials: Trials of the search.
-        n_pruned: Pruned ones among them.
-        n_raced: Trainings of the choice among candidates.
+        values: Values of the best configuration by their keys; empty for the default configuration.
+        processor_s: Processor seconds of all trials, the trainings of the race included.
+        n_trials: Number of trials.
+        n_pruned: Number of pruned trials. Default: 0.
+        n_raced: Number of trainings of the race over seeds. Default: 0, no race.
     """
 
     values: Mapping[str, Value]
@@ -72,7 +72,7 @@ class Meter:
         self.whole_s: dict[int, float] = {}
 
     def is_used(self, kept_s: float = 0.0) -> bool:
-        """Return whether the budget is used, but for these processor seconds."""
+        """Return whether no more than these processor seconds are left."""
         return self.used_s + kept_s >= self.budget_s
 
     def timed(self, run: Callable[[Attempt], dict[str, float]]) -> Callable[[Attempt], dict[str, float]]:
@@ -103,8 +103,8 @@ class BudgetedScheduler(TrialScheduler):
         return "the budget is used" if self._is_used() else super().end(state)
 
 
-def search_by_armscan(words: Sequence[str], budget_s: float, _: Path) -> Answer:
-    """Search by a study of armscan until the rest of the budget is what the first round of its race will take."""
+def search_by_armscan(words: Sequence[str], budget_s: float, _: Path) -> SearchResult:
+    """Search by a study of armscan. The search keeps enough of the budget for the first round of the race."""
     opened = open_for_work(*read_settings(words), words)
     assert opened.final_eval is not None
     meter, final = Meter(budget_s), opened.final_eval
@@ -121,11 +121,11 @@ def search_by_armscan(words: Sequence[str], budget_s: float, _: Path) -> Answer:
     number = best_trials(final.search, 1)[0].number if chosen is None else chosen
     n_pruned = sum(trial.state == TrialState.PRUNED for trial in searched)
     n_raced = len(final.selection.get_trials(states=(TrialState.COMPLETE,)))
-    return Answer(settings_of(searched, number), meter.used_s, len(searched), n_pruned, n_raced)
+    return SearchResult(settings_of(searched, number), meter.used_s, len(searched), n_pruned, n_raced)
 
 
 def chosen_of(scores: Scores, seeds: Sequence[int], min_seeds: int) -> int | None:
-    """Return the choice of a race by its complete rounds; None if not even the first seed's is complete.
+    """Return what a race chooses after its last complete seed; None if no seed is complete.
 
     Args:
         scores: See `race`.
@@ -136,7 +136,7 @@ def chosen_of(scores: Scores, seeds: Sequence[int], min_seeds: int) -> int | Non
     return next((each.chosen for each in of_rounds if each.chosen is not None), None)
 
 
-def search_by_hydra(words: Sequence[str], budget_s: float, folder: Path) -> Answer:
+def search_by_hydra(words: Sequence[str], budget_s: float, folder: Path) -> SearchResult:
     """Search by Hydra's Optuna sweeper, whose trials are trained as those of a study without a pruner."""
     words = [*words, "study/pruner=none", "study.final_eval.top_k=0"]
     opened, meter = open_for_work(*read_settings(words), words), Meter(budget_s)
@@ -155,7 +155,7 @@ def search_by_hydra(words: Sequence[str], budget_s: float, folder: Path) -> Answ
             _work(opened.search, words, meter, lambda: False, list)
             print(study.get_trials()[-1].values[0], file=process.stdin, flush=True)
     assert meter.is_used(), f"the sweeper ended early: see {folder / 'hydra.log'}"
-    return Answer(best_trials(study, 1)[0].params, meter.used_s, len(study.get_trials()))
+    return SearchResult(best_trials(study, 1)[0].params, meter.used_s, len(study.get_trials()))
 
 
 def _work(
@@ -199,7 +199,7 @@ def _hydra_config(opened: OpenedStudy, folder: Path, storage: str) -> dict[str, 
 
 
 def swept(distribution: BaseDistribution) -> str:
-    """Return a distribution as Hydra's sweeper is given it; no sweep here has a range of whole numbers."""
+    """Return a distribution in the syntax of Hydra's sweeper; integers are not supported."""
     if isinstance(distribution, CategoricalDistribution):
         return f"choice({','.join(map(str, distribution.choices))})"
     assert isinstance(distribution, FloatDistribution)

@@ -1,4 +1,4 @@
-"""Budgets of the two searches, the choice when one is used, and the pairing of what both name."""
+"""Budgets of the two searches, the choice of an unfinished race, and the pairing of the results."""
 
 import json
 import math
@@ -12,7 +12,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution
 
 from benchmarks.sweeps import same_budget, searches
 from benchmarks.sweeps.same_budget import scores_of, table
-from benchmarks.sweeps.searches import Answer, Meter, chosen_of, swept
+from benchmarks.sweeps.searches import Meter, SearchResult, chosen_of, swept
 
 
 def attempt(number):
@@ -85,11 +85,11 @@ def test_hydra_reads_the_range_that_armscan_searches(distribution):
 
 @pytest.fixture
 def trained(monkeypatch):
-    """Replace the searches by some that name `a` and `b`, whose scores are 1 and 2; the default's is 4."""
+    """Replace the searches by two that find `a` and `b`, which score 1 and 2; the default configuration scores 4."""
     trained = []
 
     def search(name):
-        return lambda words, budget_s, folder: Answer({"key": name}, budget_s, 20)
+        return lambda words, budget_s, folder: SearchResult({"key": name}, budget_s, 20)
 
     def train_and_test(words, values, seed):
         trained.append((values.get("key"), seed))
