@@ -89,7 +89,7 @@ class CompiledSAC(sac.SAC[Any]):
         with _blas().limit(limits=1), compilation_told(COMPILING, lambda dispatcher: dispatcher is kernels.update):
             for start in range(0, n_updates, N_AT_ONCE):
                 part = losses[start : start + N_AT_ONCE]
-                indices = np.stack([buffer.sample_indices(sample_size) for _ in part])
+                indices = buffer.sample_indices(len(part) * sample_size).reshape(len(part), sample_size)
                 noise = torch.empty(len(part), 2, sample_size, self._n_free)
                 for drawn in noise.flatten(0, 1):
                     drawn.normal_()

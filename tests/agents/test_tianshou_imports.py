@@ -1,0 +1,21 @@
+"""Tianshou is imported without packages that armscan does not use through it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+PROGRAM = """
+import sys
+import armscan.agents
+print(sorted({"ray", "pettingzoo", "tensorboard", "matplotlib"} & set(sys.modules)))
+from matplotlib.figure import Figure
+from torch.utils.tensorboard import SummaryWriter
+print(Figure.__module__, SummaryWriter.__module__)
+"""
+
+
+def test_packages_are_not_imported_with_tianshou_and_can_be_imported_afterwards() -> None:
+    """In a process of its own: here, other tests have imported them."""
+    printed = subprocess.run([sys.executable, "-c", PROGRAM], check=True, capture_output=True, text=True).stdout
+    assert printed.splitlines() == ["[]", "matplotlib.figure torch.utils.tensorboard.writer"]
