@@ -22,6 +22,7 @@ from pathlib import Path
 from benchmarks.speed.checkouts import HERE
 
 CASES = {"default": ["training.solved=null"], "make_run": [], "best_full": ["experiment=best_full"]}
+DEFAULT_CASES = ("default", "make_run")
 SHORT = ["training.env_steps=2500", "training.eval_every_env_steps=500", "evaluation.episodes=8"]
 PROGRAM = """
 import sys, time
@@ -64,14 +65,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--before", type=Path, help="another checkout to compare with")
     parser.add_argument("--rounds", type=int, default=3, help="runs of each (default: 3)")
-    parser.add_argument("cases", nargs="*", default=["default", "make_run"], choices=list(CASES))
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"{', '.join(CASES)} (default: the first two)")
     given = parser.parse_args()
+    if unknown := set(given.cases) - set(CASES):
+        parser.error(f"unknown cases: {', '.join(sorted(unknown))}")
     checkouts = [each.resolve() for each in (HERE, given.before) if each]
     for checkout in checkouts:
         run(checkout, *SHORT)
     print("| run | steps | training, s | before, s | ratio | all of it, s | before, s | ratio |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
-    for case in given.cases:
+    for case in given.cases or DEFAULT_CASES:
         rounds = [[run(checkout, *CASES[case]) for checkout in checkouts] for _ in range(given.rounds)]
         training, whole = (
             [statistics.median(each[which][part] for each in rounds) for which in range(len(checkouts))]

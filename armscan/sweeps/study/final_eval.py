@@ -172,8 +172,11 @@ class FinalEvaluation:
         return [] if chosen is None else list(dict.fromkeys((chosen, CONTROL)))
 
     def missing_of_judgement(self) -> list[PlannedTrial]:
-        """Return the trainings of the judgement that no worker has begun; nothing before a configuration is chosen."""
-        judged = self.judged()
+        """Return the trainings of the judgement that no worker has begun; during the selection, those of the control.
+
+        The control is judged whatever is chosen, so its trainings keep workers busy that the race leaves idle.
+        """
+        judged = self.judged() if self.race().is_over else [CONTROL]
         return self._planned([(number, seed) for seed in self.judge_seeds for number in judged], self.judgement)
 
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:

@@ -20,6 +20,7 @@ from armscan.config.compose import compose_run
 from armscan.config.defaults import MULTIRUN, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.errors import StorageAwayError, TrackingAwayError
+from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.components import make, read_settings
@@ -47,14 +48,27 @@ MAX_REASON_CHARS = 2000
 
 
 class Worker:
-    """Runs trials of one phase of a study, one after another, each with its values beside the command's words."""
+    """Runs trials of one phase of a study, one after another, each with its values beside the command's words.
 
-    def __init__(self, phase: Phase, words: Sequence[str], heartbeat: Heartbeat) -> None:
-        self._phase, self._words, self._heartbeat = phase, words, heartbeat
+    Args:
+        phase: The phase.
+        words: Command line of the study, as words.
+        heartbeat: Heartbeat of the worker in this phase.
+        other: Scheduler of a phase that runs at the same time. Default: None, no phase does.
+    """
+
+    def __init__(
+        self, phase: Phase, words: Sequence[str], heartbeat: Heartbeat, other: TrialScheduler | None = None
+    ) -> None:
+        self._phase, self._words, self._heartbeat, self._other = phase, words, heartbeat, other
         self._tracked: TrackedRun | None = None
 
     def work(self) -> str:
-        """Run trials until none is left, and those of other workers have ended; return why."""
+        """Run trials until none is left and those of other workers have ended, or until only the other phase has some.
+
+        Returns:
+            Why the phase has ended; an empty string if it has not.
+        """
         outcome: TrialOutcome | None = None
         conclude: Callable[[], None] | None = None
         while True:
@@ -69,11 +83,11 @@ class Worker:
                 outcome = self._run(trial)
                 conclude = partial(self._conclude, outcome, self._tracked) if outcome else None
                 self._tracked = None
-            elif reason := self._wait_for_trial():
+            elif (reason := self._wait_for_trial()) is not None:
                 return reason
 
     def _wait_for_trial(self) -> str | None:
-        """Wait until a trial can be claimed; return None then, or why there will be none."""
+        """Wait until a trial can be claimed; return None then, or what `work` returns."""
         scheduler = self._phase.scheduler
         while True:
             scheduler.look_for_stop()
@@ -85,6 +99,8 @@ class Worker:
                 return reason
             if scheduler.has_more(state):
                 return None
+            if self._other is not None and self._other.has_more(self._other.state()):
+                return ""
             time.sleep(WAIT_S)
 
     def _run(self, trial: Trial) -> TrialOutcome | None:
@@ -241,13 +257,16 @@ def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None
     silence_libraries()
     opened = open_for_work(*read_settings(words), words, retry=True)
 
-    def run_phase(phase: Phase) -> None:
+    def run_phase(phase: Phase, other: Phase | None) -> str:
         heartbeat = make_heartbeat(phase.scheduler, on_death=phase.close_runs_of)
         with heartbeat.running():
-            reason = Worker(phase, words, heartbeat).work()
-        log(f"{phase.name}: {reason}")
+            return Worker(phase, words, heartbeat, None if other is None else other.scheduler).work()
 
-    for phase in opened.phases:
-        run_phase(phase)
+    # While the selection waits for other workers, the judgement goes on, and the other way round.
+    for phase, other in zip(opened.phases, (None, *opened.finals[1:], None), strict=False):
+        while not (reason := run_phase(phase, other)):
+            assert other is not None
+            run_phase(other, phase)
+        log(f"{phase.name}: {reason}")
         if phase.scheduler.look_for_stop() or phase.scheduler.broken(phase.scheduler.state()):
             return

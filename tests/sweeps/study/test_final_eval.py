@@ -148,6 +148,20 @@ def is_lost(trial):
     return trial.state == TrialState.FAIL and RETRIED not in trial.user_attrs
 
 
+def test_control_is_judged_during_the_race_and_the_chosen_configuration_after_it(storage_uri):
+    final, (selection, judgement) = opened(storage_uri)
+    control = [(CONTROL, seed) for seed in final.judge_seeds]
+    running = selection.claim({})
+    assert not final.race().is_over
+    while trial := judgement.claim({}):
+        end(judgement, trial, TRUE)
+    assert trained(final.judgement) == control
+    end(selection, running, TRUE)
+    final = run(storage_uri, chance=QUIET)
+    assert trained(final.judgement) == control + [(1, seed) for seed in final.judge_seeds]
+    assert judge(final).chosen == 1
+
+
 def test_control_that_is_the_best_is_the_result(storage_uri):
     final = run(storage_uri, true=TRUE | {CONTROL: 1.0})
     judgement = judge(final)

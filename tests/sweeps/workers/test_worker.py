@@ -3,7 +3,9 @@
 import os
 import shutil
 import time
+from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import optuna
@@ -11,7 +13,7 @@ import pytest
 
 from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits
+from armscan.sweeps.scheduling.state import CONTROL, FINAL_SEED, FINALIST, LEASE, METRICS, Limits, PlannedTrial
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.stop import stop_study, stop_trial
 from armscan.sweeps.storage.reports import reports_of
@@ -19,10 +21,11 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.open import Phase
 from armscan.sweeps.study.pruners import ParetoPruner
 from armscan.sweeps.study.study import best_trials
-from armscan.sweeps.workers import heartbeat
+from armscan.sweeps.workers import heartbeat, worker
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
 from armscan.tracking import open_store
+from armscan.utils.processes import ProcessInfo
 from tests.support.waiting import HANG_S
 
 SPACE = {"agent.lr": {"low": 1e-4, "high": 1e-2, "log": True}, "agent.batch_size": {"choices": [64, 128, 256]}}
@@ -36,15 +39,25 @@ def far_from_a_thousandth(attempt):
 
 
 @pytest.fixture
-def work(tmp_path, empty_database):
-    """Let one worker run a study in a folder of its own; return the study."""
+def make_phase(tmp_path, empty_database):
+    """Return a function that makes a study in a folder, and the phase of it."""
 
-    def run_study(folder, run=far_from_a_thousandth, *, sampler=RANDOM, seed=0, objectives=("mean_steps",), **limits):
+    def make(
+        folder,
+        run=far_from_a_thousandth,
+        *,
+        sampler=RANDOM,
+        seed=0,
+        objectives=("mean_steps",),
+        name="a",
+        plan=None,
+        **limits,
+    ):
         folder = tmp_path / folder
         storage = open_storage(str(folder / "optuna.journal"))
         pruner = ParetoPruner(100) if len(objectives) > 1 else None
         study = optuna.create_study(
-            study_name="a",
+            study_name=name,
             storage=storage.optuna,
             load_if_exists=True,
             directions=["minimize"] * len(objectives),
@@ -58,9 +71,9 @@ def work(tmp_path, empty_database):
         # As each start of a study finds it.
         there = client.search_runs([experiment_id], "tags.kind = 'study'")
         own = there[0] if there else client.create_run(experiment_id, name="study", tags={"kind": "study"})
-        phase = Phase(
-            name="a",
-            scheduler=TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits)),
+        return Phase(
+            name=name,
+            scheduler=TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits), plan),
             space=Space.read(SPACE),
             objectives=objectives,
             reported=objectives if pruner else (),
@@ -74,12 +87,24 @@ def work(tmp_path, empty_database):
             experiment_id=experiment_id,
             run_id=own.info.run_id,
         )
-        beating = Heartbeat(
-            phase.scheduler, "0", is_told_to_leave=lambda: False, leave=lambda: os._exit(1), on_death=lambda _: None
-        )
+
+    return make
+
+
+def make_heartbeat(scheduler, on_death=lambda _: None):
+    return Heartbeat(scheduler, "0", is_told_to_leave=lambda: False, leave=lambda: os._exit(1), on_death=on_death)
+
+
+@pytest.fixture
+def work(tmp_path, make_phase):
+    """Let one worker run a study in a folder of its own; return the study."""
+
+    def run_study(*arguments, **options):
+        phase = make_phase(*arguments, **options)
+        beating = make_heartbeat(phase.scheduler)
         with beating.running():
             Worker(phase, ["data.n_training=1"], beating).work()
-        return study
+        return phase.scheduler.study
 
     run_study.storage = lambda folder: open_storage(str(tmp_path / folder / "optuna.journal"))
     return run_study
@@ -270,3 +295,31 @@ def test_stopped_study_requeues_its_trial_and_goes_on_when_it_is_started_again(w
     assert scheduler.go_on()
     assert not scheduler.go_on()
     assert [trial.state.name for trial in work("a", n_trials=3).trials] == ["COMPLETE"] * 3
+
+
+def test_worker_judges_the_control_while_another_worker_has_the_last_training_of_the_selection(monkeypatch, make_phase):
+    chosen, seen = 0, []
+
+    def plan():
+        begun = [trial.user_attrs[FINALIST] for trial in judgement.scheduler.study.trials]
+        known = [CONTROL] if selection.scheduler.state().running else [CONTROL, chosen]
+        return [PlannedTrial({}, {FINALIST: number, FINAL_SEED: 7}) for number in known if number not in begun]
+
+    def judge(attempt):
+        seen.append((attempt.trial.user_attrs[FINALIST], len(selection.scheduler.state().running)))
+        if len(seen) == 1:
+            selection.scheduler.study.tell(of_another, 1.0)
+        return {"mean_steps": 1.0}
+
+    search = make_phase("a", n_trials=1)
+    selection = make_phase("a", name="a-selection", plan=list)
+    judgement = make_phase("a", judge, name="a-judged", plan=plan)
+    lease = {"worker": "another", **asdict(ProcessInfo.current())}
+    selection.scheduler.study.enqueue_trial({}, user_attrs={FINALIST: chosen, FINAL_SEED: 3, LEASE: lease, METRICS: {}})
+    of_another = selection.scheduler.study.ask().number
+    opened = SimpleNamespace(phases=(search, selection, judgement), finals=(selection, judgement))
+    monkeypatch.setattr(worker, "read_settings", lambda words: ())
+    monkeypatch.setattr(worker, "open_for_work", lambda *_, **options: opened)
+    worker.work(["data.n_training=1"], make_heartbeat)
+    assert seen == [(CONTROL, 1), (chosen, 0)]
+    assert len(search.scheduler.state().finished) == len(selection.scheduler.state().finished) == 1
