@@ -1,4 +1,4 @@
-"""Tianshou, imported without packages that armscan does not use through it: 0.9 s less for each process.
+"""Tianshou, imported without packages that armscan does not use through it: half a second less for each process.
 
 The package imports this module first, so that its other modules find Tianshou imported.
 """

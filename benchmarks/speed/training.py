@@ -1,4 +1,4 @@
-"""Processor time of whole trainings, and of whole runs, beside those of an earlier checkout.
+"""Time of whole trainings, and of whole runs, beside those of an earlier checkout.
 
     python -m benchmarks.speed.training [--before CHECKOUT] [--rounds N] [CASE ...]
 
@@ -17,12 +17,15 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
+from typing import NamedTuple
 
 from benchmarks.speed.checkouts import HERE
 
 CASES = {"default": ["training.solved=null"], "make_run": [], "best_full": ["experiment=best_full"]}
 DEFAULT_CASES = ("default", "make_run")
+COLUMNS = ("training, processor s", "all of it, processor s", "all of it, wall s")
 SHORT = ["training.env_steps=2500", "training.eval_every_env_steps=500", "evaluation.episodes=8"]
 PROGRAM = """
 import sys, time
@@ -40,9 +43,18 @@ main()
 """
 
 
-def run(checkout: Path, *words: str) -> tuple[float, float, int]:
-    """Return processor seconds of a run's training and of all of it, and the training's environment steps."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+class Run(NamedTuple):
+    """Processor seconds of a run's training, processor and wall seconds of all of it, and steps of the training."""
+
+    training_s: float
+    processor_s: float
+    wall_s: float
+    n_env_steps: int
+
+
+def run(checkout: Path, *words: str) -> Run:
+    """Run the command with the code of a checkout, and measure it."""
+    before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         said = subprocess.run(
             [sys.executable, "-c", PROGRAM, *words],
@@ -53,11 +65,12 @@ def run(checkout: Path, *words: str) -> tuple[float, float, int]:
             text=True,
             check=True,
         ).stdout
+        wall_s = time.perf_counter() - start_s
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     (line,) = (line for line in said.splitlines() if line.startswith("trained "))
     _, seconds, n_steps = line.split()
-    whole_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return float(seconds), whole_s, int(n_steps)
+    processor_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Run(float(seconds), processor_s, wall_s, int(n_steps))
 
 
 def main() -> None:
@@ -72,21 +85,19 @@ def main() -> None:
     checkouts = [each.resolve() for each in (HERE, given.before) if each]
     for checkout in checkouts:
         run(checkout, *SHORT)
-    print("| run | steps | training, s | before, s | ratio | all of it, s | before, s | ratio |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
+    beside = ["before", "ratio: median, least, most"] if given.before else []
+    header = ["run", "steps", *(cell for title in COLUMNS for cell in (title, *beside))]
+    print(f"| {' | '.join(header)} |\n|{' --- |' * len(header)}", flush=True)
     for case in given.cases or DEFAULT_CASES:
         rounds = [[run(checkout, *CASES[case]) for checkout in checkouts] for _ in range(given.rounds)]
-        training, whole = (
-            [statistics.median(each[which][part] for each in rounds) for which in range(len(checkouts))]
-            for part in (0, 1)
-        )
-        cells = [
-            cell
-            for now, *before in (training, whole)
-            for cell in (f"{now:.1f}", *(f"{each:.1f} | {each / now:.1f}" for each in before or []))
-        ]
-        n_steps = " and ".join(f"{each[2]:,}" for each in rounds[0])
-        print(f"| {case} | {n_steps} | {' | '.join(cells)} |", flush=True)
+        cells = [case, " and ".join(f"{each.n_env_steps:,}" for each in rounds[0])]
+        for column in range(len(COLUMNS)):
+            seconds = [[each[column] for each in of_round] for of_round in rounds]
+            cells += [f"{statistics.median(each):.1f}" for each in zip(*seconds, strict=True)]
+            if given.before:
+                ratios = [before / now for now, before in seconds]
+                cells.append(f"{statistics.median(ratios):.2f}, {min(ratios):.2f}, {max(ratios):.2f}")
+        print(f"| {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":
