@@ -99,7 +99,7 @@ class Worker:
                 return reason
             if scheduler.has_more(state):
                 return None
-            if self._other is not None and self._other.has_more(self._other.state()):
+            if reason is None and self._other is not None and self._other.has_more(self._other.state()):
                 return ""
             time.sleep(WAIT_S)
 

@@ -13,7 +13,7 @@ import pytest
 
 from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL, FINAL_SEED, FINALIST, LEASE, METRICS, Limits, PlannedTrial
+from armscan.sweeps.scheduling.state import CONTROL, FINAL_SEED, FINALIST, LEASE, METRICS, STOP, Limits, PlannedTrial
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.stop import stop_study, stop_trial
 from armscan.sweeps.storage.reports import reports_of
@@ -297,29 +297,54 @@ def test_stopped_study_requeues_its_trial_and_goes_on_when_it_is_started_again(w
     assert [trial.state.name for trial in work("a", n_trials=3).trials] == ["COMPLETE"] * 3
 
 
-def test_worker_judges_the_control_while_another_worker_has_the_last_training_of_the_selection(monkeypatch, make_phase):
-    chosen, seen = 0, []
+@pytest.fixture
+def phases_with_training_of_another(monkeypatch, make_phase):
+    """Return a function that makes phases whose selection waits for another worker's training, and tells its end."""
 
-    def plan():
-        begun = [trial.user_attrs[FINALIST] for trial in judgement.scheduler.study.trials]
-        known = [CONTROL] if selection.scheduler.state().running else [CONTROL, chosen]
-        return [PlannedTrial({}, {FINALIST: number, FINAL_SEED: 7}) for number in known if number not in begun]
+    def make(judge):
+        chosen = 0
+
+        def plan():
+            begun = [trial.user_attrs[FINALIST] for trial in judgement.scheduler.study.trials]
+            known = [CONTROL] if selection.scheduler.state().running else [CONTROL, chosen]
+            return [PlannedTrial({}, {FINALIST: number, FINAL_SEED: 7}) for number in known if number not in begun]
+
+        search = make_phase("a", n_trials=1)
+        selection = make_phase("a", name="a-selection", plan=list)
+        judgement = make_phase("a", judge, name="a-judged", plan=plan)
+        lease = {"worker": "another", **asdict(ProcessInfo.current())}
+        attributes = {FINALIST: chosen, FINAL_SEED: 3, LEASE: lease, METRICS: {}}
+        selection.scheduler.study.enqueue_trial({}, user_attrs=attributes)
+        number = selection.scheduler.study.ask().number
+        opened = SimpleNamespace(phases=(search, selection, judgement), finals=(selection, judgement))
+        monkeypatch.setattr(worker, "read_settings", lambda words: ())
+        monkeypatch.setattr(worker, "open_for_work", lambda *_, **options: opened)
+        return opened, lambda: selection.scheduler.study.tell(number, 1.0)
+
+    return make
+
+
+def test_worker_judges_the_control_while_another_has_the_last_training_of_the_selection(
+    phases_with_training_of_another,
+):
+    seen = []
 
     def judge(attempt):
-        seen.append((attempt.trial.user_attrs[FINALIST], len(selection.scheduler.state().running)))
+        seen.append((attempt.trial.user_attrs[FINALIST], len(opened.finals[0].scheduler.state().running)))
         if len(seen) == 1:
-            selection.scheduler.study.tell(of_another, 1.0)
+            end_training()
         return {"mean_steps": 1.0}
 
-    search = make_phase("a", n_trials=1)
-    selection = make_phase("a", name="a-selection", plan=list)
-    judgement = make_phase("a", judge, name="a-judged", plan=plan)
-    lease = {"worker": "another", **asdict(ProcessInfo.current())}
-    selection.scheduler.study.enqueue_trial({}, user_attrs={FINALIST: chosen, FINAL_SEED: 3, LEASE: lease, METRICS: {}})
-    of_another = selection.scheduler.study.ask().number
-    opened = SimpleNamespace(phases=(search, selection, judgement), finals=(selection, judgement))
-    monkeypatch.setattr(worker, "read_settings", lambda words: ())
-    monkeypatch.setattr(worker, "open_for_work", lambda *_, **options: opened)
+    opened, end_training = phases_with_training_of_another(judge)
     worker.work(["data.n_training=1"], make_heartbeat)
-    assert seen == [(CONTROL, 1), (chosen, 0)]
-    assert len(search.scheduler.state().finished) == len(selection.scheduler.state().finished) == 1
+    assert seen == [(CONTROL, 1), (0, 0)]
+    assert [len(phase.scheduler.state().finished) for phase in opened.phases] == [1, 1, 2]
+
+
+def test_worker_judges_nothing_once_the_study_is_stopped(monkeypatch, phases_with_training_of_another):
+    opened, end_training = phases_with_training_of_another(lambda attempt: {"mean_steps": 1.0})
+    opened.finals[0].scheduler.study.set_user_attr(STOP, "by somebody")
+    # Here, a worker waits.
+    monkeypatch.setattr(worker, "time", SimpleNamespace(sleep=lambda _: end_training()))
+    worker.work(["data.n_training=1"], make_heartbeat)
+    assert [len(phase.scheduler.state().all) for phase in opened.phases] == [1, 1, 0]
