@@ -6,8 +6,6 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import optuna
@@ -21,7 +19,7 @@ from armscan.config.defaults import MULTIRUN, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, RETRY_OF, TrialOutcome
+from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.components import make, read_settings
 from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_picture, shown_metrics, table_of_seeds
@@ -30,17 +28,14 @@ from armscan.sweeps.tasks.attempt import (
     CONFIG_SHA256,
     FOLDER,
     RUN,
-    STUDY_TAG,
-    TRIAL_TAG,
     Attempt,
     check_metrics,
     config_sha256,
     trial_folder,
 )
 from armscan.sweeps.workers.heartbeat import Heartbeat, LimitReachedError
-from armscan.tracking import TrackedRun, run_of_study
-from armscan.tracking.run import PARENT_TAG, SHORT_WAIT_S
-from armscan.utils.files import CONFIG_FILE, SHA256_TAGS
+from armscan.sweeps.workers.trial_run import close_requeued, open_run
+from armscan.tracking import TrackedRun
 from armscan.utils.log import log, silence_libraries
 
 WAIT_S = 1.0
@@ -148,7 +143,7 @@ class Worker:
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)
         config_sum = config_sha256(to_plain(config))
-        self._tracked = self._begun(trial, chosen, folder, config_sum)
+        self._tracked = open_run(phase, trial, chosen, config_sum, writes)
         self._opened(None)
         for name, value in ((FOLDER, str(folder)), (CONFIG_SHA256, config_sum)):
             if trial.user_attrs.get(name) != value:
@@ -177,44 +172,8 @@ class Worker:
                 where = phase.client, phase.experiment_id, self._tracked.run_id, folder
                 writes.append(partial(note_run, trial, *where, table_of_seeds(attempt.seeds_done)))
 
-    def _begun(self, trial: Trial, chosen: dict[str, Any], folder: Path, config_sum: str) -> TrackedRun:
-        """Open the tracked run of a trial, or resume that of a requeued one."""
-        phase, attributes = self._phase, trial.user_attrs
-        tags = {
-            **phase.tags_of(trial),
-            SHA256_TAGS[CONFIG_FILE]: config_sum,
-            "folder": str(folder.resolve()),
-            "overrides": " ".join(overrides_of(chosen)),
-        }
-        if RETRY_OF in attributes:
-            tags["trial.retry_of"] = str(attributes[RETRY_OF])
-        if RUN in attributes:
-            run = run_of_study(
-                phase.client,
-                attributes[RUN],
-                experiment_id=phase.experiment_id,
-                tags={STUDY_TAG: phase.name, TRIAL_TAG: str(trial.number), PARENT_TAG: phase.run_id},
-                where=f"{phase.name}.trials[{trial.number}].user_attrs.{RUN}",
-            )
-            tracked = TrackedRun.reopen(phase.client, run, folder=folder, config={}, tags=tags)
-        else:
-            tracked = TrackedRun.start(
-                phase.client,
-                phase.experiment_id,
-                name=f"{phase.name}-{trial.number:04d}",
-                config=chosen,
-                tags=tags,
-                folder=folder,
-                parent_id=phase.run_id,
-            )
-            # Before the trial knows its run: a resumed trial writes no note.
-            note = partial(note_run, trial, phase.client, phase.experiment_id, tracked.run_id, folder)
-            for write in (note, partial(trial.set_user_attr, RUN, tracked.run_id)):
-                self._heartbeat.writes.append(write)
-        return tracked
-
     def _opened(self, training: TrackedRun | None) -> None:
-        self._heartbeat.cleanup = partial(_close, training, self._tracked)
+        self._heartbeat.cleanup = partial(close_requeued, training, self._tracked)
 
     def _conclude(self, outcome: TrialOutcome, tracked: TrackedRun | None) -> None:
         """Log and track the outcome of a trial, once the storage has it."""
@@ -237,11 +196,6 @@ class Worker:
         log(f"trial {trial.number} was taken over by another worker")
         if tracked is not None:
             tracked.end("FAILED", reason="taken over by another worker")
-
-
-def _close(*runs: TrackedRun | None) -> None:
-    for run in filter(None, runs):
-        run.end("KILLED", reason="requeued", wait_s=SHORT_WAIT_S)
 
 
 def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None:

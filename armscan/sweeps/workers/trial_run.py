@@ -1,0 +1,69 @@
+"""The tracked run of a trial: a worker opens it when the trial begins, and closes it when the trial is requeued."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+from optuna.trial import Trial
+
+from armscan.sweeps.scheduling.state import RETRY_OF, PendingWrites
+from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.study.dashboard import note_run
+from armscan.sweeps.study.open import Phase
+from armscan.sweeps.tasks.attempt import RUN, STUDY_TAG, TRIAL_TAG, trial_folder
+from armscan.tracking import TrackedRun, run_of_study
+from armscan.tracking.run import PARENT_TAG, SHORT_WAIT_S
+from armscan.utils.files import CONFIG_FILE, SHA256_TAGS
+
+
+def open_run(
+    phase: Phase, trial: Trial, values: Mapping[str, Any], config_sum: str, writes: PendingWrites
+) -> TrackedRun:
+    """Start the tracked run of a trial, or resume that of a requeued one.
+
+    Args:
+        phase: Phase of the trial.
+        trial: The trial.
+        values: Its values by their keys.
+        config_sum: SHA-256 of its configuration.
+        writes: Pending writes about the trial, which get a note of a new run.
+    """
+    attributes, folder = trial.user_attrs, trial_folder(phase.folder, trial.number)
+    tags = {
+        **phase.tags_of(trial),
+        SHA256_TAGS[CONFIG_FILE]: config_sum,
+        "folder": str(folder.resolve()),
+        "overrides": " ".join(overrides_of(values)),
+    }
+    if RETRY_OF in attributes:
+        tags["trial.retry_of"] = str(attributes[RETRY_OF])
+    if RUN in attributes:
+        run = run_of_study(
+            phase.client,
+            attributes[RUN],
+            experiment_id=phase.experiment_id,
+            tags={STUDY_TAG: phase.name, TRIAL_TAG: str(trial.number), PARENT_TAG: phase.run_id},
+            where=f"{phase.name}.trials[{trial.number}].user_attrs.{RUN}",
+        )
+        return TrackedRun.reopen(phase.client, run, folder=folder, config={}, tags=tags)
+    tracked = TrackedRun.start(
+        phase.client,
+        phase.experiment_id,
+        name=f"{phase.name}-{trial.number:04d}",
+        config=values,
+        tags=tags,
+        folder=folder,
+        parent_id=phase.run_id,
+    )
+    # Before the trial knows its run: a resumed trial writes no note.
+    writes.append(partial(note_run, trial, phase.client, phase.experiment_id, tracked.run_id, folder))
+    writes.append(partial(trial.set_user_attr, RUN, tracked.run_id))
+    return tracked
+
+
+def close_requeued(*runs: TrackedRun | None) -> None:
+    """Close the open runs of a trial that is requeued; None for no run."""
+    for run in filter(None, runs):
+        run.end("KILLED", reason="requeued", wait_s=SHORT_WAIT_S)
