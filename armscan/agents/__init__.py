@@ -1,6 +1,5 @@
 """Agents: learning algorithms with their networks, and baselines to compare them with."""
 
-import armscan.agents.tianshou_imports  # noqa: F401 - before any part of Tianshou
 from armscan.agents.baselines import Exhaustive, Random
 from armscan.agents.compute import Compute
 from armscan.agents.multimodal import Multimodal

@@ -9,6 +9,7 @@ from gymnasium import spaces
 
 from armscan.agents.finder_parameters import FinderParameters
 from armscan.agents.protocols import AgentSetup
+from armscan.agents.tianshou_imports import import_tianshou
 from armscan.envs.actions import COMPONENTS
 from armscan.errors import InvalidValueError
 
@@ -40,6 +41,7 @@ class PlaneFinder(FinderParameters):
             InvalidValueError: If the environment does not show or allow what it needs, or the training is too short.
         """
         self.check(setup)
+        import_tianshou()
         from armscan.agents.plane_finder_learner import PlaneFinderLearner
 
         return PlaneFinderLearner(self, setup)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 from armscan.agents.hyperparameters import Parameters, PolicyParameters, check_batch, check_collection, number
 from armscan.agents.networks import Network
 from armscan.agents.protocols import AgentSetup
+from armscan.agents.tianshou_imports import import_tianshou
 from armscan.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -84,6 +85,7 @@ class PPO(PolicyParameters):
         return self._learner(setup, network, n_collected)
 
     def _learner(self, setup: AgentSetup, network: Network, n_collected: int) -> TianshouLearner:
+        import_tianshou()
         from tianshou.algorithm.modelfree import ppo
         from tianshou.algorithm.modelfree.reinforce import ProbabilisticActorPolicy
         from tianshou.algorithm.optim import AdamOptimizerFactory

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from armscan.agents.hyperparameters import Parameters, buffer_capacity, check_batch, check_updates, number
 from armscan.agents.protocols import AgentSetup
+from armscan.agents.tianshou_imports import import_tianshou
 from armscan.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ class Regression(Parameters):
         check_updates(self.utd_ratio, setup)
         size = buffer_capacity(self.buffer_size, self.num_envs, setup)
         check_batch(self.batch_size, size, "which is all that is kept of the training's slices")
+        import_tianshou()
         from armscan.agents.regression_learner import RegressionLearner
 
         return RegressionLearner(

@@ -9,6 +9,7 @@ from armscan.agents.hyperparameters import number
 from armscan.agents.plane_finder import PlaneFinder
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.sac import SAC
+from armscan.agents.tianshou_imports import import_tianshou
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_int
 
@@ -58,6 +59,7 @@ class ResidualSAC(PlaneFinder):
                 f"{setup.total_env_steps}, which leaves the rest to SAC"
             )
         self.check(replace(setup, total_env_steps=self.taught_env_steps))
+        import_tianshou()
         from armscan.agents.residual_learner import ResidualLearner
 
         return ResidualLearner(

@@ -18,6 +18,7 @@ from armscan.agents.hyperparameters import (
 )
 from armscan.agents.networks import Network
 from armscan.agents.protocols import AgentSetup
+from armscan.agents.tianshou_imports import import_tianshou
 from armscan.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ class SAC(PolicyParameters):
     def _learner(
         self, setup: AgentSetup, network: Network, *, n_random: int, n_collected: int, n_kept: int
     ) -> TianshouLearner:
+        import_tianshou()
         import torch
         from tianshou.algorithm.modelfree import sac
         from tianshou.algorithm.optim import AdamOptimizerFactory

@@ -1,7 +1,4 @@
-"""Tianshou, imported without packages that armscan does not use through it: half a second less for each process.
-
-The package imports this module first, so that its other modules find Tianshou imported.
-"""
+"""Tianshou, imported without packages that armscan does not use through it: half a second less for each process."""
 
 from __future__ import annotations
 
@@ -10,9 +7,9 @@ import sys
 from types import ModuleType
 from typing import Any
 
-ABSENT = {
-    "tianshou.env.pettingzoo_env": "PettingZooEnv",
+STAND_INS = {
     "matplotlib.figure": "Figure",
+    "tianshou.env.pettingzoo_env": "PettingZooEnv",
     "torch.utils.tensorboard": "SummaryWriter",
     "tensorboard.backend.event_processing": "event_accumulator",
 }
@@ -20,23 +17,21 @@ ABSENT = {
 
 
 def import_tianshou() -> None:
-    """Import Tianshou, with an empty class for each name of `ABSENT`, and without Ray.
+    """Import Tianshou, with an empty class for each name of `STAND_INS`, and without Ray.
 
-    Afterwards, the modules of `ABSENT` can be imported as usual. Those imported before are left as they are, and so is
-    Tianshou itself.
+    Call it before anything else imports Tianshou; afterwards it does nothing. Tianshou keeps the empty classes, so its
+    logger for TensorBoard and its multi-agent environments do not work in this process. Anybody else who imports the
+    modules gets the real ones.
     """
     # None makes an import fail: Tianshou does without Ray then.
-    stand_ins: dict[str, ModuleType | None] = {"ray": None}
-    for name, part in ABSENT.items():
-        module = stand_ins[name] = ModuleType(name)
-        setattr(module, part, type(part, (), {}))
-    absent: dict[str, Any] = {name: module for name, module in stand_ins.items() if name not in sys.modules}
-    sys.modules.update(absent)
+    modules: dict[str, Any] = {"ray": None}
+    for name, part in STAND_INS.items():
+        modules[name] = ModuleType(name)
+        setattr(modules[name], part, type(part, (), {}))
+    added = {name: module for name, module in modules.items() if name not in sys.modules}
+    sys.modules.update(added)
     try:
         importlib.import_module("tianshou.algorithm")
     finally:
-        for name in absent:
+        for name in added:
             del sys.modules[name]
-
-
-import_tianshou()

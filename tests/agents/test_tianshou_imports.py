@@ -7,7 +7,8 @@ import sys
 
 PROGRAM = """
 import sys
-import armscan.agents
+from armscan.agents.tianshou_imports import import_tianshou
+import_tianshou()
 print(sorted({"ray", "pettingzoo", "tensorboard", "matplotlib"} & set(sys.modules)))
 from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter

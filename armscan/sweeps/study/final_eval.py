@@ -174,7 +174,7 @@ class FinalEvaluation:
     def missing_of_judgement(self) -> list[PlannedTrial]:
         """Return the trainings of the judgement that no worker has begun; during the selection, those of the control.
 
-        The control is judged whatever is chosen, so its trainings keep workers busy that the race leaves idle.
+        Whatever the race chooses, the control is judged beside it; so idle workers can train it during the race.
         """
         judged = self.judged() if self.race().is_over else [CONTROL]
         return self._planned([(number, seed) for seed in self.judge_seeds for number in judged], self.judgement)

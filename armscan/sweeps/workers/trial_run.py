@@ -19,7 +19,7 @@ from armscan.utils.files import CONFIG_FILE, SHA256_TAGS
 
 
 def open_run(
-    phase: Phase, trial: Trial, values: Mapping[str, Any], config_sum: str, writes: PendingWrites
+    phase: Phase, trial: Trial, values: Mapping[str, Any], config_sha256: str, writes: PendingWrites
 ) -> TrackedRun:
     """Start the tracked run of a trial, or resume that of a requeued one.
 
@@ -27,13 +27,16 @@ def open_run(
         phase: Phase of the trial.
         trial: The trial.
         values: Its values by their keys.
-        config_sum: SHA-256 of its configuration.
+        config_sha256: SHA-256 of its configuration.
         writes: Pending writes about the trial, which get a note of a new run.
+
+    Returns:
+        The run, open.
     """
     attributes, folder = trial.user_attrs, trial_folder(phase.folder, trial.number)
     tags = {
         **phase.tags_of(trial),
-        SHA256_TAGS[CONFIG_FILE]: config_sum,
+        SHA256_TAGS[CONFIG_FILE]: config_sha256,
         "folder": str(folder.resolve()),
         "overrides": " ".join(overrides_of(values)),
     }

@@ -49,7 +49,7 @@ class Worker:
         phase: The phase.
         words: Command line of the study, as words.
         heartbeat: Heartbeat of the worker in this phase.
-        other: Scheduler of a phase that runs at the same time. Default: None, no phase does.
+        other: Scheduler of another phase, whose trials can be run while this one waits. Default: None, there is none.
     """
 
     def __init__(
@@ -58,12 +58,13 @@ class Worker:
         self._phase, self._words, self._heartbeat, self._other = phase, words, heartbeat, other
         self._tracked: TrackedRun | None = None
 
-    def work(self) -> str:
+    def work(self) -> str | None:
         """Run trials until none is left and those of other workers have ended, or until only the other phase has some.
 
         Returns:
-            Why the phase has ended; an empty string if it has not.
+            Why the phase has ended; None if it has not.
         """
+        self._phase.scheduler.look_for_stop()
         outcome: TrialOutcome | None = None
         conclude: Callable[[], None] | None = None
         while True:
@@ -78,11 +79,13 @@ class Worker:
                 outcome = self._run(trial)
                 conclude = partial(self._conclude, outcome, self._tracked) if outcome else None
                 self._tracked = None
-            elif (reason := self._wait_for_trial()) is not None:
-                return reason
+            else:
+                can_claim, reason = self._wait_for_trial()
+                if not can_claim:
+                    return reason
 
-    def _wait_for_trial(self) -> str | None:
-        """Wait until a trial can be claimed; return None then, or what `work` returns."""
+    def _wait_for_trial(self) -> tuple[bool, str | None]:
+        """Wait for a trial; return whether one of this phase can be claimed, and otherwise what `work` returns."""
         scheduler = self._phase.scheduler
         while True:
             scheduler.look_for_stop()
@@ -91,11 +94,11 @@ class Worker:
             reason = scheduler.end(state)
             # A running trial may yet have to be retried.
             if reason is not None and not state.running:
-                return reason
+                return False, reason
             if scheduler.has_more(state):
-                return None
+                return True, None
             if reason is None and self._other is not None and self._other.has_more(self._other.state()):
-                return ""
+                return False, None
             time.sleep(WAIT_S)
 
     def _run(self, trial: Trial) -> TrialOutcome | None:
@@ -211,14 +214,15 @@ def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None
     silence_libraries()
     opened = open_for_work(*read_settings(words), words, retry=True)
 
-    def run_phase(phase: Phase, other: Phase | None) -> str:
+    def run_phase(phase: Phase, other: Phase | None) -> str | None:
         heartbeat = make_heartbeat(phase.scheduler, on_death=phase.close_runs_of)
         with heartbeat.running():
             return Worker(phase, words, heartbeat, None if other is None else other.scheduler).work()
 
-    # While the selection waits for other workers, the judgement goes on, and the other way round.
-    for phase, other in zip(opened.phases, (None, *opened.finals[1:], None), strict=False):
-        while not (reason := run_phase(phase, other)):
+    for phase in opened.phases:
+        # While the selection waits for other workers, this one trains the control for the judgement.
+        other = opened.finals[1] if opened.finals and phase is opened.finals[0] else None
+        while (reason := run_phase(phase, other)) is None:
             assert other is not None
             run_phase(other, phase)
         log(f"{phase.name}: {reason}")
