@@ -33,6 +33,8 @@ FILES = (
     CODE.name,
     "serving_input_example.json",
 )
+# Folder of the bytecode that Python writes beside code.
+BYTECODE = "__pycache__"
 # What the code needs; others come with these.
 REQUIREMENTS = ("mlflow", "numpy", "torch")
 # As the model takes them: one array of shape (n, k), or the parts by their names, each of shape (n, ...).
@@ -80,8 +82,9 @@ def is_model(folder: Path) -> bool:
 
 
 def others_in(folder: Path) -> list[str]:
-    """Return the files in a model's folder that are not part of a model."""
-    found = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+    """Return the files in a model's folder that are not part of a model, nor the bytecode that loading it writes."""
+    paths = (path.relative_to(folder) for path in folder.rglob("*"))
+    found = {path.as_posix() for path in paths if BYTECODE not in path.parts}
     return sorted(found - {*FILES, *(str(Path(file).parent) for file in FILES)})
 
 

@@ -104,6 +104,14 @@ def test_model_says_what_goes_in_and_comes_out(made):
     assert len(example["reward"]) == 2
 
 
+def test_only_what_is_not_of_a_model_and_no_bytecode_is_in_the_way_of_a_new_one(tmp_path):
+    files = [*FILES, "__pycache__/pyfunc.cpython-311.pyc", "notes/mine.txt"]
+    for file in files:
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).touch()
+    assert others_in(tmp_path) == ["notes", "notes/mine.txt"]
+
+
 def test_model_is_served_and_answers_over_http_as_the_learner_acts(made):
     variants = [("sac", "vector"), ("ppo", "images")]
     servers = [serve(made[variant][0] / "model") for variant in variants]
