@@ -10,6 +10,7 @@ import platform
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from armscan.utils.files import sha256
 
 # Those that a run's figures may depend on; of the others, the file has the versions.
 TOLD = ("torch", "tianshou", "gymnasium", "numpy", "numba", "scipy", "simpleitk", "optuna", "mlflow", "hydra-core")
+PACKAGE_FOLDERS = {"site-packages", "dist-packages"}
 PYTHON, CONSTRAINTS_SUM = "version.python", "constraints.sha256"
 UNKNOWN = "unknown"
 HEADER = re.compile(r"^(Name|Version): *(\S+)", re.MULTILINE)
@@ -37,7 +39,9 @@ TIMEOUT_S = 30.0
 @functools.cache
 def environment() -> Mapping[str, Any]:
     """Return Python, the machine and the packages of this process, once, as plain values."""
-    found = map(_name_and_version, metadata.distributions())
+    # Not what a package has put into its own folder: Ray adds one to the path when it is imported.
+    folders = [folder for folder in sys.path if not PACKAGE_FOLDERS & {*Path(folder).parent.parts}]
+    found = map(_name_and_version, metadata.distributions(path=folders))
     packages = {canonicalize_name(name): version for name, version in found if name}
     return {
         "python": platform.python_version(),

@@ -21,3 +21,14 @@ def test_environment_tags_tell_what_figures_may_depend_on():
     tags = environment_tags()
     assert set(tags) == {"version.python", "constraints.sha256", *(f"version.{name}" for name in TOLD)}
     assert "not installed" not in tags.values()
+
+
+def test_packages_in_the_folder_of_another_package_are_left_out(monkeypatch, tmp_path):
+    for name, folder in (("alone", "site-packages"), ("within", "site-packages/other/vendored")):
+        (tmp_path / folder / f"{name}-1.0.dist-info").mkdir(parents=True)
+        (tmp_path / folder / f"{name}-1.0.dist-info" / "METADATA").write_text(f"Name: {name}\nVersion: 1.0\n")
+        monkeypatch.syspath_prepend(tmp_path / folder)
+    # As a process finds them that has not asked before.
+    packages = environment.__wrapped__()["packages"]
+    assert packages["alone"] == "1.0"
+    assert "within" not in packages
