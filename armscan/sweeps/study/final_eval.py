@@ -168,15 +168,15 @@ class FinalEvaluation:
 
     def judged(self) -> list[int]:
         """Return the configurations that the test volumes are opened for: the chosen one and the control."""
-        chosen = self.race().chosen
-        return [] if chosen is None else list(dict.fromkeys((chosen, CONTROL)))
+        return _judged(self.race().chosen)
 
     def missing_of_judgement(self) -> list[PlannedTrial]:
         """Return the trainings of the judgement that no worker has begun; during the selection, those of the control.
 
-        Whatever the race chooses, the control is judged beside it; so idle workers can train it during the race.
+        The control is always judged, so idle workers train it before the race ends.
         """
-        judged = self.judged() if self.race().is_over else [CONTROL]
+        race = self.race()
+        judged = _judged(race.chosen) if race.is_over else [CONTROL]
         return self._planned([(number, seed) for seed in self.judge_seeds for number in judged], self.judgement)
 
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
@@ -187,6 +187,10 @@ class FinalEvaluation:
             for number, seed in trainings
             if (number, seed) not in begun
         ]
+
+
+def _judged(chosen: int | None) -> list[int]:
+    return [] if chosen is None else list(dict.fromkeys((chosen, CONTROL)))
 
 
 def training_of(trial: FrozenTrial | Trial) -> tuple[int, int]:
