@@ -34,8 +34,9 @@ import numpy as np
 from armscan.stats.paired import paired_difference
 from armscan.utils.arrays import FloatArray
 from armscan.utils.log import silence_libraries
-from benchmarks.sweeps.bench.collect import train_and_test
+from benchmarks.sweeps.bench.collect import train_and_evaluate
 from benchmarks.sweeps.bench.report import markdown, with_interval
+from benchmarks.sweeps.bench.table import TEST
 from benchmarks.sweeps.searches import NAME, WITHOUT_END, SearchResult, search_by_armscan, search_by_hydra
 
 
@@ -106,8 +107,9 @@ def _replicate(results: Results, name: str, replicate: int, n_seeds: int) -> Non
     for seed in range(FIRST_SEED + SEEDS_APART * replicate, FIRST_SEED + SEEDS_APART * replicate + n_seeds):
         for values in best.values():
             if results.find(task=name, values=values, seed=seed) is None:
-                _, tested = train_and_test(task.words, values, seed)
-                scores = {volume: each.metrics()[OBJECTIVE] for volume, each in tested.by_volume().items()}
+                _, evaluations = train_and_evaluate(task.words, values, seed)
+                of_volumes = evaluations[TEST].by_volume()
+                scores = {volume: each.metrics()[OBJECTIVE] for volume, each in of_volumes.items()}
                 results.add(**known, values=values, seed=seed, scores=scores)
 
 

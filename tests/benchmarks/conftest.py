@@ -19,7 +19,7 @@ def synthetic_curves(n_configs, chance=0.1):
     config_of = np.repeat(np.arange(n_configs), N_SEEDS)
     worth = np.array([true_log(places_of(design.space, values)) for values in design.configs])[config_of]
     # A seed is lucky all along, and a validation of its own.
-    logs = worth[:, None] + 3.0 * np.exp(-np.arange(N_EPOCHS + 1) / 2.0)
+    logs = worth[:, None] + 3.0 * np.exp(-np.arange(N_EPOCHS + 2) / 2.0)
     logs = logs + rng.normal(0.0, chance, (len(worth), 1)) + rng.normal(0.0, chance / 4, logs.shape)
     steps = np.exp(logs.clip(0.0, np.log(50.0)))
     return Curves(
@@ -28,7 +28,8 @@ def synthetic_curves(n_configs, chance=0.1):
         design.configs,
         config_of,
         1200.0 * np.arange(1, N_EPOCHS + 1),
-        dict.fromkeys(METRICS, steps[:, :-1]),
+        dict.fromkeys(METRICS, steps[:, :-2]),
+        dict.fromkeys(METRICS, steps[:, -2]),
         dict.fromkeys(METRICS, steps[:, -1]),
         np.ones(len(worth)),
     )

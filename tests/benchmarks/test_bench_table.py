@@ -51,11 +51,10 @@ def rows_of(n_configs, n_seeds, n_epochs, left_out=()):
     for number, values in enumerate(design.configs):
         for seed in range(n_seeds):
             of_training = {"fixed_sha256": design.fixed_sha256, "commit": "0123abc", "config": number, "seed": seed}
-            for epoch in range(n_epochs + 1):
-                steps = 1.0 + number + seed / 10 + (0.5 if epoch == n_epochs else abs(epoch - 2))
-                metrics = dict.fromkeys(METRICS, 0.5) | {"mean_steps": steps}
-                volumes = "test" if epoch == n_epochs else "validation"
-                at = {"volumes": volumes, "env_steps": 1000 * (epoch + 1), "processor_s": 1.0}
+            rows_at = [("validation", 1000 * (epoch + 1), float(abs(epoch - 2))) for epoch in range(n_epochs)]
+            for volumes, env_steps, more in (*rows_at, ("test", 3000, 0.5), ("selection", 3000, 0.25)):
+                metrics = dict.fromkeys(METRICS, 0.5) | {"mean_steps": 1.0 + number + seed / 10 + more}
+                at = {"volumes": volumes, "env_steps": env_steps, "processor_s": 1.0}
                 if (number, seed) not in left_out:
                     rows.append({**of_training, **at, **metrics, **values})
     return pd.DataFrame(rows)
@@ -70,6 +69,7 @@ def test_a_table_is_read_as_it_was_written(tmp_path):
     assert curves.validation["mean_steps"].shape == (12, 5)
     assert curves.config_of.tolist() == [0] * 3 + [1] * 3 + [2] * 3 + [3] * 3
     assert curves.env_steps.tolist() == [1000, 2000, 3000, 4000, 5000]
+    assert curves.selection["mean_steps"][7] == pytest.approx(3.35)
     assert curves.test["mean_steps"][7] == pytest.approx(3.6)
     assert curves.validation["mean_steps"][7].tolist() == pytest.approx([5.1, 4.1, 3.1, 4.1, 5.1])
 
@@ -111,6 +111,6 @@ def test_a_table_is_added_to_by_the_same_command(tmp_path):
     collect("sac_y", 2, 1, overrides=SMALL, file=file)
     rows = read_rows(file)
     assert set(rows.config) == {0, 1}
-    pd.testing.assert_frame_equal(rows[rows.config == 0], first)
+    pd.testing.assert_frame_equal(rows[rows.config == 0], first, check_dtype=False)
     with pytest.raises(ValueError, match="--allow-changes"):
         collect("sac_y", 3, 1, overrides=[*SMALL, "evaluation.episodes=3"], file=file)

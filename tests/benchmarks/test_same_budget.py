@@ -91,15 +91,15 @@ def trained(monkeypatch):
     def search(name):
         return lambda words, budget_s, folder: SearchResult({"key": name}, budget_s, 20)
 
-    def train_and_test(words, values, seed):
+    def train_and_evaluate(words, values, seed):
         trained.append((values.get("key"), seed))
         value = {"a": 1.0, "b": 2.0}.get(values.get("key"), 4.0)
         volumes = {f"v{number}": value + number + seed % 10 for number in (1, 0)}
         evaluations = {name: SimpleNamespace(metrics=lambda v=v: {"mean_steps": v}) for name, v in volumes.items()}
-        return None, SimpleNamespace(by_volume=lambda: evaluations)
+        return None, {"test": SimpleNamespace(by_volume=lambda: evaluations)}
 
     monkeypatch.setattr(same_budget, "SEARCHES", {"armscan": search("a"), "hydra": search("b")})
-    monkeypatch.setattr(same_budget, "train_and_test", train_and_test)
+    monkeypatch.setattr(same_budget, "train_and_evaluate", train_and_evaluate)
     return trained
 
 

@@ -14,7 +14,16 @@ import joblib
 import pandas as pd
 
 from benchmarks.sweeps.bench.design import Design
-from benchmarks.sweeps.bench.table import METRICS, TEST, VALIDATION, check_rows, read_rows, table_file, write_rows
+from benchmarks.sweeps.bench.table import (
+    METRICS,
+    SELECTION,
+    TEST,
+    VALIDATION,
+    check_rows,
+    read_rows,
+    table_file,
+    write_rows,
+)
 
 
 def collect(
@@ -42,6 +51,8 @@ def collect(
     file = file or table_file(sweep)
     design, rows = Design.of(sweep, n_configs, overrides), read_rows(file)
     check_rows(rows, design)
+    # Tables of earlier versions have trainings without a selection, which are trained again.
+    rows = rows.groupby(["config", "seed"]).filter(lambda training: (training.volumes == SELECTION).any())
     earlier = set(rows.fixed_sha256) - {design.fixed_sha256}
     if earlier and not allow_changes:
         raise ValueError(
@@ -76,20 +87,16 @@ def trained_rows(words: Sequence[str], training: Mapping[str, Any], values: dict
         values: Values of the configuration by name.
     """
     recorder = _Recorder()
-    result, tested = train_and_test([*words], values, int(training["seed"]), [recorder])
-    last = {
-        "volumes": TEST,
-        "env_steps": result.best.n_env_steps,
-        "processor_s": recorder.epochs[-1]["processor_s"],
-        **_shortened(tested.metrics()),
-    }
-    return [{**training, **epoch, **values} for epoch in (*recorder.epochs, last)]
+    result, evaluations = train_and_evaluate([*words], values, int(training["seed"]), [recorder])
+    last = {"env_steps": result.best.n_env_steps, "processor_s": recorder.epochs[-1]["processor_s"]}
+    ends = [{"volumes": name, **last, **_shortened(each.metrics())} for name, each in evaluations.items()]
+    return [{**training, **row, **values} for row in (*recorder.epochs, *ends)]
 
 
-def train_and_test(
+def train_and_evaluate(
     words: Sequence[str], values: Mapping[str, Any], seed: int, callbacks: Sequence[Any] = ()
-) -> tuple[Any, Any]:
-    """Train a configuration with a seed to its end as a trial would, and evaluate its best epoch on the test volumes.
+) -> tuple[Any, dict[str, Any]]:
+    """Train a configuration with a seed to its end as a trial would, and evaluate its best epoch.
 
     Args:
         words: Overrides of the configuration, as on the command line.
@@ -98,7 +105,8 @@ def train_and_test(
         callbacks: Callbacks of the training. Default: none.
 
     Returns:
-        The result of the training, and the evaluation.
+        The result of the training, and two evaluations: `selection`, on the validation volumes as in the race of a
+        study, and `test`, on the test volumes.
     """
     from armscan.config.compose import compose_run
     from armscan.experiment.build import build_experiment
@@ -106,6 +114,7 @@ def train_and_test(
     from armscan.experiment.runner import train_agent
     from armscan.sweeps.space.parameter import overrides_of
     from armscan.sweeps.tasks.attempt import volumes_of
+    from armscan.sweeps.tasks.training import SELECTION_SEED
     from armscan.training import evaluate
     from armscan.utils.log import silence_libraries
 
@@ -114,8 +123,11 @@ def train_and_test(
     setup = build_experiment(config, volumes_of(config))
     with tempfile.TemporaryDirectory() as folder:
         result = train_agent(setup, Path(folder), callbacks, run_id="bench", tell=lambda _: None)
-    episodes = {"n_episodes": setup.n_episodes, "seed": TEST_VOLUMES_SEED + setup.seed, "on_plane": setup.on_plane}
-    return result, evaluate(setup.agent, setup.test_env, **episodes)
+    where = {SELECTION: (setup.validation_env, SELECTION_SEED), TEST: (setup.test_env, TEST_VOLUMES_SEED)}
+    return result, {
+        name: evaluate(setup.agent, env, n_episodes=setup.n_episodes, seed=first + setup.seed, on_plane=setup.on_plane)
+        for name, (env, first) in where.items()
+    }
 
 
 @dataclass

@@ -163,8 +163,8 @@ def choose(scores: FloatArray, *, min_seeds: int, max_seeds: int) -> Choice:
 
 
 def scores_of(candidates: Sequence[SimulatedConfig], n_seeds: int, rng: np.random.Generator) -> FloatArray:
-    """Return scores of fresh trainings, minus the steps of the best validation, shape (candidates, seeds)."""
-    return -np.array([each.draw(rng, n_seeds)[:, :-1].min(axis=1) for each in candidates])
+    """Return scores of fresh trainings, minus the steps of the selection, shape (candidates, seeds)."""
+    return -np.array([each.draw(rng, n_seeds)[:, -2] for each in candidates])
 
 
 @lru_cache

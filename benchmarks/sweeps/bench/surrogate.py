@@ -1,12 +1,13 @@
 """Trainings of any configuration, simulated from the table: the mean by a forest, chance from real trainings.
 
 A table alone has too few points for a sampler to search: mapped to the nearest of them, what samplers propose would be
-spoiled, those most that search locally (Pfisterer et al. 2022, YAHPO Gym). So extremely randomised trees (Geurts et al.
-2006) over the configurations give weights to those of the table (Meinshausen 2006), and the mean curve of a
+spoiled, those most that search locally (Pfisterer et al. 2022, YAHPO Gym). So extremely randomised trees (Geurts et
+al. 2006) over the configurations give weights to those of the table (Meinshausen 2006), and the mean curve of a
 configuration is the weighted mean of theirs; of one in the table it is its own. A training adds what one real
-training, drawn by the same weights, was off its own configuration's mean: in all epochs and in the test at once, so
-that chance is as large, as skewed and as lasting as in the table. All of it is of the logarithm of the mean steps of an
-episode. What a configuration is truly worth is then known: the mean over all trainings that could be drawn.
+training, drawn by the same weights, was off its own configuration's mean: in all epochs, the selection and the test at
+once, so that chance is as large, as skewed and as lasting as in the table. All of it is of the logarithm of the mean
+steps of an episode. What a configuration is truly worth is then known: the mean over all trainings that could be
+drawn.
 """
 
 from __future__ import annotations
@@ -35,16 +36,18 @@ class Training(NamedTuple):
 
     Args:
         curve: Mean steps in the validation of each epoch, shape (epochs,).
-        test: Mean steps of the best epoch's weights on the test volumes.
+        selection: Mean steps of the best epoch's weights on the validation volumes, in episodes that chose no weights.
+        test: The same on the test volumes.
     """
 
     curve: FloatArray
+    selection: float
     test: float
 
 
 @dataclass(frozen=True)
 class Surrogate:
-    """A model of the mean steps of an episode in each epoch's validation, and in the test at the end.
+    """A model of the mean steps of an episode in each epoch's validation, and in the selection and the test at the end.
 
     Args:
         space: The space.
@@ -53,8 +56,8 @@ class Surrogate:
             (trees, configurations, dimensions); NaN for a configuration that is left out.
         high: Its upper corner, likewise.
         share: Inverse of the number of configurations in that box, shape (trees, configurations).
-        means: Mean logarithm of each configuration's epochs and test, shape (configurations, epochs + 1).
-        chance: Difference of each training from that mean, shape (trainings, epochs + 1).
+        means: Mean logarithm of each configuration's epochs, selection and test, shape (configurations, epochs + 2).
+        chance: Difference of each training from that mean, shape (trainings, epochs + 2).
         config_of: Configuration of each training, shape (trainings,).
         bounds: Smallest and largest logarithm of the table.
     """
@@ -78,7 +81,8 @@ class Surrogate:
             without: Fold of the configurations that is left out. Default: None, no fold.
             seed: Seed of the forest. Default: 0.
         """
-        logs = np.log(np.column_stack([curves.validation["mean_steps"], curves.test["mean_steps"]]))
+        parts = curves.validation, curves.selection, curves.test
+        logs = np.log(np.column_stack([part["mean_steps"] for part in parts]))
         means, n_seeds = curves.mean_over_seeds(logs), np.bincount(curves.config_of)[curves.config_of, np.newaxis]
         # A mean over few seeds has moved towards each of them.
         chance = (logs - means[curves.config_of]) * np.sqrt(n_seeds / (n_seeds - 1))
@@ -141,7 +145,7 @@ class SimulatedConfig:
 
     Args:
         surrogate: The surrogate.
-        mean: Mean logarithm of its epochs and test, shape (epochs + 1,).
+        mean: Mean logarithm of its epochs, selection and test, shape (epochs + 2,).
         shares: How likely the chance of each training is drawn, shape (trainings,).
     """
 
@@ -152,10 +156,10 @@ class SimulatedConfig:
     def train(self, rng: np.random.Generator) -> Training:
         """Return a training with a fresh seed."""
         (steps,) = self.draw(rng, 1)
-        return Training(steps[:-1], float(steps[-1]))
+        return Training(steps[:-2], float(steps[-2]), float(steps[-1]))
 
     def draw(self, rng: np.random.Generator, n_seeds: int) -> FloatArray:
-        """Return the epochs and the test of trainings with fresh seeds, shape (seeds, epochs + 1)."""
+        """Return epochs, selection and test of trainings with fresh seeds, shape (seeds, epochs + 2)."""
         places = rng.random(n_seeds) * self.shares.sum()
         drawn = np.searchsorted(self.shares.cumsum(), places, side="right")
         return np.asarray(np.exp((self.mean + self.surrogate.chance[drawn]).clip(*self.surrogate.bounds)))

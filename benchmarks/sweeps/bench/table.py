@@ -1,4 +1,4 @@
-"""The table of a bench: validations of every epoch and the test at the end, for each configuration and seed."""
+"""The table of a bench: for each configuration and seed the validation of each epoch, and evaluations at the end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from benchmarks.sweeps.bench.design import Design, places_of
 FOLDER = Path(__file__).parent / "tables"
 # With fewer trainings of a configuration little is known of chance.
 FEWEST_SEEDS = 3
-VALIDATION, TEST = "validation", "test"
+VALIDATION, SELECTION, TEST = "validation", "selection", "test"
 METRICS = (
     *("mean_steps", "success_rate", "on_plane_5mm_10deg", "on_plane_2mm_5deg"),
     *("mean_distance_mm", "mean_distance_deg", "mean_return"),
@@ -68,7 +68,9 @@ class Curves:
         config_of: Place of each training's configuration among them, shape (trainings,).
         env_steps: Environment steps at the end of each epoch, shape (epochs,).
         validation: Metrics of each epoch by name, shape (trainings, epochs).
-        test: Metrics of the best epoch's weights on the test volumes by name, shape (trainings,).
+        selection: Metrics of the best epoch's weights by name, on the validation volumes in episodes that chose no
+            weights, shape (trainings,).
+        test: The same on the test volumes, shape (trainings,).
         processor_s: Processor seconds of each training, shape (trainings,).
     """
 
@@ -78,6 +80,7 @@ class Curves:
     config_of: NDArray[np.intp]
     env_steps: FloatArray
     validation: dict[str, FloatArray]
+    selection: dict[str, FloatArray]
     test: dict[str, FloatArray]
     processor_s: FloatArray
 
@@ -90,14 +93,17 @@ class Curves:
             file: File of the table. Default: None, the one that `collect` writes.
         """
         rows = read_rows(file or table_file(sweep))
+        collecting = f"python -m benchmarks.sweeps.bench collect {sweep}"
         if rows.empty:
-            raise ValueError(f"there is no table of {sweep} yet: python -m benchmarks.sweeps.bench collect {sweep}")
+            raise ValueError(f"there is no table of {sweep} yet: {collecting}")
         design = Design.of(sweep, int(rows.config.max()) + 1)
         check_rows(rows, design)
-        n_seeds = rows.groupby("config").seed.nunique()
+        n_seeds = rows[rows.volumes == SELECTION].groupby("config").seed.nunique()
         numbers = n_seeds[n_seeds >= FEWEST_SEEDS].index
+        if numbers.empty:
+            raise ValueError(f"no configuration in the table of {sweep} has {FEWEST_SEEDS} seeds yet: {collecting}")
         rows = rows[rows.config.isin(numbers)].sort_values(["config", "seed", "env_steps"])
-        tests, epochs = rows[rows.volumes == TEST], rows[rows.volumes == VALIDATION]
+        epochs, selections, tests = (rows[rows.volumes == volumes] for volumes in (VALIDATION, SELECTION, TEST))
         env_steps = epochs.env_steps.to_numpy(float).reshape(len(tests), -1)
         if (env_steps != env_steps[0]).any():
             raise ValueError(f"the epochs of the table of {sweep} are not all after the same environment steps")
@@ -108,6 +114,7 @@ class Curves:
             np.searchsorted(numbers, tests.config),
             env_steps[0],
             {name: epochs[name].to_numpy(float).reshape(env_steps.shape) for name in METRICS},
+            {name: selections[name].to_numpy(float) for name in METRICS},
             {name: tests[name].to_numpy(float) for name in METRICS},
             tests.processor_s.to_numpy(float),
         )
@@ -121,6 +128,7 @@ class Curves:
             configs=tuple(self.configs[number] for number in numbers),
             config_of=np.repeat(np.arange(len(numbers)), [len(each) for each in trainings]),
             validation={name: values[drawn] for name, values in self.validation.items()},
+            selection={name: values[drawn] for name, values in self.selection.items()},
             test={name: values[drawn] for name, values in self.test.items()},
             processor_s=self.processor_s[drawn],
         )
