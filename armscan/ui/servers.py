@@ -78,7 +78,7 @@ def start_dashboard(
 
     from armscan.sweeps.stop import stop_running_trial
 
-    storage.optuna.checks.is_on = False
+    storage.optuna.checks_reads = False
     application = wsgi(storage.optuna, artifact_store=FileSystemArtifactStore(artifacts))
     view = DashboardView(application, partial(stop_running_trial, storage), mlflow)
     checked = HostCheck(view, allowed_hosts or (f"{HOST}:{port}", f"localhost:{port}"))

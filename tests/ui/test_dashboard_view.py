@@ -35,7 +35,7 @@ def dashboard(tmp_path):
     def made(of_study, of_trial, *, is_running=False):
         storage = open_storage(str(tmp_path / "optuna.journal"))
         # As other programs write.
-        storage.optuna.checks.is_on = False
+        storage.optuna.checks_reads = False
         study = optuna.create_study(study_name="a", storage=storage.optuna)
         for name, value in of_study.items():
             study.set_user_attr(name, value)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from numbers import Real
 from typing import Annotated, Any
 
 import optuna
-from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
 from pydantic import ConfigDict, Field
 
@@ -155,57 +153,6 @@ def unreadable(what: str, error: Exception) -> StudyError:
     """Return the error of one line that the trials of `what` cannot be read."""
     reason = " ".join(str(error).split()) or repr(error)
     return StudyError(f"the trials of {what} cannot be read: {reason[:MAX_REASON_CHARS]}")
-
-
-class ReadChecks:
-    """Checks of data read from a storage, to which others may write at any time."""
-
-    def __init__(self) -> None:
-        # Optuna's dashboard shows attributes of any type.
-        self.is_on = True
-        # IDs of finished trials that were found sound: nobody can change them through Optuna.
-        self._sound: set[int] = set()
-
-    def trials(self, storage: BaseStorage, study_id: int, read: Callable[[], list[FrozenTrial]]) -> list[FrozenTrial]:
-        """Return the trials of a study that `read` returns, checked as by `check_trials`."""
-        if not self.is_on:
-            return read()
-        name = storage.get_study_name_from_id(study_id)
-        with _in_one_line(f"study {name!r}"):
-            trials = read()
-        unknown = [trial for trial in trials if trial._trial_id not in self._sound]
-        n_objectives = len(storage.get_study_directions(study_id)) if unknown else 0
-        for trial in unknown:
-            check_trial(trial, name, n_objectives)
-        self._sound.update(trial._trial_id for trial in unknown if trial.state.is_finished())
-        return trials
-
-    def trial(self, read: Callable[[], FrozenTrial]) -> FrozenTrial:
-        """Return the trial that `read` returns, with its attributes checked."""
-        # Not a `KeyError`: by that Optuna says that there is none.
-        with _in_one_line("a study", DAMAGED):
-            trial = read()
-        if self.is_on:
-            TrialAttributes.read(f"trials[{trial.number}].user_attrs", trial.user_attrs)
-        return trial
-
-    def study_attributes(self, read: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Return the user attributes of a study that `read` returns, checked if armscan has written them."""
-        with _in_one_line("a study"):
-            attributes = read()
-        if self.is_on and attributes.keys() >= OF_STUDY:
-            StudyAttributes.read("study.user_attrs", attributes)
-        return attributes
-
-
-@contextlib.contextmanager
-def _in_one_line(what: str, errors: tuple[type[Exception], ...] = UNREADABLE) -> Iterator[None]:
-    try:
-        yield
-    except errors as error:
-        if isinstance(error, ArmscanError):
-            raise
-        raise unreadable(what, error) from error
 
 
 def _wrong_numbers(trial: FrozenTrial, n_objectives: int) -> str | None:

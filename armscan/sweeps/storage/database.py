@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
-from collections.abc import Callable, Container
+from collections.abc import Callable
 from functools import partial, wraps
 from typing import Any, TypeVar
 
@@ -13,13 +13,12 @@ from optuna.distributions import BaseDistribution
 from optuna.exceptions import StorageInternalError
 from optuna.storages import BaseStorage, RDBStorage
 from optuna.storages._cached_storage import _CachedStorage
-from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy import URL, Connection, create_engine, inspect, text
 from sqlalchemy.exc import DBAPIError, OperationalError, SQLAlchemyError
 
 from armscan.config.credentials import STORAGE_PASSWORD, database_url
 from armscan.errors import StorageAwayError
-from armscan.sweeps.storage.attributes import ReadChecks
+from armscan.sweeps.storage.checked_reads import CheckedReads
 from armscan.utils.retry import RetryPolicy
 
 T = TypeVar("T")
@@ -66,26 +65,8 @@ def why_away(error: BaseException) -> str | None:
     return message.splitlines()[0] if message else type(error).__name__
 
 
-class _CheckedStorage(_CachedStorage):
+class _CheckedStorage(CheckedReads, _CachedStorage):
     """A cache of a database that checks all data it reads."""
-
-    def __init__(self, database: RDBStorage) -> None:
-        super().__init__(database)
-        self.checks = ReadChecks()
-
-    def get_all_trials(
-        self, study_id: int, deepcopy: bool = True, states: Container[TrialState] | None = None
-    ) -> list[FrozenTrial]:
-        """See `BaseStorage`."""
-        return self.checks.trials(self, study_id, partial(super().get_all_trials, study_id, deepcopy, states))
-
-    def get_trial(self, trial_id: int) -> FrozenTrial:
-        """See `BaseStorage`."""
-        return self.checks.trial(partial(super().get_trial, trial_id))
-
-    def get_study_user_attrs(self, study_id: int) -> dict[str, Any]:
-        """See `BaseStorage`."""
-        return self.checks.study_attributes(partial(super().get_study_user_attrs, study_id))
 
 
 class DatabaseStorage(_CheckedStorage):

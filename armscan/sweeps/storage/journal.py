@@ -8,7 +8,7 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Container, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,10 +18,10 @@ from filelock import FileLock
 from optuna.storages import JournalStorage
 from optuna.storages.journal import BaseJournalBackend
 from optuna.storages.journal._storage import JournalOperation
-from optuna.trial import FrozenTrial, TrialState
 
 from armscan.errors import StorageAwayError, StudyError
-from armscan.sweeps.storage.attributes import UNREADABLE, ReadChecks
+from armscan.sweeps.storage.attributes import UNREADABLE
+from armscan.sweeps.storage.checked_reads import CheckedReads
 from armscan.utils.files import FULL_DISK, truncate_torn_line
 from armscan.utils.retry import RetryPolicy
 
@@ -56,26 +56,8 @@ def open_journal(path: Path, *, is_written: bool) -> CheckedJournal:
         raise StudyError(f"that file is not an Optuna journal: {error}") from error
 
 
-class CheckedJournal(JournalStorage):
+class CheckedJournal(CheckedReads, JournalStorage):
     """A journal that checks all data it reads."""
-
-    def __init__(self, file: JournalFile) -> None:
-        self.checks = ReadChecks()
-        super().__init__(file)
-
-    def get_all_trials(
-        self, study_id: int, deepcopy: bool = True, states: Container[TrialState] | None = None
-    ) -> list[FrozenTrial]:
-        """See `BaseStorage`."""
-        return self.checks.trials(self, study_id, partial(super().get_all_trials, study_id, deepcopy, states))
-
-    def get_trial(self, trial_id: int) -> FrozenTrial:
-        """See `BaseStorage`."""
-        return self.checks.trial(partial(super().get_trial, trial_id))
-
-    def get_study_user_attrs(self, study_id: int) -> dict[str, Any]:
-        """See `BaseStorage`."""
-        return self.checks.study_attributes(partial(super().get_study_user_attrs, study_id))
 
 
 def _why_full(error: BaseException) -> str | None:
