@@ -80,8 +80,6 @@ def _watch(write: Callable[[int | None], Path]) -> None:
 
 def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int | None], Path]:
     """Return a function that writes the current report of a study, for a browser that reloads it every few seconds."""
-    import optuna
-
     from armscan.sweeps.results.report import write_report
     from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, check_trials
     from armscan.sweeps.storage.storage import existing_storage
@@ -93,20 +91,18 @@ def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int |
     storage = existing_storage(uri, where="--storage")
     if storage is None:
         raise StudyError(f"--storage is {uri!r}, but there is no storage: give the one that contains the study")
-    names = optuna.get_all_study_names(storage.optuna)
-    if name not in names:
-        others = [each for each in names if not each.endswith(FINAL_SUFFIXES)]
+    study = storage.study(name)
+    if study is None:
+        others = [each for each in storage.study_names if not each.endswith(FINAL_SUFFIXES)]
         there = f"there is only {listed(others)}" if others else "there is no study"
         raise StudyError(f"--study is {name!r}, but {there} in {storage.uri!r}")
-    study = optuna.load_study(study_name=name, storage=storage.optuna)
     if not is_ours(study):
         raise StudyError(f"--study is {name!r}, but that one in {storage.uri!r} was not made by armscan")
 
     def write(refresh_s: int | None) -> Path:
         check_trials(study)
         evaluated = []
-        if name + JUDGEMENT_SUFFIX in optuna.get_all_study_names(storage.optuna):
-            final = optuna.load_study(study_name=name + JUDGEMENT_SUFFIX, storage=storage.optuna)
+        if (final := storage.study(name + JUDGEMENT_SUFFIX)) is not None:
             check_trials(final, n_searched=len(study.get_trials(deepcopy=False)))
             evaluated = final.get_trials(deepcopy=False)
         stored = FinalEvaluation.stored(storage, study)

@@ -1,7 +1,4 @@
-"""One run from beginning to end: build, track, train, evaluate, show.
-
-The configuration is read only here, in `setup` and in `build`.
-"""
+"""One run from beginning to end: build, track, train, evaluate, show."""
 
 from __future__ import annotations
 
@@ -101,7 +98,7 @@ def run_tracked(
     again = resume_command(tracked.run_id, tracking_uri, trust=trust)
     hint = _resume_hint_on_error(again, folder, is_told=job_label is None)
     with hint, tracked, named_if_full(folder):
-        result = None
+        result, how = None, getattr(setup.agent, "validation_note", None)
         if isinstance(setup.agent, Learner):
             at_once, every = setup.agent.env_steps_at_once, setup.budget.eval_every_env_steps
             if at_once > every:
@@ -110,7 +107,6 @@ def run_tracked(
                     f"(training.eval_every_env_steps = {every} is less)"
                 )
             n_validation = setup.budget.validation_episodes
-            how = getattr(setup.agent, "validation_note", None)
             measured = ", ".join(filter(None, ["validation", f"{n_validation} episodes", how]))
             callbacks = [progress_reporter(job_label, measured), tracked]
             result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, tell=tell, earlier=earlier)
@@ -120,8 +116,9 @@ def run_tracked(
         tell(f"playing {setup.n_episodes} episodes on the training volumes, and as many on the test volumes")
         reached = RunResult.of(setup, result)
         if job_label is None:
-            how = f"as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
-            print_results(f"results ({'deterministic policy, ' if result else ''}{how})", reached)
+            policy = f"{how} policy, " if how else ""
+            origin = f"{policy}as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
+            print_results(f"results ({origin})", reached)
         tell("writing the results, the video of an episode, and the policy")
         record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)
         keep_results(tracked, result, reached, folder)

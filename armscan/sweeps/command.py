@@ -12,8 +12,10 @@ from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.errors import printable
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher
 from armscan.sweeps.results.console import print_result
+from armscan.sweeps.storage.storage import existing_storage
 from armscan.sweeps.study.arguments import STORAGE, StudyCommand, words_of_trials
 from armscan.sweeps.study.components import check_space, read_settings
+from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.population import population_of
@@ -47,7 +49,9 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     check_space(settings, task, trial_words, config)
     begins = beginnings(settings, trial_words, to_plain(config), existing)
     if given.is_plan:
-        print_plan(settings, existing, begins)
+        storage = existing_storage(settings.storage)
+        final = FinalEvaluation.stored(storage, existing) if storage is not None and existing is not None else None
+        print_plan(settings, existing, final, begins)
         return 0
     opened = open_for_work(settings, task, config, trial_words)
     search = opened.search.scheduler

@@ -25,18 +25,16 @@ def reason() -> str:
 
 def is_study(storage: Storage | None, name: str) -> bool:
     """Return whether a study of armscan has this name; the final trainings of one belong to it."""
-    if storage is None or name not in optuna.get_all_study_names(storage.optuna):
-        return False
-    return is_ours(optuna.load_study(study_name=name, storage=storage.optuna))
+    study = storage.study(name) if storage is not None else None
+    return study is not None and is_ours(study)
 
 
 def stop_study(uri: str, name: str) -> str:
     """Stop a study: its trials are requeued, and its command resumes it; return the consequence in one line."""
     storage = _storage_with(uri, name)
-    names, n_running = optuna.get_all_study_names(storage.optuna), 0
+    n_running = 0
     for each in (name, *(name + suffix for suffix in FINAL_SUFFIXES)):
-        if each in names:
-            study = optuna.load_study(study_name=each, storage=storage.optuna)
+        if (study := storage.study(each)) is not None:
             study.set_user_attr(STOP, reason())
             n_running += len(study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
     return (
@@ -84,6 +82,6 @@ def stop_running_trial(storage: Storage, trial_id: int) -> bool:
 def _storage_with(uri: str, name: str) -> Storage:
     """Open a storage that has a study, to write; nothing is made if there is none."""
     there = existing_storage(uri, where="--storage")
-    if there is None or name not in optuna.get_all_study_names(there.optuna):
+    if there is None or name not in there.study_names:
         raise StudyError(f"the study is {name!r}, but it is not in {uri!r}: give --storage URI")
     return open_storage(uri, where="--storage")

@@ -31,9 +31,7 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
         rates.plot(steps, [100 * value for value in values], marker="o", color=colour, label=label)
     rates.set_ylabel("of validation episodes (%)")
     rates.set_ylim(-3, 103)
-    lengths.plot(
-        steps, [report.evaluation.mean_steps for report in reports], marker="o", label="validation, deterministic"
-    )
+    lengths.plot(steps, [report.evaluation.mean_steps for report in reports], marker="o", label="validation")
     trained = [
         (report.n_env_steps, report.metrics["train/length"]) for report in reports if "train/length" in report.metrics
     ]

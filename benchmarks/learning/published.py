@@ -28,7 +28,7 @@ from matplotlib.ticker import NullFormatter
 from benchmarks.learning.runs import MIXED, finished_run
 
 HERE = Path(__file__).parent
-PICTURE = HERE.parent / "docs" / "images" / "published.png"
+PICTURE = HERE.parents[1] / "docs" / "images" / "published.png"
 LENGTHS = (10, 5, 2)
 TICKS = (1, 2, 5, 10, 20, 50, 100)
 N_SMOOTHED = 5

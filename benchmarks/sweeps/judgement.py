@@ -1,11 +1,11 @@
-"""Simulate how often the interval of a study's result holds the true difference, beside other intervals.
+"""Simulate how often the interval of a study's result contains the true difference, beside other intervals.
 
     python -m benchmarks.sweeps.judgement [--studies 2000]
 
 A simulated study has four candidates and the control. The score of a training on a volume is the sum of its
 configuration's true value, an effect of the training, one of the configuration on the volume, and a rest, all normal.
 The configuration is selected by `armscan.sweeps.scheduling.race`. Of the studies that do not choose the control, the
-table has the share of those whose 95 % interval of chosen less control holds the true difference:
+table has the share of those whose 95 % interval of chosen less control contains the true difference:
 
 - `paired`: as armscan judges, with seeds of its own, and `armscan.stats.paired`;
 - `bootstrap`: seeds of its own, and a percentile bootstrap of the seeds;
@@ -35,7 +35,7 @@ N_SEEDS, N_VOLUMES, EFFECTS = (2, 3, 5, 10), (4, 8, 12), (0.0, 1.0)
 
 
 class Coverage(NamedTuple):
-    """Shares of the studies whose interval holds the truth, by the way of judging; see above."""
+    """Shares of the studies whose interval contains the truth, by the way of judging; see above."""
 
     paired: float
     bootstrap: float
@@ -93,7 +93,7 @@ def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float, *, see
 
 
 def holds(differences: np.ndarray, truth: float) -> bool:
-    """Return whether the interval of a paired difference holds the truth."""
+    """Return whether the interval of a paired difference contains the truth."""
     mean, half = crossed_mean(differences)
     return bool(abs(mean - truth) <= half)
 

@@ -19,6 +19,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, Self
 
+from omegaconf import DictConfig
 from optuna.trial import FrozenTrial
 
 from armscan.sweeps.scheduling.state import METRICS
@@ -42,10 +43,9 @@ TRAINING = (
 class TimedTraining(TrainingTask):
     """The task of training an agent, which says what of its time was the study's."""
 
-    @property
-    def metrics(self) -> tuple[str, ...]:
-        """Those of a training, and the seconds of the whole task and of the study's part in it."""
-        return (*super().metrics, "task_s", *(f"{name}_s" for name in OF_STUDY))
+    def metrics(self, config: DictConfig) -> tuple[str, ...]:
+        """Return those of a training, and the seconds of the whole task and of the study's part in it."""
+        return (*super().metrics(config), "task_s", *(f"{name}_s" for name in OF_STUDY))
 
     def run(self, attempt: Attempt) -> dict[str, float]:
         """See `Task.run`."""

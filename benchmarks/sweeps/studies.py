@@ -82,9 +82,8 @@ def finish(folder: Path, *words: str) -> StudyState:
 def state_in(folder: Path, uri: str = JOURNAL) -> StudyState:
     """Return how the study of a folder stands."""
     storage = open_storage(uri if "://" in uri else str(folder / uri))
-    if NAME not in optuna.get_all_study_names(storage.optuna):
-        return StudyState.of([])
-    return StudyState.of(optuna.load_study(study_name=NAME, storage=storage.optuna).trials)
+    study = storage.study(NAME)
+    return StudyState.of([] if study is None else study.trials)
 
 
 def by_worker(state: StudyState) -> dict[str, list[FrozenTrial]]:

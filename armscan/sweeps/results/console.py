@@ -96,9 +96,9 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
         title = f"selection on the validation volumes, by: {title_of(objective)}"
         _print_rows(title, [each.row(objective) for each in candidates])
     judgement = judge(final)
-    if judgement is None or not judgement.results:
+    if judgement is None or judgement.of_chosen is None:
         reason = "no trial or no final training has finished"
-        if not final.race().is_over or final.missing_of_judgement():
+        if not final.is_over:
             reason = "trainings are missing; the same command resumes the study"
         print(f"error: no final evaluation, because {reason}", file=sys.stderr)
         return False

@@ -28,9 +28,9 @@ from armscan.utils.markdown import markdown_table
 
 MAXIMIZE = "maximize"
 HOW = (
-    "A difference is the mean over all seeds and test volumes, each beside itself; its interval is for other seeds and "
-    "other volumes. The probability of improvement: a training of the chosen configuration is better on a volume than "
-    "one of the control. Rates differ by percentage points."
+    "A difference is the mean of the paired differences over all seeds and test volumes; its interval is for other "
+    "seeds and volumes. The probability of improvement is the probability that a training of the chosen configuration "
+    "is better on a volume than one of the control. Rates differ by percentage points."
 )
 
 
@@ -113,7 +113,13 @@ class Judgement:
     @property
     def compared(self) -> str:
         """The configurations that the differences are between, and their seeds."""
-        return f"{name_of(self.chosen).capitalize()} and the control, {self.n_seeds} other seeds each"
+        seeds = f"{self.n_seeds} new seed{'s' if self.n_seeds > 1 else ''}"
+        return f"{name_of(self.chosen).capitalize()} and the control, both with the same {seeds}"
+
+    @property
+    def of_chosen(self) -> ConfigResult | None:
+        """The result of the chosen configuration; None before one of its trainings has finished."""
+        return next((each for each in self.results if each.number == self.chosen), None)
 
     @property
     def result(self) -> str:
@@ -135,12 +141,12 @@ class Judgement:
             return f"{name} was chosen; it has not been judged beside the control yet."
         first = self.differences[0]
         if math.isnan(first.paired.low):
-            return f"{name} was chosen; one seed does not show whether it is better than the default configuration."
+            return f"{name} was chosen; one seed does not show whether it is better than the control."
         if first.verdict:
-            return f"{name} is {first.verdict} than the default configuration: {title_of(first.metric)}."
+            return f"{name} is {first.verdict} than the control ({title_of(first.metric)})."
         return (
-            f"{name} was chosen, but the test volumes do not show that it is better than the default configuration: "
-            f"the interval of the difference holds 0 ({title_of(first.metric)})."
+            f"{name} was chosen, but the test volumes do not show that it is better than the control: the interval of "
+            f"the difference contains 0 ({title_of(first.metric)})."
         )
 
 
@@ -169,23 +175,22 @@ def judge(final: FinalEvaluation) -> Judgement | None:
     )
 
 
-def best_metrics(search: optuna.Study, final: FinalEvaluation | None) -> dict[str, float]:
+def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str, float]:
     """Return the leading metrics of a study's best trial and of its result, by the names that runs use.
 
     Args:
         search: Study of the search.
-        final: Its final evaluation; None without one.
+        judgement: Its judgement; None without one.
     """
     found: dict[str, float] = {}
     if best := best_trials(search, 1):
         metrics = best[0].user_attrs.get(METRICS, {})
         found |= {f"validation/{name}": metrics[name] for name in leading_among(metrics)}
-    judgement = judge(final) if final is not None else None
-    if judgement is None or not judgement.results:
+    if judgement is None or (chosen := judgement.of_chosen) is None:
         return found
-    of_chosen = judgement.results[0].figures.metrics()
+    of_chosen = chosen.figures.metrics()
     found |= {f"test_volumes/{name}": of_chosen[name] for name in leading_among(of_chosen)}
-    if (of_random := judgement.results[0].baselines.get(RANDOM)) is not None:
+    if (of_random := chosen.baselines.get(RANDOM)) is not None:
         metrics = of_random.metrics()
         found |= {f"{RANDOM}/{name}": metrics[name] for name in leading_among(metrics)}
     for each in judgement.differences:
@@ -195,10 +200,9 @@ def best_metrics(search: optuna.Study, final: FinalEvaluation | None) -> dict[st
     return found
 
 
-def result_note(final: FinalEvaluation | None) -> str:
+def result_note(judgement: Judgement | None) -> str:
     """Return the result of a study in Markdown, as the study prints it; empty before a configuration was judged."""
-    judgement = judge(final) if final is not None else None
-    if judgement is None or not judgement.results:
+    if judgement is None or judgement.of_chosen is None:
         return ""
     settings = (f"{name}: {f'`{words}`' if words else NOTHING_SEARCHED}" for name, words in judgement.settings.items())
     parts = [f"**{judgement.result}**", *settings, "The test volumes:", final_table(judgement.results).markdown()]

@@ -56,7 +56,7 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
                 print_sentence(printable(_describe(trial, phase)))
 
     def show() -> None:
-        # Nothing that is shown is worth waiting for: who leaves would wait for it, too.
+        # A display is not worth waiting for, and a retry would delay the exit.
         with no_retry():
             if not sys.stdout.isatty():
                 repeat(print_new, stopped)
@@ -128,19 +128,19 @@ def _table(opened: OpenedStudy) -> Table:
 def _final_summary(final: FinalEvaluation, n_done: Sequence[int]) -> str:
     """Return the state of the final evaluation in one line."""
     _, most = n_trainings(final.settings)
-    chosen = final.race().chosen
-    n_left = sum(standing.is_in for standing in final.race().standings.values())
-    now = f"{n_left} candidates left" if chosen is None else f"{name_of(chosen)} chosen"
-    selected, judged = n_done
-    return f"final evaluation: {selected} trainings to select, {judged} to judge, at most {most} in all; {now}"
+    race, (n_selected, n_judged) = final.race(), n_done
+    n_left = sum(standing.is_in for standing in race.standings.values())
+    now = f"{n_left} candidates left" if race.chosen is None else f"{name_of(race.chosen)} chosen"
+    done = f"{n_selected} selection and {n_judged} judgement trainings done"
+    return f"final evaluation: {done}, at most {most} in all; {now}"
 
 
 def status_line(opened: OpenedStudy, state: StudyState) -> str:
     """Return the state of a study in one line."""
     settings = opened.settings
-    n_pruned = sum(trial.state == TrialState.PRUNED for trial in state.finished)
+    done = f"{len(state.finished)} of {settings.n_trials} trials done, {state.n_pruned} of them pruned"
     parts = [
-        f"study {settings.name}: {len(state.finished)} of {settings.n_trials} trials done, {n_pruned} of them pruned",
+        f"study {settings.name}: {done}",
         f"{len(state.running)} running, {len(state.failed)} failed, {len(state.retried)} retried",
     ]
     if best := best_trials(opened.search.scheduler.study, 1):
@@ -148,7 +148,7 @@ def status_line(opened: OpenedStudy, state: StudyState) -> str:
     durations = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
     if durations and opened.search.scheduler.end(state) is None:
         left_s = (settings.n_trials - len(state.finished)) * fmean(durations) / settings.workers
-        parts.append(f"{left_s // 60:.0f} min of trials left")
+        parts.append(f"about {left_s // 60:.0f} min left for the trials")
     return "; ".join(parts)
 
 

@@ -89,16 +89,15 @@ def write_report(
 
 def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
     state, best = StudyState.of(trials), best_trials(study, 1)
-    n_pruned = sum(trial.state == TrialState.PRUNED for trial in state.finished)
     n_infeasible = sum(not is_feasible(trial) for trial in state.finished)
     taken = f"; {len(state.taken)} were taken from other studies" if state.taken else ""
     violating = f", {n_infeasible} infeasible" if n_infeasible else ""
     ended = study.user_attrs.get(TERMINATED, {}).get(REASON)
     hours = state.busy_hours
     text = (
-        f"{len(state.finished)} trials finished, {n_pruned} of them pruned{violating}; {len(state.running)} running, "
-        f"{len(state.failed)} failed, {len(state.retried)} retried after their worker died{taken}. "
-        f"{state.env_steps:,} environment steps in "
+        f"{len(state.finished)} trials finished, {state.n_pruned} of them pruned{violating}; "
+        f"{len(state.running)} running, {len(state.failed)} failed, "
+        f"{len(state.retried)} retried after their worker died{taken}. {state.env_steps:,} environment steps in "
         f"{f'{hours:.1f} hours' if hours >= 1 else f'{60 * hours:.1f} minutes'}."
     )
     if ended:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from optuna.trial import TrialState
 from plotly.graph_objects import Figure
 
 from armscan.reports.chart_style import BLUE, GREY, ORANGE, RATE_AXIS
@@ -139,20 +138,19 @@ def decided(
     final: FinalEvaluation, judgement: Judgement | None, candidates: Sequence[Candidate], searched: StudyState
 ) -> str:
     """Return how a study has decided, step by step, as HTML."""
-    n_pruned = sum(trial.state == TrialState.PRUNED for trial in searched.finished)
     objective, settings = objective_of(final), final.settings
     better = "higher" if final.sign > 0 else "lower"
     n_selected = sum(len(each.scores) for each in candidates)
     n_candidates = max(0, len(candidates) - 1)
     n_seeds = " to ".join(dict.fromkeys(map(str, (settings.min_seeds, settings.max_seeds))))
     steps = [
-        f"<b>Search</b>: {len(searched.finished)} trials, {n_pruned} of them pruned. Candidates are its best different "
-        f"configurations ({n_candidates}), and the control: {NOTHING_SEARCHED}.",
+        f"<b>Search</b>: {len(searched.finished)} trials, {searched.n_pruned} of them pruned. Candidates are its best "
+        f"different configurations ({n_candidates}), and the control: {NOTHING_SEARCHED}.",
         f"<b>Selection</b>, on the validation volumes: {n_selected} trainings with seeds that the search has not used "
         f"({n_seeds} of each candidate), compared by "
         f"{html.escape(title_of(objective))} ({better} is better). Those that were behind the "
-        f"leader with {DROP_LEVEL:.0%} confidence got no further seed. Of the others, the one with the best "
-        "unfavourable end of its interval is chosen.",
+        f"leader with {DROP_LEVEL:.0%} confidence got no further seed. Of the others, the one whose "
+        "interval has the best worst-case end is chosen.",
     ]
     if judgement is not None:
         judged = "the control alone" if judgement.chosen == CONTROL else f"{name_of(judgement.chosen)} and the control"

@@ -59,8 +59,8 @@ def final_table(results: Sequence[ConfigResult]) -> ResultTable:
 def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
     """Return the final evaluation of each configuration, over all episodes of all its trainings.
 
-    The intervals draw seeds, each with all its volumes, because one training was evaluated on all of them. Of trials
-    that have kept no episodes, which older ones have not, they are of the means of seeds and volumes.
+    The intervals draw seeds, each with all its volumes, because one training was evaluated on all of them. Older trials
+    stored no episodes; their intervals come from the means of seeds and volumes.
 
     Args:
         trials: Trials of the final evaluation; unfinished ones are left out.

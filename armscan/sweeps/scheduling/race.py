@@ -18,7 +18,8 @@ from armscan.stats.bootstrap import LEVEL, Estimate
 
 # Confidence, one-sided, at which a configuration that is behind the leader is dropped.
 DROP_LEVEL = 0.9
-# Degrees of freedom that the variance of all configurations has in that of each: two or three seeds say little of it.
+# Prior degrees of freedom: the weight of the pooled variance in that of each configuration, of which two or three seeds
+# say little.
 PRIOR_DF = 4.0
 
 UNKNOWN = Estimate(math.nan, math.nan, math.nan)

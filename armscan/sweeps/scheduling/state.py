@@ -37,7 +37,7 @@ RESET_FAILURES = "forgiven"
 # In a lease: the worker that holds the trial.
 HOLDER = ("worker", "host", "pid", "started", "boot", "pid_namespace")
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
-# So many failures before any trial reported are the fault of the configuration.
+# If this many trials fail before any reports, the configuration is at fault.
 FAILURES_AT_ONCE = 3
 
 
@@ -46,11 +46,11 @@ class StudyState:
     """State of a study.
 
     Args:
-        finished: Number of trials that ran to their end or were pruned.
-        running: Number of trials that workers run.
-        waiting: Number of requeued trials and enqueued retries.
-        failed: Number of trials that raised, or whose workers died too often.
-        retried: Number of attempts whose worker died, and that were retried.
+        finished: Trials that ran to their end or were pruned.
+        running: Trials that workers run.
+        waiting: Requeued trials and enqueued retries.
+        failed: Trials that raised, or whose workers died too often.
+        retried: Attempts whose worker died, and that were retried.
         taken: Finished trials of other studies, which count nowhere.
     """
 
@@ -80,6 +80,11 @@ class StudyState:
     def all(self) -> tuple[FrozenTrial, ...]:
         """All trials that were run here, or will be."""
         return self.finished + self.running + self.waiting + self.failed + self.retried
+
+    @property
+    def n_pruned(self) -> int:
+        """Number of finished trials that were pruned."""
+        return sum(trial.state == TrialState.PRUNED for trial in self.finished)
 
     @property
     def env_steps(self) -> int:

@@ -12,6 +12,7 @@ from typing import TypeVar
 import optuna
 from filelock import FileLock
 from optuna.exceptions import StorageInternalError
+from optuna.study import Study
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.config.credentials import STORAGE_PASSWORD, check_address, database_url, mask_passwords
@@ -39,6 +40,15 @@ class Storage:
     uri: str
     optuna: DatabaseStorage | CheckedJournal = field(repr=False)
     lock_file: Path | None
+
+    @property
+    def study_names(self) -> list[str]:
+        """The names of its studies."""
+        return optuna.get_all_study_names(self.optuna)
+
+    def study(self, name: str) -> Study | None:
+        """Return the study with this name; None if there is none."""
+        return optuna.load_study(study_name=name, storage=self.optuna) if name in self.study_names else None
 
     def exclusive(self, decide: Callable[[], T]) -> T:
         """Run an operation that excludes all other processes, and return its result.

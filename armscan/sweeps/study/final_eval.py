@@ -29,7 +29,7 @@ from armscan.sweeps.scheduling.state import (
     PlannedTrial,
 )
 from armscan.sweeps.space.parameter import Value
-from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
+from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.settings import (
     JUDGEMENT_SEEDS_ABOVE,
@@ -80,7 +80,14 @@ class FinalEvaluation:
     def opened(
         cls, storage: Storage, settings: StudySettings, search: optuna.Study, control: Mapping[str, Value] | None
     ) -> Self:
-        """Make the two studies, or find them; the arguments are those of the class."""
+        """Make the two studies, or find them.
+
+        Args:
+            storage: Storage of the study.
+            settings: Settings of the whole study.
+            search: Study of the search.
+            control: Values of the control by the searched keys; None if they do not lie in the space.
+        """
 
         def make(suffix: str, directions: Sequence[StudyDirection]) -> optuna.Study:
             study = storage.exclusive(
@@ -108,10 +115,9 @@ class FinalEvaluation:
     @classmethod
     def stored(cls, storage: Storage, search: optuna.Study) -> Self | None:
         """Return the final evaluation of a stored study; None if none was begun, or an earlier version made it."""
-        names = [search.study_name + suffix for suffix in (SELECTION_SUFFIX, JUDGEMENT_SUFFIX)]
-        if not set(names) <= set(optuna.get_all_study_names(storage.optuna)):
+        selection, judgement = (storage.study(search.study_name + suffix) for suffix in FINAL_SUFFIXES)
+        if selection is None or judgement is None:
             return None
-        selection, judgement = (optuna.load_study(study_name=name, storage=storage.optuna) for name in names)
         for study in (selection, judgement):
             check_trials(study, n_searched=len(search.get_trials(deepcopy=False)))
         where, found = f"{selection.study_name}.user_attrs.{FINAL_EVAL}", selection.user_attrs.get(FINAL_EVAL)
@@ -165,6 +171,11 @@ class FinalEvaluation:
     def missing_of_selection(self) -> list[PlannedTrial]:
         """Return the trainings that the selection needs next and no worker has begun."""
         return self._planned(self.race().missing, self.selection)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a configuration was chosen, and all trainings of the judgement have begun."""
+        return self.race().is_over and not self.missing_of_judgement()
 
     def judged(self) -> list[int]:
         """Return the configurations that the test volumes are opened for: the chosen one and the control."""

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import optuna
 from optuna.distributions import CategoricalDistribution, IntDistribution
+from optuna.trial import TrialState
+from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
@@ -15,7 +18,7 @@ from armscan.errors import printable
 from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
-from armscan.sweeps.study.final_eval import n_trainings
+from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.warm_start import Beginning
 from armscan.utils.console import WHOLE_CHARS, wide_console
@@ -23,8 +26,17 @@ from armscan.utils.console import WHOLE_CHARS, wide_console
 BYTES_A_MIB = 2**20
 
 
-def print_plan(settings: StudySettings, study: optuna.Study | None, begins: Sequence[Beginning]) -> None:
-    """Print the space, the progress and cost of a started study, and the cost of the rest."""
+def print_plan(
+    settings: StudySettings, study: optuna.Study | None, final: FinalEvaluation | None, begins: Sequence[Beginning]
+) -> None:
+    """Print the space, the progress and cost of a started study, and the cost of the rest.
+
+    Args:
+        settings: Settings of the study.
+        study: Study of the search; None if it has not been started.
+        final: Its final evaluation; None if it has not been started.
+        begins: Trials that come first.
+    """
     console = wide_console(WHOLE_CHARS)
     state = StudyState.of(study.get_trials(deepcopy=False) if study is not None else ())
     table = Table(
@@ -42,7 +54,6 @@ def print_plan(settings: StudySettings, study: optuna.Study | None, begins: Sequ
     limits = [f"{settings.n_trials} trials"]
     limits += [f"{settings.timeout_hours:g} hours"] if settings.timeout_hours is not None else []
     limits += [f"{settings.max_env_steps:,} environment steps"] if settings.max_env_steps is not None else []
-    fewest, most = n_trainings(settings.final_eval)
     console.print(f"objective  {objectives}, over the seeds {', '.join(map(str, settings.seeds))}")
     console.print(f"limits     {', '.join(limits)}; {settings.workers} workers")
     console.print(f"then       {_final(settings.final_eval)}")
@@ -51,25 +62,49 @@ def print_plan(settings: StudySettings, study: optuna.Study | None, begins: Sequ
     others = (("failed", state.failed), ("waiting", state.waiting))
     also = "".join(f", {len(trials)} {what}" for what, trials in others if trials)
     console.print(f"done       {(done := len(state.finished))} trials{also}")
-    if not done:
+    if done:
+        ended = ended_because(study, settings.asked) if study is not None else None
+        if ended:
+            console.print(printable(f"ended      {ended}"), markup=False, highlight=False)
+        _print_cost(console, settings, state, final, n_left=0 if ended else max(0, settings.n_trials - done))
+    else:
         console.print("cost       not known before the first trial has finished")
-        return
-    seconds = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
+
+
+def _print_cost(
+    console: Console, settings: StudySettings, state: StudyState, final: FinalEvaluation | None, *, n_left: int
+) -> None:
+    """Print the cost of the finished trials, and that of `n_left` trials and the final evaluation."""
+    timed = [(trial, trial.duration.total_seconds()) for trial in state.finished if trial.duration is not None]
+    seconds = [spent_s for _, spent_s in timed]
+    mean_s = fmean(seconds)
     files = [file for file in Path(settings.folder).rglob("*") if file.is_file()]
-    mean_s, spent_mib = sum(seconds) / len(seconds), sum(file.stat().st_size for file in files) / BYTES_A_MIB
-    ended = ended_because(study, settings.asked) if study is not None else None
-    left = 0 if ended else max(0, settings.n_trials - done)
-    if ended:
-        console.print(printable(f"ended      {ended}"), markup=False, highlight=False)
-    hours = [(left + n / len(settings.seeds)) * mean_s / settings.workers / 3600 for n in (fewest, most)]
+    spent_mib = sum(file.stat().st_size for file in files) / BYTES_A_MIB
+    # Final trainings are never pruned.
+    whole_s = [spent_s for trial, spent_s in timed if trial.state == TrialState.COMPLETE]
+    training_s = fmean(whole_s or seconds) / len(settings.seeds)
+    fewest, most = final_trainings_left(settings, final)
+    hours = [(n_left * mean_s + n * training_s) / settings.workers / 3600 for n in (fewest, most)]
     console.print(
         f"cost       {sum(seconds) / 3600:.2f} hours of workers, {state.busy_hours:.2f} hours in all, "
         f"{state.env_steps:,} environment steps, {spent_mib:.0f} MiB"
     )
     console.print(
-        f"the rest   {left} trials and the final evaluation, about {hours[0]:.2f} to {hours[1]:.2f} hours and "
-        f"{spent_mib / done * left:.0f} MiB ({mean_s:.0f} s a trial so far)"
+        f"the rest   {n_left} trials and the final evaluation, about {hours[0]:.2f} to {hours[1]:.2f} hours and "
+        f"{spent_mib / len(state.finished) * n_left:.0f} MiB ({mean_s:.0f} s a trial so far)"
     )
+
+
+def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None) -> tuple[int, int]:
+    """Return the fewest and the most final trainings that are left."""
+    fewest, most = n_trainings(settings.final_eval)
+    if final is None:
+        return fewest, most
+    if final.is_over:
+        return 0, 0
+    finals = final.selection, final.judgement
+    n_done = sum(len(each.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) for each in finals)
+    return max(0, fewest - n_done), max(0, most - n_done)
 
 
 def _final(settings: FinalEvalSettings) -> str:
@@ -81,8 +116,8 @@ def _final(settings: FinalEvalSettings) -> str:
     least, seeds = settings.min_seeds, settings.max_seeds
     return (
         f"at least {fewest} and at most {most} final trainings: {candidates} and the control with "
-        f"{f'{least} to ' if least < seeds else ''}{seeds} seed{'s' if seeds > 1 else ''} each to select one, then it "
-        f"and the control with {settings.judge_seeds} others on the test volumes"
+        f"{f'{least} to ' if least < seeds else ''}{seeds} seed{'s' if seeds > 1 else ''} each to select one, then "
+        f"that one and the control with {settings.judge_seeds} more each on the test volumes"
     )
 
 

@@ -9,8 +9,8 @@ from optuna.pruners import BasePruner
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.errors import InvalidValueError
 from armscan.sweeps.storage.reports import reports_of
+from armscan.utils.validation import check_int
 
 Losses = NDArray[np.float64]
 
@@ -20,9 +20,9 @@ class ParetoPruner(BasePruner):
 
     The rungs are `min_resource` steps and each `reduction_factor` times as many as the one before. A trial that reaches
     a rung is compared with all trials that have reached it, and with those that ended before it by their final values.
-    It continues unless so many are better as may continue. Better is a lower Pareto front, and within one the larger
-    crowding distance (Schmucker et al. 2021, arXiv:2106.12639; Deb et al. 2002, doi:10.1109/4235.996017). The first
-    front always continues, however many it has.
+    It continues if fewer are better than may continue: one in `reduction_factor`, at least one. Better is a lower
+    Pareto front, and within one the larger crowding distance (Schmucker et al. 2021, arXiv:2106.12639; Deb et al. 2002,
+    doi:10.1109/4235.996017). The first front always continues, however many it has.
 
     Args:
         min_resource: Environment steps of the first rung, 1 or more.
@@ -33,10 +33,8 @@ class ParetoPruner(BasePruner):
     """
 
     def __init__(self, min_resource: int, reduction_factor: int = 3) -> None:
-        for name, value, least in (("min_resource", min_resource, 1), ("reduction_factor", reduction_factor, 2)):
-            if type(value) is not int or value < least:
-                raise InvalidValueError(f"{name} is {value!r}, but it must be a whole number of at least {least}")
-        self._min_resource, self._reduction_factor = min_resource, reduction_factor
+        self._min_resource = check_int("min_resource", min_resource, at_least=1)
+        self._reduction_factor = check_int("reduction_factor", reduction_factor, at_least=2)
 
     def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
         """Return whether a trial is to be pruned, which it is at its first report on a rung at most."""

@@ -69,10 +69,8 @@ def name_objectives(study: optuna.Study, names: Sequence[str]) -> None:
 def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study | None:
     """Return the study that these settings would continue with, to look at; None if they would begin one."""
     storage = existing_storage(settings.storage)
-    if storage is None or settings.name not in optuna.get_all_study_names(storage.optuna):
-        return None
-    study = optuna.load_study(study_name=settings.name, storage=storage.optuna)
-    if not settings.allow_config_changes:
+    study = storage.study(settings.name) if storage is not None else None
+    if study is not None and not settings.allow_config_changes:
         _check_same(settings, study, described(settings, fixed))
     return study
 

@@ -16,8 +16,9 @@ from optuna.trial import FrozenTrial, TrialState
 from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.state import SEEDS, StudyState, is_feasible
 from armscan.sweeps.study.pruners import front_numbers
+from armscan.utils.validation import check_int
 
-# Of the trials, the better part that the noise between seeds is measured on: what comes close to the best.
+# Share of the trials, the best first, on which the noise between seeds is measured.
 BETTER_PART = 0.5
 
 
@@ -38,14 +39,14 @@ class BelowSeedNoise:
     `RegretBoundEvaluator`; the noise is the standard deviation of one training of the better half of the trials.
 
     Args:
-        min_trials: Trials that run to their end before, at least 2. Default: 20.
+        min_trials: Completed trials that the study needs before it may end, 2 or more. Default: 20.
 
     Raises:
         InvalidValueError: If there are too few.
     """
 
     def __init__(self, min_trials: int = 20) -> None:
-        self._min_trials = _at_least(2, "min_trials", min_trials)
+        self._min_trials = check_int("study.terminator.min_trials", min_trials, at_least=2)
 
     def check(self, n_objectives: int, n_seeds: int) -> None:
         """See `Terminator.check`."""
@@ -81,14 +82,14 @@ class Stagnation:
     With several objectives a trial is better if it is on the Pareto front of all, and no trial before is as good.
 
     Args:
-        n_trials: Trials that ran to their end without being better, at least 1. Default: 30.
+        n_trials: Latest completed trials without an improvement, 1 or more. Default: 30.
 
     Raises:
         InvalidValueError: If there are too few.
     """
 
     def __init__(self, n_trials: int = 30) -> None:
-        self._n_trials = _at_least(1, "n_trials", n_trials)
+        self._n_trials = check_int("study.terminator.n_trials", n_trials, at_least=1)
 
     def check(self, n_objectives: int, n_seeds: int) -> None:
         """See `Terminator.check`."""
@@ -130,11 +131,3 @@ def seed_noise(trials: Sequence[FrozenTrial], objective: str, direction: StudyDi
 def _completed(state: StudyState) -> list[FrozenTrial]:
     trials = (*state.taken, *state.finished)
     return [trial for trial in trials if trial.state == TrialState.COMPLETE and is_feasible(trial)]
-
-
-def _at_least(least: int, name: str, value: int) -> int:
-    if type(value) is not int or value < least:
-        raise InvalidValueError(
-            f"study.terminator: {name} is {value!r}, but it must be a whole number of at least {least}"
-        )
-    return value

@@ -163,7 +163,7 @@ def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], stor
 
 
 def _source(settings: StudySettings, name: str, storage: Storage | None) -> optuna.Study:
-    names = [] if storage is None else optuna.get_all_study_names(storage.optuna)
+    names = [] if storage is None else storage.study_names
     others = sorted(each for each in names if each != settings.name and not each.endswith(FINAL_SUFFIXES))
     if storage is None or name not in others:
         there = listed(others) if others else "none is there"

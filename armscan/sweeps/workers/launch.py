@@ -19,7 +19,7 @@ from armscan.config.error_messages import one_line_message
 from armscan.config.sources import working_folder
 from armscan.errors import ArmscanError, StudyError
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, silence_launcher
-from armscan.sweeps.results.judgement import best_metrics, result_note
+from armscan.sweeps.results.judgement import best_metrics, judge, result_note
 from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.space.parameter import written
 from armscan.sweeps.study.arguments import STORAGE, USUAL_LAUNCHER, WORKER_KEY, StudyCommand, fixed_by
@@ -144,8 +144,9 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
             for phase in opened.phases:
                 for trial in phase.scheduler.reclaim(LivenessCheck().is_dead):
                     phase.close_runs_of(trial)
-            tracked.log_metrics(best_metrics(opened.search.scheduler.study, opened.final_eval), n_env_steps=0)
-            if note := result_note(opened.final_eval):
+            judgement = judge(opened.final_eval) if opened.final_eval is not None else None
+            tracked.log_metrics(best_metrics(opened.search.scheduler.study, judgement), n_env_steps=0)
+            if note := result_note(judgement):
                 tracked.set_note(note)
                 where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder
                 note_run(opened.search.scheduler.study, *where, note)

@@ -151,7 +151,7 @@ def test_report_shows_how_a_study_decided(answer, tmp_path, browser):
     assert answer("--study=a") == (0, "look at   reports/a/report.html\n", "")
     folder = tmp_path / "reports" / "a"
     page = (folder / "report.html").read_text()
-    assert "Trial 1 is better than the default configuration: steps, mean." in page
+    assert "Trial 1 is better than the control (steps, mean)." in page
     of_candidates = chart_below(page, "How this study decides")
     # Dots of the seeds and a diamond with the interval, of each candidate.
     assert [len(each["x"]) > 1 for each in of_candidates] == [True, False] * 3

@@ -25,6 +25,7 @@ from armscan.sweeps.scheduling.state import (
 )
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, training_of
+from armscan.sweeps.study.plan import final_trainings_left
 from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import make_study
 from tests.sweeps.study.test_study import settings
@@ -162,6 +163,28 @@ def test_control_is_judged_during_the_race_and_the_chosen_configuration_after_it
     assert judge(final).chosen == 1
 
 
+def test_control_that_was_judged_before_the_chosen_configuration_is_not_its_result(storage_uri):
+    final, (selection, judgement) = opened(storage_uri)
+    for scheduler in (judgement, selection):
+        while trial := scheduler.claim({}):
+            end(scheduler, trial, TRUE)
+        # The chosen configuration is judged later.
+    judged = judge(final)
+    assert (judged.chosen, [each.number for each in judged.results]) == (1, [CONTROL])
+    assert judged.of_chosen is None
+    assert result_note(judged) == ""
+    assert not [name for name in best_metrics(final.search, judged) if name.startswith("test_volumes/")]
+
+
+def test_plan_counts_the_final_trainings_that_are_left(storage_uri):
+    final, (selection, _) = opened(storage_uri)
+    settings = searched(storage_uri)[1]
+    fewest, most = final_trainings_left(settings, None)
+    end(selection, selection.claim({}), TRUE)
+    assert final_trainings_left(settings, final) == (fewest - 1, most - 1)
+    assert final_trainings_left(settings, run(storage_uri)) == (0, 0)
+
+
 def test_control_that_is_the_best_is_the_result(storage_uri):
     final = run(storage_uri, true=TRUE | {CONTROL: 1.0})
     judgement = judge(final)
@@ -215,7 +238,7 @@ def test_study_that_goes_on_says_for_whom_else_the_test_volumes_were_opened(stor
 
 def test_run_of_the_study_has_the_result(storage_uri):
     final = run(storage_uri)
-    metrics = best_metrics(final.search, final)
+    metrics = best_metrics(final.search, judge(final))
     assert metrics["validation/mean_steps"] == 1.0
     assert metrics["difference/mean_steps_low"] < metrics["difference/mean_steps"] < 0
     assert metrics["probability_of_improvement/mean_steps"] == 1.0
@@ -224,12 +247,12 @@ def test_run_of_the_study_has_the_result(storage_uri):
 
 def test_note_on_a_study_says_which_settings_how_sure_and_what_helps(storage_uri):
     final = run(storage_uri)
-    said, chosen, control, *rest = result_note(final).split("\n\n")
-    assert said == "**Trial 1 is better than the default configuration: steps, mean.**"
+    said, chosen, control, *rest = result_note(judge(final)).split("\n\n")
+    assert said == "**Trial 1 is better than the control (steps, mean).**"
     assert chosen.startswith("trial 1: `agent.lr=0.0")
     assert control.startswith("control: the configuration of the study without")
     assert "| with 95 % intervals | trial 1 | control |" in rest[1]
-    assert rest[2] == "Trial 1 and the control, 3 other seeds each:"
+    assert rest[2] == "Trial 1 and the control, both with the same 3 new seeds:"
     difference = judge(final).differences[0].row()
     assert rest[3].splitlines()[2] == f"| {' | '.join(difference.values())} |"
     assert rest[-1].startswith("Note: 3 test volumes, fewer than 8")
@@ -237,15 +260,15 @@ def test_note_on_a_study_says_which_settings_how_sure_and_what_helps(storage_uri
 
 def test_one_judge_seed_gives_a_difference_without_interval_and_the_result_says_so(storage_uri):
     final = run(storage_uri, judge_seeds=1)
-    said, *_, table, _, _ = result_note(final).split("\n\n")
-    assert said == "**Trial 1 was chosen; one seed does not show whether it is better than the default configuration.**"
+    said, *_, table, _, _ = result_note(judge(final)).split("\n\n")
+    assert said == "**Trial 1 was chosen; one seed does not show whether it is better than the control.**"
     first = table.splitlines()[2].split("|")
     assert float(first[2]) < 0.0
     assert first[3].strip() == first[5].strip() == ""
 
 
 def test_note_on_a_study_that_has_no_result_is_empty(storage_uri):
-    assert result_note(None) == result_note(opened(storage_uri)[0]) == ""
+    assert result_note(None) == result_note(judge(opened(storage_uri)[0])) == ""
 
 
 def test_final_evaluation_is_read_from_the_storage_and_that_of_an_earlier_version_is_none(storage_uri):
