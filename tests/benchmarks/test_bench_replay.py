@@ -3,11 +3,11 @@ import pytest
 
 from benchmarks.sweeps.bench.design import places_of, sobol, values_at
 from benchmarks.sweeps.bench.importance import keys_of
+from benchmarks.sweeps.bench.power import needed_seeds, power_of
 from benchmarks.sweeps.bench.races import N_SEEDS, Choices, candidates_of, choices_of, compare, needed_for
 from benchmarks.sweeps.bench.ranking import REFERENCE, ranked, studies_of
 from benchmarks.sweeps.bench.replay import Rule, choose, search
 from benchmarks.sweeps.bench.seed_rules import fixed
-from benchmarks.sweeps.bench.seeds import needed_seeds, power_of
 from benchmarks.sweeps.bench.surrogate import Surrogate, fit_of
 from tests.benchmarks.conftest import synthetic_curves, true_log
 
@@ -70,9 +70,9 @@ def test_a_trial_with_two_seeds_takes_two_trainings(surrogate):
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning")
-def test_a_sampler_that_learns_beats_chance_on_a_smooth_function(surrogate):
-    rules = Rule("random", "none"), Rule("tpe", "none")
-    ranks = ranked(studies_of(surrogate, "sac_y", rules, n_studies=15, n_trainings=30))
+def test_a_sampler_that_learns_beats_chance_on_a_smooth_function(curves, surrogate):
+    rules, control = (Rule("random", "none"), Rule("tpe", "none")), surrogate.config(curves.configs[0])
+    ranks = ranked(studies_of(surrogate, control, "sac_y", rules, n_studies=15, n_trainings=30))
     assert list(ranks.sampler) == ["tpe", "random"]
     assert (ranks.low <= ranks.regret).all()
     assert (ranks.regret <= ranks.high).all()

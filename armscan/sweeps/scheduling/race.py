@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import stdtrit
 
 from armscan.stats.bootstrap import LEVEL, Estimate
+from armscan.utils.arrays import FloatArray
 
 # Confidence, one-sided, at which a configuration that is behind the leader is dropped.
 DROP_LEVEL = 0.9
@@ -111,6 +113,19 @@ def budget(n_configurations: int, *, min_seeds: int, max_seeds: int) -> tuple[in
     return n_configurations * min_seeds, n_configurations * max_seeds
 
 
+def moderated_variances(own: FloatArray, pooled: Any, n_seeds: Any) -> FloatArray:
+    """Return the variances of scores, shrunk as in the moderated t statistics of Smyth 2004.
+
+    See doi:10.2202/1544-6115.1027.
+
+    Args:
+        own: Variance of each configuration over its seeds.
+        pooled: Mean of these variances.
+        n_seeds: Number of seeds that each variance is over.
+    """
+    return np.asarray((PRIOR_DF * pooled + (n_seeds - 1) * own) / (PRIOR_DF + n_seeds - 1))
+
+
 def _standings(
     configurations: Sequence[int], scores: np.ndarray[tuple[int, int], np.dtype[np.float64]], drop_level: float
 ) -> Iterator[tuple[int, Standing]]:
@@ -120,8 +135,7 @@ def _standings(
     df = PRIOR_DF + n_seeds - 1
     if n_seeds > 1:
         own = scores.var(axis=1, ddof=1)
-        # As the moderated t statistics of Smyth 2004 (doi:10.2202/1544-6115.1027).
-        variances = (PRIOR_DF * own.mean() + (n_seeds - 1) * own) / df / n_seeds
+        variances = moderated_variances(own, own.mean(), n_seeds) / n_seeds
     leader = int(means.argmax())
     half = stdtrit(df, (1 + LEVEL) / 2) * np.sqrt(variances)
     allowed = stdtrit(df, drop_level) * np.sqrt(variances[leader] + variances)

@@ -52,14 +52,14 @@ class Design:
         if conditional := [each.name for each in space.parameters if each.when]:
             raise ValueError(f"sweep {sweep} searches {conditional[0]} only beside other values, which no bench does")
         fixed, _ = of_run(config)
-        points = sobol(len(space.parameters), n_configs)[: n_configs - 1]
+        points = sobol(len(space.parameters), n_configs - 1)
         return cls(sweep, space, (default_of(space, fixed), *(values_at(space, row) for row in points)), _sha256(fixed))
 
 
 def sobol(n_dimensions: int, n_points: int) -> FloatArray:
-    """Return the first points of a scrambled Sobol sequence and some more, shape (points, dimensions), from 0 to 1."""
+    """Return the first points of a scrambled Sobol sequence, shape (n_points, n_dimensions), from 0 to below 1."""
     sequence = qmc.Sobol(n_dimensions, rng=np.random.default_rng(SEED))
-    return np.asarray(sequence.random_base2(max(1, n_points).bit_length()))
+    return np.asarray(sequence.random_base2(max(1, n_points - 1).bit_length()))[:n_points]
 
 
 def values_at(space: Space, places: FloatArray) -> dict[str, Value]:

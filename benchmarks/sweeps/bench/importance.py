@@ -65,7 +65,7 @@ def keys_of(curves: Curves, n_resamples: int) -> dict[str, Key]:
 def effects_of(surrogate: Surrogate) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return the places of values of each key, and the mean steps at each, averaged over the other keys."""
     space = surrogate.space
-    points = sobol(len(space.parameters), N_PLACES - 1)
+    points = sobol(len(space.parameters), N_PLACES)
     effects = {}
     for dimension, parameter in enumerate(space.parameters):
         choices = getattr(parameter.distribution, "choices", ())

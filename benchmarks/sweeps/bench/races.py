@@ -49,7 +49,8 @@ class Comparison(NamedTuple):
         regret: Its mean regret.
         n_trainings: Its mean number of trainings.
         n_fixed: Trainings that fixed seeds need for the same regret; infinite where none of `FIXED` reaches it.
-        share: Share of those that the race needs.
+        share: Share of those that the race needs. Where none of `FIXED` reaches its regret, an upper bound of it: the
+            share of the trainings of the last one.
     """
 
     rule: str
@@ -107,7 +108,7 @@ def compare(fixed: Sequence[Choices], races: Mapping[str, Choices]) -> list[Comp
     for rule, race in races.items():
         regrets, n_trainings = race.regret[drawn].mean(axis=1), race.n_trainings[drawn].mean(axis=1)
         needed = np.array([needed_for(*pair, n_of_fixed) for pair in zip(regrets, of_fixed, strict=True)])
-        share = n_trainings / needed
+        share = n_trainings / needed.clip(max=n_of_fixed[-1])
         compared.append(Comparison(rule, _estimate(regrets), float(n_trainings[0]), float(needed[0]), _estimate(share)))
     return compared
 

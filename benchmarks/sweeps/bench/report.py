@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from armscan.utils.markdown import markdown_table
 from benchmarks.sweeps.bench.importance import Key, keys_of
 from benchmarks.sweeps.bench.picture import draw
+from benchmarks.sweeps.bench.power import needed_seeds, power_of, residuals_of_good_configs
 from benchmarks.sweeps.bench.races import FIXED, N_SEEDS, RACES, Choices, Comparison, candidates_of, choices_of, compare
 from benchmarks.sweeps.bench.ranking import ranked, rules, studies_of
 from benchmarks.sweeps.bench.replay import DEFAULT
-from benchmarks.sweeps.bench.seeds import chance_of_good, needed_seeds, power_of
 from benchmarks.sweeps.bench.surrogate import Surrogate, fit_of
 from benchmarks.sweeps.bench.table import Curves
 
@@ -46,7 +48,7 @@ def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, pi
         raced = choices_of(candidates, RACES)
         races[top_k] = fixed, raced
         _print_races(top_k, fixed, compare(fixed, raced))
-    studies = studies_of(surrogate, sweep, rules(), n_studies=n_studies, n_trainings=n_trainings)
+    studies = studies_of(surrogate, control, sweep, rules(), n_studies=n_studies, n_trainings=n_trainings)
     ranks = ranked(studies)
     _print_ranks(ranks)
     if picture is not None:
@@ -55,8 +57,7 @@ def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, pi
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """Return a table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+    return markdown_table([*map(str, head)], [[*map(str, row)] for row in rows])
 
 
 def with_interval(estimate: Sequence[float], form: str = ".3f") -> str:
@@ -77,7 +78,7 @@ def _print_table(curves: Curves, surrogate: Surrogate) -> None:
         ("configurations left out: rank correlation, variance explained", f"{correlation:.2f}, {explained:.2f}"),
         (
             "noise between seeds of good configurations, in % of the steps",
-            f"{100 * chance_of_good(surrogate).std():.0f}",
+            f"{100 * residuals_of_good_configs(surrogate).std():.0f}",
         ),
     ]
     print(f"\n## {curves.sweep}\n\n{markdown(['', ''], rows)}", flush=True)
@@ -117,8 +118,8 @@ def _print_races(top_k: int, fixed: Sequence[Choices], compared: Sequence[Compar
             each.rule,
             f"{each.n_trainings:.1f}",
             with_interval(each.regret, ".4f"),
-            f"{each.n_fixed:.1f}",
-            with_interval(each.share, ".2f"),
+            f"{each.n_fixed:.1f}" if isfinite(each.n_fixed) else f"> {fixed[-1].n_trainings.mean():.0f}",
+            ("" if isfinite(each.n_fixed) else "< ") + with_interval(each.share, ".2f"),
         )
         for each in compared
     ]

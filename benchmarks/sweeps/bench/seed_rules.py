@@ -12,7 +12,7 @@ from scipy.special import chdtri, stdtrit
 from scipy.stats import rankdata
 
 from armscan.stats.bootstrap import LEVEL
-from armscan.sweeps.scheduling.race import DROP_LEVEL, PRIOR_DF
+from armscan.sweeps.scheduling.race import DROP_LEVEL, PRIOR_DF, moderated_variances
 from armscan.utils.arrays import FloatArray
 
 # Seeds that are simulated for each configuration: no rule takes more.
@@ -78,8 +78,7 @@ def allocation(min_seeds: int, mean_seeds: float) -> SeedRule:
         n_seeds, every = np.full((n_choices, n_configs), min_seeds), np.arange(n_choices)
         for _ in range(round(mean_seeds * n_configs) - min_seeds * n_configs):
             means, own = _moments(scores, n_seeds)
-            df = PRIOR_DF + n_seeds - 1
-            variances = (PRIOR_DF * own.mean(axis=1, keepdims=True) + (n_seeds - 1) * own) / df + 1e-12
+            variances = moderated_variances(own, own.mean(axis=1, keepdims=True), n_seeds) + 1e-12
             best = means.argmax(axis=1)
             shares = variances / np.maximum(means[every, best][:, np.newaxis] - means, 1e-6) ** 2
             shares[every, best] = 0.0
@@ -117,7 +116,7 @@ def _standing(seen: FloatArray, is_in: Mask) -> tuple[FloatArray, FloatArray]:
         return means, np.zeros_like(means)
     own = seen.var(axis=-1, ddof=1)
     pooled = np.where(is_in, own, 0.0).sum(axis=1, keepdims=True) / is_in.sum(axis=1, keepdims=True)
-    return means, (PRIOR_DF * pooled + (n_seeds - 1) * own) / (PRIOR_DF + n_seeds - 1) / n_seeds
+    return means, moderated_variances(own, pooled, n_seeds) / n_seeds
 
 
 def _behind_by_t(seen: FloatArray, is_in: Mask, *, level: float) -> Mask:

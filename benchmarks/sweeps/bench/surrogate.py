@@ -1,13 +1,13 @@
-"""Trainings of any configuration, simulated from the table: the mean by a forest, chance from real trainings.
+"""Trainings of any configuration, simulated from the table: the mean by a forest, residuals from real trainings.
 
 A table alone has too few points for a sampler to search: mapped to the nearest of them, what samplers propose would be
 spoiled, those most that search locally (Pfisterer et al. 2022, YAHPO Gym). So extremely randomised trees (Geurts et
 al. 2006) over the configurations give weights to those of the table (Meinshausen 2006), and the mean curve of a
-configuration is the weighted mean of theirs; of one in the table it is its own. A training adds what one real
-training, drawn by the same weights, was off its own configuration's mean: in all epochs, the selection and the test at
-once, so that chance is as large, as skewed and as lasting as in the table. All of it is of the logarithm of the mean
-steps of an episode. What a configuration is truly worth is then known: the mean over all trainings that could be
-drawn.
+configuration is the weighted mean of theirs; of one in the table it is its own. A training adds the residuals of one
+real training, drawn by the same weights: its differences from the mean of its own configuration, in all epochs, the
+selection and the test at once, so that they are as large, as skewed and as persistent as in the table. All of it is of
+the logarithm of the mean steps of an episode. What a configuration is truly worth is then known: the mean over all
+trainings that could be drawn.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Surrogate:
         high: Its upper corner, likewise.
         share: Inverse of the number of configurations in that box, shape (trees, configurations).
         means: Mean logarithm of each configuration's epochs, selection and test, shape (configurations, epochs + 2).
-        chance: Difference of each training from that mean, shape (trainings, epochs + 2).
+        residuals: Difference of each training from that mean, shape (trainings, epochs + 2).
         config_of: Configuration of each training, shape (trainings,).
         bounds: Smallest and largest logarithm of the table.
     """
@@ -68,7 +68,7 @@ class Surrogate:
     high: FloatArray
     share: FloatArray
     means: FloatArray
-    chance: FloatArray
+    residuals: FloatArray
     config_of: NDArray[np.intp]
     bounds: tuple[float, float]
 
@@ -85,7 +85,7 @@ class Surrogate:
         logs = np.log(np.column_stack([part["mean_steps"] for part in parts]))
         means, n_seeds = curves.mean_over_seeds(logs), np.bincount(curves.config_of)[curves.config_of, np.newaxis]
         # A mean over few seeds has moved towards each of them.
-        chance = (logs - means[curves.config_of]) * np.sqrt(n_seeds / (n_seeds - 1))
+        residuals = (logs - means[curves.config_of]) * np.sqrt(n_seeds / (n_seeds - 1))
         places = curves.places()
         is_in = np.arange(len(places)) % N_FOLDS != (-1 if without is None else without)
         forest = ExtraTreesRegressor(N_TREES, random_state=seed).fit(places[is_in], means[is_in])
@@ -98,7 +98,7 @@ class Surrogate:
         low[:, ~is_in] = np.nan
         share = np.array([1.0 / np.bincount(each[is_in], minlength=each.max() + 1)[each] for each in leaves])
         bounds = float(logs.min()), float(logs.max())
-        return cls(curves.space, curves.env_steps, low, high, share, means, chance, curves.config_of, bounds)
+        return cls(curves.space, curves.env_steps, low, high, share, means, residuals, curves.config_of, bounds)
 
     def weights(self, places: FloatArray) -> FloatArray:
         """Return how much each configuration of the table counts at places, shape (places, configurations)."""
@@ -115,13 +115,13 @@ class Surrogate:
     def truth(self, places: FloatArray) -> FloatArray:
         """Return the mean steps on the test volumes over all trainings that could be drawn, shape (places,)."""
         weights, n_seeds = self.weights(places), np.bincount(self.config_of)
-        logs = (weights @ self.means[:, -1])[:, np.newaxis] + self.chance[:, -1]
+        logs = (weights @ self.means[:, -1])[:, np.newaxis] + self.residuals[:, -1]
         drawn = (weights / n_seeds)[:, self.config_of]
         return np.asarray((np.exp(logs.clip(*self.bounds)) * drawn).sum(axis=1))
 
     def best(self) -> tuple[dict[str, Any], float]:
         """Return the best configuration of a Sobol sequence through the space, and what it is truly worth."""
-        points = sobol(len(self.space.parameters), N_PLACES - 1)
+        points = sobol(len(self.space.parameters), N_PLACES)
         configs = [values_at(self.space, row) for row in points]
         truth = self.truth(np.array([places_of(self.space, values) for values in configs]))
         return configs[int(truth.argmin())], float(truth.min())
@@ -146,7 +146,7 @@ class SimulatedConfig:
     Args:
         surrogate: The surrogate.
         mean: Mean logarithm of its epochs, selection and test, shape (epochs + 2,).
-        shares: How likely the chance of each training is drawn, shape (trainings,).
+        shares: Probability that the residuals of each training are drawn, shape (trainings,).
     """
 
     surrogate: Surrogate
@@ -162,12 +162,12 @@ class SimulatedConfig:
         """Return epochs, selection and test of trainings with fresh seeds, shape (seeds, epochs + 2)."""
         places = rng.random(n_seeds) * self.shares.sum()
         drawn = np.searchsorted(self.shares.cumsum(), places, side="right")
-        return np.asarray(np.exp((self.mean + self.surrogate.chance[drawn]).clip(*self.surrogate.bounds)))
+        return np.asarray(np.exp((self.mean + self.surrogate.residuals[drawn]).clip(*self.surrogate.bounds)))
 
     @property
     def truth(self) -> float:
         """The mean steps on the test volumes over all trainings that could be drawn."""
-        logs = self.mean[-1] + self.surrogate.chance[:, -1]
+        logs = self.mean[-1] + self.surrogate.residuals[:, -1]
         return float(np.exp(logs.clip(*self.surrogate.bounds)) @ self.shares)
 
 

@@ -18,7 +18,7 @@ from armscan.utils.files import atomic_write
 from benchmarks.sweeps.bench.design import Design, places_of
 
 FOLDER = Path(__file__).parent / "tables"
-# With fewer trainings of a configuration little is known of chance.
+# Fewer trainings of a configuration say little of the noise between seeds.
 FEWEST_SEEDS = 3
 VALIDATION, SELECTION, TEST = "validation", "selection", "test"
 METRICS = (

@@ -21,14 +21,14 @@ LEVEL, POWER = 0.05, 0.8
 def power_of(surrogate: Surrogate, n_comparisons: int = N_COMPARISONS) -> pd.DataFrame:
     """Return how often a difference is seen, by how large it is (rows) and by seeds of each setting (columns).
 
-    Both settings have the chance of the table's good configurations in their tests. A difference is seen if Welch's t
-    test of the logarithms of the mean steps says so at 5 %.
+    Both settings have the residuals of the table's good configurations in their tests. A difference is seen if Welch's
+    t test of the logarithms of the mean steps says so at 5 %.
     """
-    chance = chance_of_good(surrogate)
+    residuals = residuals_of_good_configs(surrogate)
     rng = np.random.default_rng(0)
     power = {}
     for n_seeds in N_SEEDS:
-        ours, theirs = rng.choice(chance, size=(2, n_comparisons, n_seeds))
+        ours, theirs = rng.choice(residuals, size=(2, n_comparisons, n_seeds))
         power[n_seeds] = [
             float((ttest_ind(ours, theirs + np.log1p(each), axis=1, equal_var=False).pvalue < LEVEL).mean())
             for each in DIFFERENCES
@@ -42,8 +42,8 @@ def needed_seeds(power: pd.DataFrame) -> dict[float, int | None]:
     return {float(each): int(row.idxmax()) if row.any() else None for each, row in enough.iterrows() if each > 0}
 
 
-def chance_of_good(surrogate: Surrogate) -> FloatArray:
+def residuals_of_good_configs(surrogate: Surrogate) -> FloatArray:
     """Return what the trainings of good configurations are off their means in the test, as logarithms."""
     means = surrogate.means[:, -1]
     is_good = means <= means.min() + np.log(COMPARED)
-    return surrogate.chance[is_good[surrogate.config_of], -1]
+    return surrogate.residuals[is_good[surrogate.config_of], -1]
