@@ -20,7 +20,7 @@ from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.study import existing_study
-from armscan.sweeps.study.warm_start import beginnings
+from armscan.sweeps.study.warm_start import initial_trials
 from armscan.sweeps.workers.launch import run_workers
 from armscan.utils.console import print_sentence
 from armscan.utils.log import silence_libraries
@@ -47,17 +47,17 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     if not given.is_plan:
         check_launcher(launcher)
     check_space(settings, task, trial_words, config)
-    begins = beginnings(settings, trial_words, to_plain(config), existing)
+    initial = initial_trials(settings, trial_words, to_plain(config), existing)
     if given.is_plan:
         storage = existing_storage(settings.storage)
         final = FinalEvaluation.stored(storage, existing) if storage is not None and existing is not None else None
-        print_plan(settings, existing, final, begins)
+        print_plan(settings, existing, final, initial)
         return 0
     opened = open_for_work(settings, task, config, trial_words)
     search = opened.search.scheduler
-    for beginning in begins:
-        if beginning.add(search.storage, search.study):
-            print_sentence(printable(beginning.told))
+    for each in initial:
+        if each.add(search.storage, search.study):
+            print_sentence(printable(each.message))
     for phase in opened.phases:
         if phase.scheduler.go_on():
             print(f"{phase.name}: was stopped, and resumes")

@@ -76,7 +76,17 @@ class TrackedRun:
         folder: Path,
         parent_id: str | None = None,
     ) -> Self:
-        """Make a new run; the leaves of its resolved configuration become parameters."""
+        """Make a new run.
+
+        Args:
+            store: Store of the run.
+            experiment_id: ID of its MLflow experiment.
+            name: Name of the run in the UI.
+            config: Resolved configuration, whose leaves become parameters.
+            tags: Tags of the run, beside those of the source code.
+            folder: Folder of the run.
+            parent_id: ID of the run that it is shown below. Default: None, no run.
+        """
         parent = {PARENT_TAG: parent_id} if parent_id else {}
         run = store.create_run(experiment_id, name=name, tags={**source().tags, **tags, **parent})
         tracked = cls.joined(store, run.info.run_id, name=name, folder=folder)
@@ -92,7 +102,18 @@ class TrackedRun:
     def reopen(
         cls, store: TrackingStore, run: Run, *, folder: Path, config: Mapping[str, Any], tags: Mapping[str, str]
     ) -> Self:
-        """Reopen an interrupted run; log the parameters that it lacks."""
+        """Reopen an interrupted run.
+
+        Args:
+            store: Store of the run.
+            run: Run to reopen.
+            folder: Folder of the run.
+            config: Resolved configuration; the parameters that the run lacks are logged.
+            tags: Tags to set.
+
+        Raises:
+            TrackingError: If its tag `resumed` is not a whole number.
+        """
         run_id = run.info.run_id
         if not (resumed := run.data.tags.get("resumed", "0")).isdecimal():
             raise TrackingError(f"run {run_id}: its tag resumed is {resumed[:50]!r}, but it must be a whole number")

@@ -126,7 +126,7 @@ def deliver(
         outbox: Outbox of the run.
         client: Client of the run's store.
         channel: Channel whose entries are delivered.
-        is_whole: Whether the run's folder is complete, so that a missing file was removed on purpose.
+        is_whole: Whether the run's folder is complete, so that a missing file was removed on purpose. Default: True.
         trust: Whether to upload files outside of the run's folder that another process has added. Default: False.
 
     Returns:

@@ -26,7 +26,7 @@ from optuna.pruners import BasePruner, NopPruner
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from armscan.sweeps.scheduling.state import ENV_STEPS, env_steps_of
+from armscan.sweeps.scheduling.state import ENV_STEPS, env_steps_of, loss_signs
 from armscan.sweeps.storage.reports import REPORT, keep_report, reports_of
 from armscan.sweeps.study.pruners import ParetoPruner
 from benchmarks.sweeps.bench.table import VALIDATION, read_rows, table_file
@@ -54,7 +54,7 @@ class Unpruned:
 
     def losses(self, trials: Sequence[FrozenTrial]) -> np.ndarray:
         """Return the values of trials, lower ones better, from 0 for the best to 1 for the worst of all trials."""
-        signs = [-1.0 if direction == StudyDirection.MAXIMIZE else 1.0 for direction in self.directions]
+        signs = loss_signs(self.directions)
         of_all, values = (np.array([trial.values for trial in each]) * signs for each in (self.trials, trials))
         best, worst = of_all.min(axis=0), of_all.max(axis=0)
         return np.asarray((values - best) / np.where(worst > best, worst - best, 1.0))

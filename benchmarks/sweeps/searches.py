@@ -31,7 +31,7 @@ from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval import settings_of
 from armscan.sweeps.study.open import OpenedStudy, Phase, open_for_work
 from armscan.sweeps.study.study import best_trials
-from armscan.sweeps.study.warm_start import beginnings
+from armscan.sweeps.study.warm_start import initial_trials
 from armscan.sweeps.tasks.attempt import Attempt
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
@@ -171,8 +171,8 @@ def _work(
 
 
 def _add_presets(words: Sequence[str], opened: OpenedStudy, study: optuna.Study) -> None:
-    for beginning in beginnings(opened.settings, words, to_plain(opened.config), None):
-        for values in beginning.enqueued:
+    for each in initial_trials(opened.settings, words, to_plain(opened.config), None):
+        for values in each.enqueued:
             study.enqueue_trial(values)
 
 

@@ -28,6 +28,7 @@ from armscan.sweeps.scheduling.state import (
     SCHEDULE,
     STOP,
     TAKEN_FROM,
+    TEST_PREFIX,
     is_feasible,
 )
 from armscan.sweeps.space.parameter import overrides_of
@@ -124,7 +125,7 @@ def _difference_rows(judgement: Judgement) -> Iterator[Row]:
     for each in judgement.differences:
         yield {
             "chosen": key_of(judgement.chosen),
-            "figure": f"test/{each.metric}",
+            "figure": f"{TEST_PREFIX}{each.metric}",
             "seeds": judgement.n_seeds,
             **dict(zip(("difference", "low", "high"), each.paired, strict=True)),
             **dict(zip(("probability", "probability_low", "probability_high"), each.probability, strict=True)),
@@ -136,8 +137,8 @@ def _result_rows(found: Sequence[ConfigResult]) -> Iterator[Row]:
     for result in found:
         for of, figures in {"agent": result.figures, **result.baselines}.items():
             for name, (value, low, high) in figures.estimates.items():
-                row = {"trial": key_of(result.number), "of": of, "seeds": figures.n_seeds, "figure": f"test/{name}"}
-                yield row | {"value": value, "low": low, "high": high}
+                row = {"trial": key_of(result.number), "of": of, "seeds": figures.n_seeds}
+                yield row | {"figure": f"{TEST_PREFIX}{name}", "value": value, "low": low, "high": high}
 
 
 def _importance_rows(study: optuna.Study, objectives: Sequence[str]) -> list[Row]:

@@ -15,11 +15,11 @@ from armscan.experiment.results import volume_notes
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
-from armscan.sweeps.results.summary import OF_TEST, ConfigResult, final_results, final_table, scores_of
-from armscan.sweeps.scheduling.state import CONTROL, METRICS
+from armscan.sweeps.results.summary import ConfigResult, final_results, final_table, scores_of
+from armscan.sweeps.scheduling.state import CONTROL, METRICS, TEST_PREFIX
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, name_of, settings_of, training_of
-from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, best_trials
+from armscan.sweeps.study.study import OBJECTIVES, best_trials
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
 from armscan.training.metric_display import is_rate, leading_among, title_of, value_text
@@ -217,11 +217,11 @@ def _differences(
     """Yield the differences of the metrics that all trainings have; both have the same seeds, in order."""
     metrics = [trial.user_attrs[METRICS] for trial in (*chosen, *control)]
     common = set.intersection(*map(set, metrics))
-    tested = [name.removeprefix(OF_TEST) for name in metrics[0] if name in common and name.startswith(OF_TEST)]
-    objectives = search.user_attrs[DASHBOARD_OBJECTIVES]
+    tested = [name.removeprefix(TEST_PREFIX) for name in metrics[0] if name in common and name.startswith(TEST_PREFIX)]
+    objectives = search.user_attrs[OBJECTIVES]
     # First what the configuration was selected by.
     for name in dict.fromkeys((*(name for name in objectives if name in tested), *leading_among(tested))):
-        scores = scores_of(OF_TEST + name, metrics)
+        scores = scores_of(TEST_PREFIX + name, metrics)
         if not np.isfinite(scores).all():
             continue
         ours, theirs = scores[: len(chosen)], scores[len(chosen) :]

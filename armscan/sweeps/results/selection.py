@@ -17,7 +17,7 @@ from armscan.sweeps.scheduling.race import DROP_LEVEL, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of
-from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES
+from armscan.sweeps.study.study import OBJECTIVES
 from armscan.training.metric_display import bounds_of, is_rate, title_of, value_text
 
 ROW_PX, AROUND_PX = 44, 110
@@ -62,7 +62,7 @@ class Candidate(NamedTuple):
 
 def objective_of(final: FinalEvaluation) -> str:
     """Return the metric that candidates are compared by."""
-    return str(next(iter(final.search.user_attrs[DASHBOARD_OBJECTIVES])))
+    return str(next(iter(final.search.user_attrs[OBJECTIVES])))
 
 
 def candidates_of(final: FinalEvaluation) -> list[Candidate]:

@@ -13,7 +13,7 @@ from optuna.trial import FrozenTrial, TrialState
 from armscan.errors import StudyError
 from armscan.stats.on_plane import limits_among
 from armscan.stats.paired import mean_over_seeds
-from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
+from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS, TEST_PREFIX
 from armscan.sweeps.study.final_eval import name_of
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
@@ -22,7 +22,6 @@ from armscan.training.metrics import COUNTS
 from armscan.training.result_table import with_baselines
 
 OF_VOLUME = re.compile(r"test/volume/(.+)/(\w+)")
-OF_TEST = "test/"
 
 
 @dataclass(frozen=True)
@@ -98,15 +97,15 @@ def _of_means(of_seeds: Sequence[Mapping[str, float]]) -> MetricEstimates:
     """Return the means of the metrics that all seeds have, with intervals for other seeds and volumes."""
     common = set.intersection(*map(set, of_seeds))
     of_seeds = [{name: value for name, value in metrics.items() if name in common} for metrics in of_seeds]
-    names = [name for name in of_seeds[0] if name.startswith(OF_TEST) and not OF_VOLUME.fullmatch(name)]
-    means = {name.removeprefix(OF_TEST): mean_over_seeds(scores_of(name, of_seeds)) for name in names}
+    names = [name for name in of_seeds[0] if name.startswith(TEST_PREFIX) and not OF_VOLUME.fullmatch(name)]
+    means = {name.removeprefix(TEST_PREFIX): mean_over_seeds(scores_of(name, of_seeds)) for name in names}
     volumes = {match[1] for name in common if (match := OF_VOLUME.fullmatch(name))}
-    episodes, solved = (sum(int(each.get(OF_TEST + name, 0)) for each in of_seeds) for name in COUNTS[1:])
+    episodes, solved = (sum(int(each.get(TEST_PREFIX + name, 0)) for each in of_seeds) for name in COUNTS[1:])
     return MetricEstimates(len(of_seeds), len(volumes), episodes, solved, means, limits_among(means))
 
 
 def scores_of(name: str, of_seeds: Sequence[Mapping[str, float]]) -> NDArray[np.float64]:
     """Return a metric of shape (seeds, test volumes), or (seeds, 1) if it is not known for each volume."""
-    metric = name.removeprefix(OF_TEST)
+    metric = name.removeprefix(TEST_PREFIX)
     volumes = [key for key in of_seeds[0] if (found := OF_VOLUME.fullmatch(key)) and found[2] == metric]
     return np.array([[metrics[key] for key in volumes or [name]] for metrics in of_seeds])

@@ -7,10 +7,13 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Self, TypeVar
 
+import numpy as np
+from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 from pydantic import Field
 
 from armscan.sweeps.storage.reports import reports_of
+from armscan.utils.arrays import FloatArray
 from armscan.utils.section import Section
 
 T = TypeVar("T")
@@ -36,6 +39,8 @@ KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED, STOP, ENQUEUED_FROM, MEMBER, GENER
 RESET_FAILURES = "forgiven"
 # In a lease: the worker that holds the trial.
 HOLDER = ("worker", "host", "pid", "started", "boot", "pid_namespace")
+# How the names of metrics on the test volumes begin.
+TEST_PREFIX = "test/"
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 # If this many trials fail before any reports, the configuration is at fault.
 FAILURES_AT_ONCE = 3
@@ -103,6 +108,16 @@ class StudyState:
                 busy_s += (end - max(start, until)).total_seconds()
                 until = end
         return busy_s / 3600
+
+
+def metrics_of_test(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Return those of a trial's metrics that are of the test volumes, by their names without the prefix."""
+    return {name.removeprefix(TEST_PREFIX): each for name, each in metrics.items() if name.startswith(TEST_PREFIX)}
+
+
+def loss_signs(directions: Sequence[StudyDirection]) -> FloatArray:
+    """Return the factors that turn objectives of these directions into losses: -1 for those to maximise, else 1."""
+    return np.where([direction == StudyDirection.MAXIMIZE for direction in directions], -1.0, 1.0)
 
 
 def env_steps_of(trial: FrozenTrial) -> int:

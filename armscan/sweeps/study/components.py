@@ -109,6 +109,12 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
 
     Choices of groups and of keys at the top are tried beside values of all others, too, as a trial has them.
 
+    Args:
+        settings: Settings of the study.
+        task: Task of its trials, which checks each configuration.
+        words: Overrides that its trials are composed from.
+        config: Configuration of its trials without the searched values.
+
     Raises:
         InvalidValueError: If a key is unknown, or a value not allowed.
     """

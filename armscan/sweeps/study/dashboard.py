@@ -10,6 +10,7 @@ import optuna
 from optuna.trial import Trial
 
 from armscan.config.services import MLFLOW_PORT
+from armscan.sweeps.scheduling.state import metrics_of_test
 from armscan.tracking import TrackingStore
 from armscan.training.metric_display import COSTS, leading_among, title_of, value_text
 from armscan.utils.files import sha256
@@ -21,7 +22,6 @@ LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
 # Of the note that was left at a study.
 NOTE_SUM = "note_sha256"
 # Before the metrics of a final training on the test volumes.
-TEST = "test/"
 
 
 def note_run(
@@ -77,7 +77,7 @@ def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float
         metrics: Metrics by name; of a final training, those of the test are shown.
         n_seeds: Number of seeds of their interquartile means.
     """
-    tested = {name.removeprefix(TEST): value for name, value in metrics.items() if name.startswith(TEST)}
+    tested = metrics_of_test(metrics)
     of, statistic = "test volumes: " if tested else "", f" (IQM of {n_seeds} seeds)" if n_seeds > 1 else ""
     chosen = tested or metrics
     names = [name for name in leading_among(chosen) if math.isfinite(chosen[name])]
@@ -86,7 +86,7 @@ def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float
 
 def named_as_of_runs(metrics: Mapping[str, float]) -> dict[str, float]:
     """Return the leading metrics of a trial by the names that runs use, so that MLflow has them in the same columns."""
-    tested = {name.removeprefix(TEST): value for name, value in metrics.items() if name.startswith(TEST)}
+    tested = metrics_of_test(metrics)
     of_phases = {"validation": metrics, "test_volumes": tested}
     return {f"{of}/{name}": each[name] for of, each in of_phases.items() for name in leading_among(each)}
 

@@ -155,7 +155,14 @@ class OpenedStudy:
 def open_for_work(
     settings: StudySettings, task: Task, config: DictConfig, words: Sequence[str], *, retry: bool = False
 ) -> OpenedStudy:
-    """Open a study, as `read_settings` has read it from these words, and make it if there is none.
+    """Open a study, and make it if there is none.
+
+    Args:
+        settings: Settings of the study, as `read_settings` returns them.
+        task: Task of its trials.
+        config: Configuration of its trials without the searched values.
+        words: Overrides that its trials are composed from.
+        retry: Whether to wait for a store or a storage that is away. Default: False.
 
     Raises:
         StudyError: If the storage cannot be used, or the study that exists is another.

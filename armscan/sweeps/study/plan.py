@@ -20,14 +20,14 @@ from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
-from armscan.sweeps.study.warm_start import Beginning
+from armscan.sweeps.study.warm_start import InitialTrials
 from armscan.utils.console import WHOLE_CHARS, wide_console
 
 BYTES_A_MIB = 2**20
 
 
 def print_plan(
-    settings: StudySettings, study: optuna.Study | None, final: FinalEvaluation | None, begins: Sequence[Beginning]
+    settings: StudySettings, study: optuna.Study | None, final: FinalEvaluation | None, initial: Sequence[InitialTrials]
 ) -> None:
     """Print the space, the progress and cost of a started study, and the cost of the rest.
 
@@ -35,7 +35,7 @@ def print_plan(
         settings: Settings of the study.
         study: Study of the search; None if it has not been started.
         final: Its final evaluation; None if it has not been started.
-        begins: Trials that come first.
+        initial: Trials that come first.
     """
     console = wide_console(WHOLE_CHARS)
     state = StudyState.of(study.get_trials(deepcopy=False) if study is not None else ())
@@ -57,8 +57,8 @@ def print_plan(
     console.print(f"objective  {objectives}, over the seeds {', '.join(map(str, settings.seeds))}")
     console.print(f"limits     {', '.join(limits)}; {settings.workers} workers")
     console.print(f"then       {_final(settings.final_eval)}")
-    for each in begins:
-        console.print(printable(f"begins     {each.told}"), markup=False, highlight=False)
+    for each in initial:
+        console.print(printable(f"begins     {each.message}"), markup=False, highlight=False)
     others = (("failed", state.failed), ("waiting", state.waiting))
     also = "".join(f", {len(trials)} {what}" for what, trials in others if trials)
     console.print(f"done       {(done := len(state.finished))} trials{also}")

@@ -6,9 +6,9 @@ import numpy as np
 import optuna
 from numpy.typing import NDArray
 from optuna.pruners import BasePruner
-from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
+from armscan.sweeps.scheduling.state import loss_signs
 from armscan.sweeps.storage.reports import reports_of
 from armscan.utils.validation import check_int
 
@@ -44,9 +44,9 @@ class ParetoPruner(BasePruner):
             return False
         reached = [_values_at(rung, each) for each in study.get_trials(deepcopy=False) if each.number != trial.number]
         values = [_values_at(rung, trial), *filter(None, reached)]
-        signs = [-1.0 if direction == StudyDirection.MAXIMIZE else 1.0 for direction in study.directions]
+        losses = np.array(values, dtype=float) * loss_signs(study.directions)
         # What is not known counts as worst.
-        losses = np.nan_to_num(np.array(values, dtype=float) * signs, nan=np.inf, posinf=np.inf, neginf=-np.inf)
+        losses = np.nan_to_num(losses, nan=np.inf, posinf=np.inf, neginf=-np.inf)
         return bool(n_better(losses) >= max(1, len(losses) // self._reduction_factor))
 
     def _rung_below(self, step: int) -> int | None:

@@ -86,10 +86,12 @@ class FinalEvalSettings(Section):
     seeds, and the judgement has seeds of its own.
 
     Args:
-        top_k: Number of candidates, the best different configurations of the search; 0 for no final evaluation.
-        min_seeds: Seeds of each candidate, and of the control, in the first round of the selection.
-        max_seeds: Most seeds of each in the selection.
-        judge_seeds: Seeds of the chosen configuration, and of the control, on the test volumes.
+        top_k: Number of candidates, the best different configurations of the search, 0 or more; 0 for no final
+            evaluation.
+        min_seeds: Seeds of each candidate, and of the control, in the first round of the selection, from 1 to
+            `max_seeds`.
+        max_seeds: Most seeds of each in the selection, from 1 to 1000.
+        judge_seeds: Seeds of the chosen configuration, and of the control, on the test volumes, from 1 to 1000.
     """
 
     top_k: int = Field(ge=0, description="a whole number of at least 0")

@@ -24,12 +24,17 @@ from armscan.sweeps.study.settings import StudySettings
 from armscan.tracking import flattened
 
 # User attributes of a study.
-SPACE, FIXED, STUDY_RUN, DASHBOARD_OBJECTIVES = "space", "fixed_config", "mlflow_run", "objectives"
+SPACE, FIXED, STUDY_RUN, OBJECTIVES = "space", "fixed_config", "mlflow_run", "objectives"
 N_SHOWN = 5
 
 
 def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study:
-    """Make a study, or find the existing one; `fixed` is the configuration of trials without searched values.
+    """Make a study, or find the existing one.
+
+    Args:
+        storage: Storage of the study.
+        settings: Settings of the study.
+        fixed: Configuration of its trials without the searched values.
 
     Raises:
         StudyError: If the study that exists searches another space, has other objectives, or has trials with another
@@ -85,7 +90,7 @@ def described(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, An
     shared = {key: value for key, value in shared.items() if key not in ADDED or value is not None}
     return {
         SPACE: settings.space.to_plain(),
-        DASHBOARD_OBJECTIVES: dict(settings.objectives),
+        OBJECTIVES: dict(settings.objectives),
         FIXED: shared | of_trials,
     }
 
@@ -97,10 +102,10 @@ def is_ours(study: optuna.Study) -> bool:
         InvalidValueError: If a user attribute of it is of another type than armscan writes.
     """
     there = study.user_attrs
-    if not {SPACE, FIXED, DASHBOARD_OBJECTIVES} <= there.keys():
+    if not {SPACE, FIXED, OBJECTIVES} <= there.keys():
         return False
     StudyAttributes.read(f"{study.study_name}.user_attrs", there)
-    return [direction.name.lower() for direction in study.directions] == [*there[DASHBOARD_OBJECTIVES].values()]
+    return [direction.name.lower() for direction in study.directions] == [*there[OBJECTIVES].values()]
 
 
 def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[str, Any]) -> None:
@@ -110,7 +115,7 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
     check_trials(study)
     whose = f"the study {settings.name} in {settings.storage if '://' not in settings.storage else 'its storage'}"
     other = "; give study.name another value"
-    for key, what in ((SPACE, "searches another space"), (DASHBOARD_OBJECTIVES, "has other objectives")):
+    for key, what in ((SPACE, "searches another space"), (OBJECTIVES, "has other objectives")):
         if differences := _differences(renamed(there.get(key, {})), wanted[key]):
             raise StudyError(f"{whose} {what}: {differences}{other}")
     differences = _differences(migrate(there.get(FIXED, {})), wanted[FIXED])

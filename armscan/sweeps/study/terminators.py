@@ -14,7 +14,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.errors import InvalidValueError
-from armscan.sweeps.scheduling.state import SEEDS, StudyState, is_feasible
+from armscan.sweeps.scheduling.state import SEEDS, StudyState, is_feasible, loss_signs
 from armscan.sweeps.study.pruners import front_numbers
 from armscan.utils.validation import check_int
 
@@ -99,8 +99,8 @@ class Stagnation:
         trials = sorted(_completed(state), key=lambda trial: (str(trial.datetime_complete), trial.number))
         if len(trials) <= self._n_trials:
             return None
-        signs = [-1.0 if direction == StudyDirection.MAXIMIZE else 1.0 for direction in study.directions]
-        losses, n_before = np.array([trial.values for trial in trials]) * signs, len(trials) - self._n_trials
+        losses = np.array([trial.values for trial in trials]) * loss_signs(study.directions)
+        n_before = len(trials) - self._n_trials
         before = np.unique(losses[:n_before], axis=0)
         # Those that are as good as one before are not better.
         new = [loss for loss in losses[n_before:] if not (before <= loss).all(axis=1).any()]

@@ -30,8 +30,7 @@ from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES as OBJECTIVES
-from armscan.sweeps.study.study import FIXED, SPACE, best_trials, described, is_ours
+from armscan.sweeps.study.study import FIXED, OBJECTIVES, SPACE, best_trials, described, is_ours
 
 # User attribute of a study: what it has begun with.
 BEGUN_WITH = "begun_with"
@@ -46,18 +45,18 @@ KEPT = (METRICS, SEEDS, ENV_STEPS)
 
 
 @dataclass(frozen=True)
-class Beginning:
+class InitialTrials:
     """Trials that a study begins with, all of one origin.
 
     Args:
         origin: Name of the study or the preset, and its kind.
-        told: Line about the part that is taken, and why the rest is not.
+        message: Line about the part that is taken, and why the rest is not.
         taken: Finished trials, with their values.
         enqueued: Settings to try first.
     """
 
     origin: str
-    told: str
+    message: str
     taken: tuple[FrozenTrial, ...] = ()
     enqueued: tuple[dict[str, Value], ...] = ()
 
@@ -81,12 +80,12 @@ class Beginning:
         return storage.exclusive(add)
 
 
-def beginnings(
+def initial_trials(
     settings: StudySettings, words: Sequence[str], fixed: Mapping[str, Any], study: optuna.Study | None
-) -> list[Beginning]:
-    """Return the beginnings of a study: the presets of `study.enqueue`, then the studies of `study.warm_start`.
+) -> list[InitialTrials]:
+    """Return the trials that a study begins with: of the presets of `study.enqueue`, then of other studies.
 
-    Those that it has begun with already are left out.
+    The other studies are those of `study.warm_start`. Trials that it has already are left out.
 
     Args:
         settings: Settings of the study.
@@ -101,20 +100,20 @@ def beginnings(
     presets = [name for name in settings.enqueue if PRESET.format(name) not in begun_with]
     sources = [name for name in settings.warm_start if SOURCE.format(name) not in begun_with]
     storage = existing_storage(settings.storage) if sources else None
-    begins = [
+    initial = [
         *(_of_preset(settings.space, name, words) for name in presets),
         *(_of_study(settings, name, fixed, storage) for name in sources),
     ]
     # First what is taken: the settings of a trial with a value need not be tried again.
-    return sorted(begins, key=lambda each: not each.taken)
+    return sorted(initial, key=lambda each: not each.taken)
 
 
-def _of_preset(space: Space, name: str, words: Sequence[str]) -> Beginning:
+def _of_preset(space: Space, name: str, words: Sequence[str]) -> InitialTrials:
     chosen, misfit = values_of(space, words if name == DEFAULT else [f"experiment={name}"])
     if misfit:
-        return Beginning(PRESET.format(name), f"preset {name} is not tried: {misfit}")
-    told = f"preset {name} is tried first: {' '.join(overrides_of(chosen))}"
-    return Beginning(PRESET.format(name), told, (), (chosen,))
+        return InitialTrials(PRESET.format(name), f"preset {name} is not tried: {misfit}")
+    message = f"preset {name} is tried first: {' '.join(overrides_of(chosen))}"
+    return InitialTrials(PRESET.format(name), message, (), (chosen,))
 
 
 def values_of(space: Space, words: Sequence[str]) -> tuple[dict[str, Value], str | None]:
@@ -134,7 +133,7 @@ def values_of(space: Space, words: Sequence[str]) -> tuple[dict[str, Value], str
     return space.fit({key: as_kept(value) for key, value in plain.items()})
 
 
-def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], storage: Storage | None) -> Beginning:
+def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], storage: Storage | None) -> InitialTrials:
     source, wanted = _source(settings, name, storage), described(settings, fixed)
     trials = [trial for trial in source.get_trials(deepcopy=False) if trial.state in FINISHED]
     difference = _difference(source.user_attrs, wanted)
@@ -150,16 +149,16 @@ def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], stor
             misfits[misfit] += 1
         else:
             fitting.append((trial, chosen))
-    told = f"warm start from {name}, which has {len(trials)} finished trials: "
+    message = f"warm start from {name}, which has {len(trials)} finished trials: "
     left = f"; {sum(misfits.values())} do not fit, such as: {misfits.most_common(1)[0][0]}" if misfits else ""
     if difference is None:
         taken = tuple(_taken(name, trial, chosen, settings.space) for trial, chosen in fitting)
-        return Beginning(SOURCE.format(name), f"{told}{len(taken)} taken with their values{left}", taken)
+        return InitialTrials(SOURCE.format(name), f"{message}{len(taken)} taken with their values{left}", taken)
     settings_of = {trial.number: chosen for trial, chosen in fitting if chosen}
     best = best_trials(source, NO_LIMIT)
     first = first_different(settings_of[trial.number] for trial in best if trial.number in settings_of)
-    told += f"none taken with its value, because {difference}; the settings of the best {len(first)} are tried first"
-    return Beginning(SOURCE.format(name), told + left, (), first)
+    message += f"none taken with its value, because {difference}; the settings of the best {len(first)} are tried first"
+    return InitialTrials(SOURCE.format(name), message + left, (), first)
 
 
 def _source(settings: StudySettings, name: str, storage: Storage | None) -> optuna.Study:

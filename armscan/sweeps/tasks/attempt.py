@@ -137,9 +137,9 @@ class Attempt:
         *,
         seed: int,
         n_env_steps: int,
-        grid: int,
-        total: int,
-        n_inherited: int = 0,
+        report_every_env_steps: int,
+        total_env_steps: int,
+        n_inherited_env_steps: int = 0,
     ) -> None:
         """Report how a training is going.
 
@@ -148,20 +148,21 @@ class Attempt:
                 report every objective is not pruned.
             seed: Seed of the training.
             n_env_steps: Environment steps so far.
-            grid: Environment steps between two reports, so that trials are compared at the same steps.
-            total: Environment steps of a whole training.
-            n_inherited: Environment steps that its parent has taken. Default: 0.
+            report_every_env_steps: Environment steps between two reports; trials are compared at multiples of it.
+            total_env_steps: Environment steps of a whole training.
+            n_inherited_env_steps: Environment steps that its parent has taken. Default: 0.
 
         Raises:
             optuna.TrialPruned: If the trial is pruned.
         """
         done = [one for each, one in self.seeds_done.items() if each in self.seeds]
-        self.env_steps = sum(int(one[ENV_STEPS]) for one in done) + n_env_steps - n_inherited
+        self.env_steps = sum(int(one[ENV_STEPS]) for one in done) + n_env_steps - n_inherited_env_steps
         progress = {"seed": seed, ENV_STEPS: self.env_steps}
         self.report_progress(progress | ({"return": metrics["mean_return"]} if "mean_return" in metrics else {}))
         if not self.objectives or any(name not in metrics for name in self.objectives):
             return
-        step = self.seeds.index(seed) * total + n_env_steps // grid * grid
+        step = self.seeds.index(seed) * total_env_steps
+        step += n_env_steps // report_every_env_steps * report_every_env_steps
         if step in self._reported:
             return
         self._reported.add(step)

@@ -13,6 +13,7 @@ from armscan.anatomy import PlaneScorer
 from armscan.anatomy.tissues import Tissues, check_tissues
 from armscan.errors import InvalidValueError
 from armscan.experiment.build import check_keys
+from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.tasks.attempt import Attempt, volumes_of
 from armscan.volumes import LabelVolume
 from armscan.volumes.plane import ManipulatorAction
@@ -35,7 +36,7 @@ class LandmarksTask:
     @property
     def final_metric(self) -> str:
         """The difference, on the test volumes."""
-        return "test/separation"
+        return f"{TEST_PREFIX}separation"
 
     def check(self, config: DictConfig) -> None:
         """See `Task.check`."""
@@ -61,7 +62,7 @@ class LandmarksTask:
         """Look at the test volumes. See `Task.evaluate`."""
         config, _ = attempt.config(attempt.seeds[0])
         metrics = self._run_task(config, volumes_of(config).test)
-        return {f"test/{name}": value for name, value in metrics.items()}
+        return {f"{TEST_PREFIX}{name}": value for name, value in metrics.items()}
 
     def _run_task(self, config: DictConfig, volumes: Mapping[str, LabelVolume]) -> dict[str, float]:
         reward, tissues = instantiate(config.reward, _convert_="object"), self._tissues(config)

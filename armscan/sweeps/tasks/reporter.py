@@ -48,9 +48,9 @@ class Reporter:
             self._validation().metrics() | so_far,
             seed=self.seed,
             n_env_steps=report.n_env_steps,
-            grid=grid,
-            total=self.budget.env_steps,
-            n_inherited=before.n_env_steps if before is not None else 0,
+            report_every_env_steps=grid,
+            total_env_steps=self.budget.env_steps,
+            n_inherited_env_steps=before.n_env_steps if before is not None else 0,
         )
 
     def on_end(self) -> None:

@@ -21,6 +21,7 @@ from armscan.experiment.provenance import place_tags, start_tracking, volume_tag
 from armscan.experiment.results import RunResult
 from armscan.experiment.runner import VIDEO_SEED, log_result, train_agent
 from armscan.stats.bootstrap import interquartile_mean
+from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.tasks.attempt import STUDY_TAG, Attempt, volumes_of
 from armscan.sweeps.tasks.generation import begin_generation
 from armscan.sweeps.tasks.reporter import TRAINING_METRICS, Reporter
@@ -55,7 +56,7 @@ class TrainingTask:
     @property
     def final_metric(self) -> str:
         """The mean steps of an episode."""
-        return "test/mean_steps"
+        return f"{TEST_PREFIX}mean_steps"
 
     def check(self, config: DictConfig) -> None:
         """See `Task.check`."""
@@ -116,9 +117,9 @@ def _concluded(
     from armscan.policies.build import save_policy
 
     save_policy(agent, setup.test_env, tracked, folder, log)
-    metrics = {f"test/{name}": value for name, value in tested.metrics().items()}
+    metrics = {f"{TEST_PREFIX}{name}": value for name, value in tested.metrics().items()}
     for volume, evaluation in tested.by_volume().items():
-        metrics |= {f"test/volume/{volume}/{name}": value for name, value in evaluation.metrics().items()}
+        metrics |= {f"{TEST_PREFIX}volume/{volume}/{name}": value for name, value in evaluation.metrics().items()}
     return metrics
 
 

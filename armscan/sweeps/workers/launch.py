@@ -45,6 +45,12 @@ Launch = Callable[[Sequence[str]], object]
 def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch: Launch) -> None:
     """Launch the workers of a study, and wait for their end.
 
+    Args:
+        opened: The study.
+        given: Command that started it.
+        launcher: Choice of `hydra/launcher`.
+        launch: Function that launches Hydra's jobs, one for each worker, from words of the command line.
+
     Raises:
         KeyboardInterrupt: If it is interrupted; the workers have been asked to leave.
         StudyError: If the launcher has failed, and no worker is alive.

@@ -1,6 +1,8 @@
 """A bench for studies: which sampler, pruner and rule of seeds finds the best settings with the fewest trainings.
 
 python -m benchmarks.sweeps.bench collect sac_y [--configs N] [--seeds N] [--workers N]
+python -m benchmarks.sweeps.bench report sac_y [--studies N] [--picture FILE]
+python -m benchmarks.sweeps.bench warm-start sac_y sac_zy [--studies N]
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from armscan.sweeps.scheduling.termination import TERMINATED
 from armscan.sweeps.storage.attributes import StudyAttributes, TrialAttributes, check_trials
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import NOTE_SUM
-from armscan.sweeps.study.study import DASHBOARD_OBJECTIVES, FIXED, SPACE, STUDY_RUN, make_study
+from armscan.sweeps.study.study import FIXED, OBJECTIVES, SPACE, STUDY_RUN, make_study
 from armscan.sweeps.study.warm_start import BEGUN_WITH
 from armscan.sweeps.tasks import attempt
 from armscan.sweeps.workers.heartbeat import LivenessCheck
@@ -44,7 +44,7 @@ def is_refused(check):
 def study_with(trial_attributes=(), study_attributes=(), state=TrialState.RUNNING):
     storage = optuna.storages.InMemoryStorage()
     study = optuna.create_study(study_name="a", storage=storage)
-    for name, value in ({DASHBOARD_OBJECTIVES: {"mean_steps": "minimize"}} | dict(study_attributes)).items():
+    for name, value in ({OBJECTIVES: {"mean_steps": "minimize"}} | dict(study_attributes)).items():
         study.set_user_attr(name, value)
     study.add_trial(create_trial(state=state, value=None, user_attrs=dict(trial_attributes)))
     return study
@@ -79,7 +79,7 @@ def test_every_attribute_is_checked():
         attempt.CONFIG_SHA256,
     }
     assert set(OF_TRIAL) == ours
-    assert set(StudyAttributes.model_fields) == {SPACE, FIXED, DASHBOARD_OBJECTIVES, *HARMLESS_OF_STUDY}
+    assert set(StudyAttributes.model_fields) == {SPACE, FIXED, OBJECTIVES, *HARMLESS_OF_STUDY}
 
 
 @pytest.mark.parametrize("value", ODD, ids=lambda value: repr(value)[:10])

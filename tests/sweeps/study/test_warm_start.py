@@ -16,7 +16,7 @@ from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import best_trials, make_study
-from armscan.sweeps.study.warm_start import N_ENQUEUED, Beginning, beginnings, values_of
+from armscan.sweeps.study.warm_start import N_ENQUEUED, InitialTrials, initial_trials, values_of
 from tests.sweeps.study.test_study import settings
 
 LR = {"low": 1e-4, "high": 1e-2, "log": True}
@@ -49,10 +49,10 @@ def study_in(tmp_path):
 def begin(made, fixed=FIXED):
     """Let a study begin; return what is told."""
     asked, storage, study = made
-    begins = beginnings(asked, [], fixed, study)
-    for each in begins:
+    initial = initial_trials(asked, [], fixed, study)
+    for each in initial:
         assert each.add(storage, study)
-    return [each.told for each in begins]
+    return [each.message for each in initial]
 
 
 def test_trials_of_the_same_configuration_are_taken_with_their_values_and_count_nowhere(study_in):
@@ -114,7 +114,7 @@ def test_best_settings_of_another_configuration_are_tried_first_without_their_va
 def test_study_begins_once_also_where_a_process_ended_in_between(study_in, monkeypatch):
     study_in("before", {"agent.lr": LR}, rows=[({"agent.lr": 1e-3}, 3.0), ({"agent.lr": 2e-3}, 2.0)])
     asked, storage, study = study_in("now", {"agent.lr": LR}, warm_start=["before"])
-    (beginning,) = beginnings(asked, [], FIXED, study)
+    (each,) = initial_trials(asked, [], FIXED, study)
 
     def killed(*_):
         raise KeyboardInterrupt
@@ -122,11 +122,11 @@ def test_study_begins_once_also_where_a_process_ended_in_between(study_in, monke
     with monkeypatch.context() as patch:
         patch.setattr(optuna.Study, "set_user_attr", killed)
         with pytest.raises(KeyboardInterrupt):
-            beginning.add(storage, study)
-    assert beginning.add(storage, study)
-    assert not beginning.add(storage, study)
+            each.add(storage, study)
+    assert each.add(storage, study)
+    assert not each.add(storage, study)
     assert len(study.trials) == 2
-    assert beginnings(asked, [], FIXED, study) == []
+    assert initial_trials(asked, [], FIXED, study) == []
 
 
 @pytest.mark.parametrize("name", ["elsewhere", "now"])
@@ -134,17 +134,17 @@ def test_study_that_is_not_there_is_refused_with_those_that_are(study_in, name):
     study_in("before", {"agent.lr": LR})
     asked, _, study = study_in("now", {"agent.lr": LR}, warm_start=[name])
     with pytest.raises(StudyError, match=f"warm_start names '{name}', but it must be .* of the storage: before$"):
-        beginnings(asked, [], FIXED, study)
+        initial_trials(asked, [], FIXED, study)
 
 
 def test_preset_whose_values_lie_in_the_space_is_tried_first():
     words = ["sweep=sac_zy", "study.enqueue=[default,best_zy]"]
     asked, _, config = read_settings(words)
-    own, best = beginnings(asked, words, to_plain(config), None)
+    own, best = initial_trials(asked, words, to_plain(config), None)
     assert own.enqueued[0]["agent.lr_end_factor"] == 1.0
     other = {"agent.lr_end_factor": 0.1, "stack": 4, "memory": 2, "agent.target_entropy_per_dim": -3.0}
     assert best.enqueued == (own.enqueued[0] | other,)
-    assert best.told.startswith("preset best_zy is tried first: agent.lr=0.001 agent.lr_end_factor=0.1 ")
+    assert best.message.startswith("preset best_zy is tried first: agent.lr=0.001 agent.lr_end_factor=0.1 ")
 
 
 def test_taken_trial_with_the_values_of_the_control_is_no_candidate_beside_it(study_in):
@@ -162,8 +162,8 @@ def test_taken_trial_with_the_values_of_the_control_is_no_candidate_beside_it(st
 def test_settings_of_a_taken_trial_are_not_tried_again(study_in):
     study_in("before", {"agent.lr": LR}, rows=[({"agent.lr": 1e-3}, 3.0)])
     asked, storage, study = study_in("now", {"agent.lr": LR}, warm_start=["before"])
-    (taken,) = beginnings(asked, [], FIXED, study)
-    preset = Beginning("preset a", "", (), ({"agent.lr": 1e-3}, {"agent.lr": 2e-3}))
+    (taken,) = initial_trials(asked, [], FIXED, study)
+    preset = InitialTrials("preset a", "", (), ({"agent.lr": 1e-3}, {"agent.lr": 2e-3}))
     for each in (taken, preset):
         each.add(storage, study)
     assert [trial.state.name for trial in study.trials] == ["COMPLETE", "WAITING"]
@@ -173,14 +173,14 @@ def test_preset_whose_values_do_not_lie_in_the_space_is_not_tried():
     given = StudyCommand.read(["-m", "sweep=sac_y", "study.space.agent.lr.low=5e-3"])
     words = words_of_trials(given.words)
     asked, _, config = read_settings(words)
-    (beginning,) = beginnings(asked, words, to_plain(config), None)
-    assert beginning.told == "preset best_y is not tried: agent.lr=0.001 is not in the space"
-    assert beginning.enqueued == ()
+    (each,) = initial_trials(asked, words, to_plain(config), None)
+    assert each.message == "preset best_y is not tried: agent.lr=0.001 is not in the space"
+    assert each.enqueued == ()
 
 
 @pytest.mark.parametrize("sweep", sorted(path.stem for path in sweeps_folder().glob("*.yaml")))
 def test_presets_of_each_sweep_lie_in_its_space(sweep):
     words = [f"sweep={sweep}"]
     asked, _, config = read_settings(words)
-    begins = beginnings(asked, words, to_plain(config), None)
-    assert [len(each.enqueued) for each in begins] == [1] * len(asked.enqueue)
+    initial = initial_trials(asked, words, to_plain(config), None)
+    assert [len(each.enqueued) for each in initial] == [1] * len(asked.enqueue)

@@ -124,7 +124,7 @@ def test_worker_prunes_a_trial_of_several_objectives_that_is_behind_in_all(work)
     def first_is_best(attempt):
         metrics = {"mean_steps": float(attempt.trial.number), "env_steps": float(attempt.trial.number)}
         for step in (50, 100):
-            attempt.report(metrics, seed=0, n_env_steps=step, grid=50, total=100)
+            attempt.report(metrics, seed=0, n_env_steps=step, report_every_env_steps=50, total_env_steps=100)
         return metrics
 
     study = work("a", first_is_best, objectives=("mean_steps", "env_steps"), n_trials=3)
@@ -246,7 +246,7 @@ def test_worker_goes_on_with_a_broken_study_once_its_failures_are_forgiven(work)
 
 def test_worker_needs_of_a_report_only_what_is_pruned_by(work):
     def reports(attempt):
-        attempt.report({"mean_steps": 1.0}, seed=0, n_env_steps=1, grid=1, total=1)
+        attempt.report({"mean_steps": 1.0}, seed=0, n_env_steps=1, report_every_env_steps=1, total_env_steps=1)
         return {"mean_steps": 1.0}
 
     assert {trial.state.name for trial in work("a", reports).trials} == {"COMPLETE"}
@@ -256,7 +256,7 @@ def report_until_told_otherwise(attempt):
     """Report as a long training does."""
     until_s = time.monotonic() + HANG_S
     while time.monotonic() < until_s:
-        attempt.report({"mean_return": -1.0}, seed=0, n_env_steps=100, grid=100, total=1000)
+        attempt.report({"mean_return": -1.0}, seed=0, n_env_steps=100, report_every_env_steps=100, total_env_steps=1000)
         time.sleep(0.01)
     raise AssertionError
 
