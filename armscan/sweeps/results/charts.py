@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import accumulate
 from typing import Any
 
 import optuna
-from optuna.distributions import CategoricalDistribution
+from optuna.distributions import BaseDistribution, CategoricalDistribution
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 from optuna.visualization import plot_parallel_coordinate, plot_pareto_front
@@ -24,6 +25,8 @@ from armscan.training.metric_display import is_rate, title_of
 
 HEIGHT_PX, SMALL_PX, BAR_PX = 360, 260, 34
 MOST_TICKS = 20
+# Room on either side of a range, as a share of it.
+MARGIN = 0.03
 
 
 def charts_of(
@@ -130,12 +133,20 @@ def _slice(trials: Sequence[FrozenTrial], key: str, number: int, objective: str)
     hover = {"text": list(map(_said, having)), "hovertemplate": "%{y:.4g}<br>%{text}<extra></extra>"}
     points = {"mode": "markers", "marker": {"color": BLUE, "size": 7, "opacity": 0.5}}
     figure = Figure(Scatter(x=places, y=[_value(number)(trial) for trial in having], **points, **hover))
-    axis: dict[str, Any] = {"title": key}
-    if isinstance(found, CategoricalDistribution):
-        axis |= {"type": "category", "categoryorder": "array", "categoryarray": list(map(str, found.choices))}
-    elif getattr(found, "log", False):
-        axis |= {"type": "log", "exponentformat": "power", "dtick": 1}
-    return figure.update_layout(height=SMALL_PX, xaxis=axis, yaxis=_axis(objective))
+    return figure.update_layout(height=SMALL_PX, xaxis=key_axis(key, found), yaxis=_axis(objective))
+
+
+def key_axis(key: str, distribution: BaseDistribution) -> dict[str, Any]:
+    """Return how the axis of a searched key is drawn: its whole range, or all of its choices."""
+    if isinstance(distribution, CategoricalDistribution):
+        choices = list(map(str, distribution.choices))
+        return {"title": key, "type": "category", "categoryorder": "array", "categoryarray": choices}
+    limits: Any = distribution
+    ends = (math.log10(limits.low), math.log10(limits.high)) if limits.log else (limits.low, limits.high)
+    # Room for the markers at both ends.
+    room = MARGIN * (ends[1] - ends[0])
+    how = {"type": "log", "exponentformat": "power", "dtick": 1} if limits.log else {}
+    return {"title": key, "range": [ends[0] - room, ends[1] + room], **how}
 
 
 def _reports(trials: Sequence[FrozenTrial], number: int, objective: str) -> Figure:

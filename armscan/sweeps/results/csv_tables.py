@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 
 import optuna
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
-from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.reports.html import Row
@@ -30,6 +29,7 @@ from armscan.sweeps.scheduling.state import (
     TAKEN_FROM,
     TEST_PREFIX,
     is_feasible,
+    loss_signs,
 )
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.reports import reports_of
@@ -147,9 +147,8 @@ def _importance_rows(study: optuna.Study, objectives: Sequence[str]) -> list[Row
     rows: list[Row] = []
     if len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) < MIN_TRIALS_FOR_IMPORTANCE:
         return rows
-    for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):
-        # Low is good for the evaluator.
-        sign = -1.0 if direction == StudyDirection.MAXIMIZE else 1.0
+    # Low is good for the evaluator.
+    for number, (objective, sign) in enumerate(zip(objectives, loss_signs(study.directions).tolist(), strict=True)):
         target = _value(number, sign) if len(objectives) > 1 else None
         with warnings.catch_warnings():
             # That low is good.

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
-from optuna.distributions import BaseDistribution, CategoricalDistribution
 from optuna.trial import FrozenTrial, TrialState
 from plotly.graph_objects import Figure
 
 from armscan.agents.schedule import FROM
 from armscan.reports.chart_style import BLUE, GREY, ORANGE
 from armscan.reports.html import chart
+from armscan.sweeps.results.charts import HEIGHT_PX, SMALL_PX, key_axis
 from armscan.sweeps.scheduling.population import lineage
 from armscan.sweeps.scheduling.state import GENERATION, INTERVAL, MEMBER, PARENT, SCHEDULE
 from armscan.training.metric_display import title_of
 
-HEIGHT_PX, SMALL_PX = 360, 260
 STEPS = "environment steps"
 
 
@@ -84,17 +82,7 @@ def _values(members: Sequence[FrozenTrial], best: FrozenTrial, key: str) -> Figu
             showlegend=False,
             hovertemplate=f"member {trial.user_attrs[MEMBER]}: %{{y:.4g}}<extra></extra>",
         )
-    return figure.update_layout(height=SMALL_PX, xaxis_title=STEPS, yaxis=_axis(key, best.distributions[key]))
-
-
-def _axis(key: str, distribution: BaseDistribution) -> dict[str, Any]:
-    if isinstance(distribution, CategoricalDistribution):
-        return {"title": key, "type": "category", "categoryarray": list(map(str, distribution.choices))}
-    limits: Any = distribution
-    if limits.log:
-        ends = [math.log10(limits.low), math.log10(limits.high)]
-        return {"title": key, "type": "log", "exponentformat": "power", "dtick": 1, "range": ends}
-    return {"title": key, "range": [limits.low, limits.high]}
+    return figure.update_layout(height=SMALL_PX, xaxis_title=STEPS, yaxis=key_axis(key, best.distributions[key]))
 
 
 def _end(trial: FrozenTrial) -> int:
