@@ -45,7 +45,7 @@ class Sweep:
 
 def compare(folder: Path, *, trials: int = 60, shortest_s: float = 6.0, longest_s: float = 30.0) -> None:
     """Run both, and print what came of them."""
-    python = environment()
+    python = hydra_python()
     start_s = time.monotonic()
     state = slept(folder, trials, shortest_s, longest_s)
     ours = Sweep(Occupation.of_study(state), len(state.finished), time.monotonic() - start_s)
@@ -54,19 +54,21 @@ def compare(folder: Path, *, trials: int = 60, shortest_s: float = 6.0, longest_
     rows = {
         "trials finished": [f"{sweep.n_finished}" for sweep in sweeps],
         "trials lost": [f"{trials - sweep.n_finished}" for sweep in sweeps],
-        "what all trials wait, one after another, s": [f"{each.waited_s:.1f}" for each in occupations],
-        "first trial's begin to last trial's end, s": [f"{each.wall_s:.1f}" for each in occupations],
-        "the command from start to end, s": [f"{sweep.command_s:.1f}" for sweep in sweeps],
-        "of the workers' time spent in what trials do": [f"{each.share_of_wall:.1%}" for each in occupations],
-        "the same, each worker until its own last trial": [f"{each.share_until_last:.1%}" for each in occupations],
-        "likewise, from a trial's claim to its tell": [f"{share_in_trials(state):.1%}", ""],
+        "waiting time of all trials together, s": [f"{each.waited_s:.1f}" for each in occupations],
+        "from the first trial's start to the last trial's end, s": [f"{each.wall_s:.1f}" for each in occupations],
+        "the whole command, s": [f"{sweep.command_s:.1f}" for sweep in sweeps],
+        "share of the workers' time spent waiting in trials": [f"{each.share_of_wall:.1%}" for each in occupations],
+        "the same, each worker counted until its own last trial": [
+            f"{each.share_until_last:.1%}" for each in occupations
+        ],
+        "the same, from a trial's claim to its tell": [f"{share_in_trials(state):.1%}", ""],
     }
     print("| | armscan | Hydra's Optuna sweeper |\n| --- | --- | --- |")
     for name, cells in rows.items():
         print(f"| {name} | {' | '.join(cells)} |")
 
 
-def environment() -> Path:
+def hydra_python() -> Path:
     """Return the interpreter of the environment of Hydra's sweeper, which is made where there is none."""
     requirements = HYDRA_OPTUNA / "requirements.txt"
     version = hashlib.sha256(requirements.read_bytes()).hexdigest()[:12]

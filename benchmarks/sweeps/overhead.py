@@ -118,11 +118,11 @@ def beside(folder: Path, *, trials: int = 4) -> None:
     rows = {
         "a trial, from claim to tell": [each.at_hand_s for each in shares],
         "its training: learning, validating, tracking, checkpoints": [each.training_s for each in shares],
-        "what else a single run does: building, its tracked run, the curve": [each.single_s for each in shares],
-        "the study's, before and after the task": [each.around_s for each in shares],
-        "the study's, within the task": [each.within_s for each in shares],
-        "the study's, between a tell and the worker's next claim": between_s,
-        "the study's, all of it": study_s,
+        "the rest of a single run: building, its tracked run, the curve": [each.single_s for each in shares],
+        "the study, before and after the task": [each.around_s for each in shares],
+        "the study, within the task": [each.within_s for each in shares],
+        "the study, between a tell and the worker's next claim": between_s,
+        "the study, in all": study_s,
         "the same, in % of the trial": [
             100 * own_s / each.at_hand_s for own_s, each in zip(study_s, shares, strict=True)
         ],

@@ -35,7 +35,7 @@ from armscan.sweeps.study.warm_start import initial_trials
 from armscan.sweeps.tasks.attempt import Attempt
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
-from benchmarks.sweeps.compare_sweepers import HYDRA_OPTUNA, environment
+from benchmarks.sweeps.compare_sweepers import HYDRA_OPTUNA, hydra_python
 
 NAME, WITHOUT_END = "search", 10**6
 
@@ -143,7 +143,7 @@ def search_by_hydra(words: Sequence[str], budget_s: float, folder: Path) -> Sear
     study, storage = opened.search.scheduler.study, f"sqlite:///{folder.absolute()}/hydra.db"
     _add_presets(words, opened, optuna.create_study(study_name=NAME, storage=storage))
     (folder / "trained.yaml").write_text(yaml.safe_dump(_hydra_config(opened, folder, storage)))
-    command = [environment(), HYDRA_OPTUNA / "trained.py", "-m", "--config-dir", folder, "--config-name", "trained"]
+    command = [hydra_python(), HYDRA_OPTUNA / "trained.py", "-m", "--config-dir", folder, "--config-name", "trained"]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with (folder / "hydra.log").open("w") as log, subprocess.Popen(command, stderr=log, **pipes) as process:
         for line in process.stdout or ():
