@@ -30,10 +30,10 @@ class Random:
 
 
 class RandomAgent:
-    """Draws planes with `n_free` components."""
+    """Draws planes with `n_action` components."""
 
-    def __init__(self, n_free: int) -> None:
-        self._n_free = n_free
+    def __init__(self, n_action: int) -> None:
+        self._n_action = n_action
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
         """Begin an episode; its planes are drawn from the seed."""
@@ -42,8 +42,8 @@ class RandomAgent:
         self._rng = np.random.default_rng(child)
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
-        """Return the next action, shape (n_free,)."""
-        return self._rng.uniform(-1.0, 1.0, self._n_free)
+        """Return the next action, shape (n_action,)."""
+        return self._rng.uniform(-1.0, 1.0, self._n_action)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +122,7 @@ class ExhaustiveAgent:
         self._n_looked_at = 0
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
-        """Return the next plane, or the best one when all were seen, shape (n_free,)."""
+        """Return the next plane, or the best one when all were seen, shape (n_action,)."""
         # The first reward is the start's, which is none of these planes.
         if 0 < self._n_looked_at <= len(self._planes):
             self._rewards.append(reward)
@@ -132,7 +132,7 @@ class ExhaustiveAgent:
         return np.array(self._planes[chosen])
 
     def planes(self, bounds: ActionBounds) -> FloatArray:
-        """Return all planes in their order, normalised, shape (n_planes, n_free).
+        """Return all planes in their order, normalised, shape (n_planes, n_action).
 
         Raises:
             InvalidValueError: If the steps are so small that there are more than a million.

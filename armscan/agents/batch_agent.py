@@ -24,7 +24,7 @@ class BatchAgent(Protocol):
         """Begin an episode for each seed; see `Agent.begin`."""
 
     def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[np.int64]) -> NDArray[Any]:
-        """Return the next action of some of the episodes, shape (n, n_free); see `Agent.act`.
+        """Return the next action of some of the episodes, shape (n, n_action); see `Agent.act`.
 
         Args:
             observations: Observation of each current plane, shape (n, ...).

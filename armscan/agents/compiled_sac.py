@@ -65,7 +65,7 @@ class CompiledSAC(sac.SAC[Any]):
         self._target_entropy = float(self.alpha._target_entropy) if isinstance(self.alpha, sac.AutoAlpha) else 0.0
         self._sizes = [np.array(layer_sizes(network)) for network in (self.policy.actor, self.critic)]
         actor: Any = self.policy.actor
-        self._n_free = int(actor.output_dim)
+        self._n_action = int(actor.output_dim)
         self._layers: tuple[Layers, Layers] | None = None
 
     def update(self, buffer: ReplayBuffer, sample_size: int | None) -> Any:
@@ -90,7 +90,7 @@ class CompiledSAC(sac.SAC[Any]):
             for start in range(0, n_updates, N_AT_ONCE):
                 part = losses[start : start + N_AT_ONCE]
                 indices = buffer.sample_indices(len(part) * sample_size).reshape(len(part), sample_size)
-                noise = torch.empty(len(part), 2, sample_size, self._n_free)
+                noise = torch.empty(len(part), 2, sample_size, self._n_action)
                 for drawn in noise.flatten(0, 1):
                     drawn.normal_()
                 kernels.update(transitions, indices, noise.numpy(), agent, actor_layers, critic_layers, part)

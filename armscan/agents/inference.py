@@ -69,13 +69,13 @@ class Inference:
             self._generators = [torch.Generator().manual_seed(seed) for seed in seeds]
 
     def action(self, observation: Observed) -> Rows:
-        """Return the action for one observation of the first episode, shape (n_free,)."""
+        """Return the action for one observation of the first episode, shape (n_action,)."""
         batch = observation_of({name: part[None] for name, part in parts_of(observation).items()})
         first: Rows = self.actions(batch, [0])[0]
         return first
 
     def actions(self, observations: Observed, episodes: Sequence[int] | NDArray[np.int64]) -> Rows:
-        """Return an action for each observation of a batch, shape (n, n_free), within [-1, 1].
+        """Return an action for each observation of a batch, shape (n, n_action), within [-1, 1].
 
         Args:
             observations: Observations, shape (n, ...).
@@ -91,7 +91,7 @@ class Inference:
             return actions
 
     def _asked(self, observation: Observed, episode: int) -> torch.Tensor:
-        """Return the action for one observation, shape (n_free,)."""
+        """Return the action for one observation, shape (n_action,)."""
         (means, spreads), _ = self._actor(batch_of([observation]))
         mean, spread = means[0], spreads[0]
         if self._is_sampling:

@@ -78,11 +78,11 @@ class Multimodal:
             n_features += count_features(box, self.filters)
         return n_weights + linear_weights([n_features, *self.head_sizes])
 
-    def actor(self, observation_space: spaces.Space[Any], n_free: int, log_std: float | None) -> Actor:
+    def actor(self, observation_space: spaces.Space[Any], n_action: int, log_std: float | None) -> Actor:
         """See `Network.actor`."""
         from armscan.agents.network_modules import gaussian_actor
 
-        return gaussian_actor(self.body(observation_space), n_free, log_std)
+        return gaussian_actor(self.body(observation_space), n_action, log_std)
 
     def critic(self, observation_space: spaces.Space[Any], n_action: int = 0) -> nn.Module:
         """See `Network.critic`."""

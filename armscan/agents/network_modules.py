@@ -34,9 +34,9 @@ def mlp_critic(body: Net) -> nn.Module:
     return init_linear(ContinuousCritic(preprocess_net=body))
 
 
-def gaussian_actor(body: ModuleWithVectorOutput, n_free: int, log_std: float | None) -> Actor:
+def gaussian_actor(body: ModuleWithVectorOutput, n_action: int, log_std: float | None) -> Actor:
     """Return a Gaussian actor whose actions are near 0 at first; see `Network.actor`."""
-    actor = Actor(preprocess_net=body, action_shape=(n_free,), unbounded=True, conditioned_sigma=log_std is None)
+    actor = Actor(preprocess_net=body, action_shape=(n_action,), unbounded=True, conditioned_sigma=log_std is None)
     if log_std is not None:
         nn.init.constant_(actor.get_parameter("sigma_param"), log_std)
     init_linear(actor)

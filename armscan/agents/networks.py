@@ -37,12 +37,12 @@ class NetworkChoice(Protocol):
 class Network(NetworkChoice, Protocol):
     """A kind of network that can be an actor's and a critic's."""
 
-    def actor(self, observation_space: spaces.Space[Any], n_free: int, log_std: float | None) -> Actor:
+    def actor(self, observation_space: spaces.Space[Any], n_action: int, log_std: float | None) -> Actor:
         """Return a Gaussian actor.
 
         Args:
             observation_space: Space of one observation.
-            n_free: Number of components of an action.
+            n_action: Number of components of an action.
             log_std: Initial logarithm of the standard deviation. None: it depends on the observation.
         """
 
@@ -78,11 +78,11 @@ class MLP:
         check_weights(self, linear_weights([*(observation_space.shape or ()), *self.hidden_sizes]))
         return self
 
-    def actor(self, observation_space: spaces.Space[Any], n_free: int, log_std: float | None) -> Actor:
+    def actor(self, observation_space: spaces.Space[Any], n_action: int, log_std: float | None) -> Actor:
         """See `Network.actor`."""
         from armscan.agents.network_modules import gaussian_actor, mlp_body
 
-        return gaussian_actor(mlp_body(observation_space, self.hidden_sizes, self.activation), n_free, log_std)
+        return gaussian_actor(mlp_body(observation_space, self.hidden_sizes, self.activation), n_action, log_std)
 
     def critic(self, observation_space: spaces.Space[Any], n_action: int = 0) -> nn.Module:
         """See `Network.critic`."""

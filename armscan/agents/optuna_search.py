@@ -71,7 +71,7 @@ class OptunaAgent:
         self._trial: optuna.Trial | None = None
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
-        """Report the reward of the last plane; return the next one, shape (n_free,)."""
+        """Report the reward of the last plane; return the next one, shape (n_action,)."""
         if self._trial is not None:
             self._study.tell(self._trial, reward)
         self._trial = trial = self._study.ask()

@@ -44,7 +44,7 @@ class Policy(nn.Module):
             self.differs = f"the agent has computed with {compute.precision} on {compute.torch_device}"
 
     def forward(self, observations: Batch) -> torch.Tensor:
-        """Return the actions for a batch of observations, shape (n, n_free), within [-1, 1]."""
+        """Return the actions for a batch of observations, shape (n, n_action), within [-1, 1]."""
         (mean, _), _ = self.actor(observations)
         return self._bounded(mean)
 

@@ -35,7 +35,7 @@ class Agent(Protocol):
         """
 
     def act(self, observation: Observed, reward: float) -> NDArray[Any]:
-        """Return the next action, shape (n_free,), within [-1, 1], as it is judged: without exploration.
+        """Return the next action, shape (n_action,), within [-1, 1], as it is judged: without exploration.
 
         Args:
             observation: Observation of the current plane.

@@ -50,10 +50,10 @@ class RegressionLearner(SupervisedLearner):
     ) -> None:
         self._parameters, self._utd_ratio, self._own_planes_share = parameters, utd_ratio, own_planes_share
         prepare_torch(setup.seed)
-        n_free = len(setup.action_names)
-        actor = network.actor(setup.observation_space, n_free, log_std=-0.5)
+        n_action = len(setup.action_names)
+        actor = network.actor(setup.observation_space, n_action, log_std=-0.5)
         super().__init__(actor, parameters.lr, setup.make_envs(parameters.num_envs), setup)
-        self._examples = SupervisedBuffer(size, setup.observation_space, n_free)
+        self._examples = SupervisedBuffer(size, setup.observation_space, n_action)
         self._inference = Inference(self._network, clip_action, setup.compute)
 
     @property
@@ -91,7 +91,7 @@ class RegressionLearner(SupervisedLearner):
         return observations
 
     def _next_planes(self, observations: Observed, rng: np.random.Generator) -> FloatArray:
-        """Draw random planes, or such near its own choice, at distances of every order; shape (n, n_free)."""
+        """Draw random planes, or such near its own choice, at distances of every order; shape (n, n_action)."""
         planes = rng.uniform(-1.0, 1.0, self._envs.action_space.shape or ())
         if not self._own_planes_share:
             return planes
@@ -112,7 +112,7 @@ class RegressionLearner(SupervisedLearner):
         return loss.detach()
 
     def _predicted(self, observations: Observed | Batch) -> torch.Tensor:
-        """Return the predicted optimal actions of a batch, shape (n, n_free), not yet clipped."""
+        """Return the predicted optimal actions of a batch, shape (n, n_action), not yet clipped."""
         (mean, _), _ = self._network(observations)
         return torch.as_tensor(mean)
 
@@ -120,14 +120,14 @@ class RegressionLearner(SupervisedLearner):
         """Begin an episode, in which nothing is drawn."""
 
     def act(self, observation: Observed, reward: float) -> NDArray[np.float32]:
-        """Return the optimal action as predicted from this observation alone, shape (n_free,)."""
+        """Return the optimal action as predicted from this observation alone, shape (n_action,)."""
         return self._inference.action(observation)
 
     def begin_all(self, *, seeds: Sequence[int], bounds: Sequence[ActionBounds]) -> None:
         """Begin episodes, in which nothing is drawn."""
 
     def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the optimal action as predicted from each observation alone, shape (n, n_free)."""
+        """Return the optimal action as predicted from each observation alone, shape (n, n_action)."""
         return self._inference.actions(observations, episodes)
 
     def policy(self) -> Policy:

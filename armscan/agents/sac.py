@@ -111,9 +111,9 @@ class SAC(PolicyParameters):
         from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
 
         envs, device = training_envs(setup, self.num_envs), setup.compute.torch_device
-        space, n_free = setup.observation_space, len(setup.action_names)
-        actor = network.actor(space, n_free, log_std=None)
-        critics = [network.critic(space, n_free).to(device) for _ in range(2)]
+        space, n_action = setup.observation_space, len(setup.action_names)
+        actor = network.actor(space, n_action, log_std=None)
+        critics = [network.critic(space, n_action).to(device) for _ in range(2)]
         policy = sac.SACPolicy(
             actor=actor.to(device),
             deterministic_eval=self.deterministic_eval,
@@ -133,7 +133,7 @@ class SAC(PolicyParameters):
             tau=self.tau,
             gamma=self.gamma,
             alpha=sac.AutoAlpha(
-                self.target_entropy_per_dim * n_free,
+                self.target_entropy_per_dim * n_action,
                 math.log(self.ent_coef_init),
                 AdamOptimizerFactory(lr=self.ent_coef_lr),
             ),

@@ -45,7 +45,7 @@ class Transitions(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """Actions that were drawn, shape (n, n_free) each, but for the logarithms of their probabilities, shape (n,)."""
+    """Actions that were drawn, shape (n, n_action) each, but for the logarithms of their probabilities, shape (n,)."""
 
     log_std: Floats
     std: Floats
@@ -76,15 +76,15 @@ class Agent(NamedTuple):
 @fast_njit
 def _act(actor: Weights, layers: Layers, noise: Floats) -> Drawn:
     """Draw an action for each observation that the first of the actor's layers holds."""
-    n, n_free = noise.shape
-    log_std, std, actions = np.empty((n, n_free), F), np.empty((n, n_free), F), np.empty((n, n_free), F)
+    n, n_action = noise.shape
+    log_std, std, actions = np.empty((n, n_action), F), np.empty((n, n_action), F), np.empty((n, n_action), F)
     log_prob = np.zeros(n, F)
     mean_head = forward(actor.values, layers, n)
     features = layer_view(layers.values, layers.sizes, n, layers.sizes.size - 1)
     std_head = linear(features, actor.values, mean_head, actions, False)
     linear(features, actor.values, std_head, log_std, False)
     for i in range(n):
-        for j in range(n_free):
+        for j in range(n_action):
             log_s = min(max(log_std[i, j], LOG_STD_MIN), LOG_STD_MAX)
             std[i, j] = np.exp(log_s)
             actions[i, j] = np.tanh(actions[i, j] + std[i, j] * noise[i, j])
@@ -137,27 +137,27 @@ def _update_actor(
     agent: Agent, layers: Layers, critic_layers: Layers, noise: Floats, alpha: np.float32
 ) -> tuple[float, float]:
     """Take a gradient step of the actor; returns its loss, and the mean logarithmic probability of its actions."""
-    n, n_free = noise.shape
+    n, n_action = noise.shape
     obs = layer_view(layers.values, layers.sizes, n, 0)
     drawn = _act(agent.actor, layers, noise)
-    values, d_values, d_actions = np.empty((2, n, 1), F), np.ones((n, 1), F), np.empty((2, n, n_free), F)
+    values, d_values, d_actions = np.empty((2, n, 1), F), np.ones((n, 1), F), np.empty((2, n, n_action), F)
     for k in range(2):
         head = _judge(agent.critics[k].values, critic_layers, obs, drawn.actions, values[k])
         _critic_gradient(agent.critics[k], critic_layers, head, d_values, True)
         d_x = layer_view(critic_layers.gradient, critic_layers.sizes, n, 0)
         for i in range(n):
-            for j in range(n_free):
+            for j in range(n_action):
                 d_actions[k, i, j] = d_x[i, obs.shape[1] + j]
 
     loss = mean_log_prob = 0.0
-    d_mean, d_log_std = np.empty((n, n_free), F), np.empty((n, n_free), F)
+    d_mean, d_log_std = np.empty((n, n_action), F), np.empty((n, n_action), F)
     for i in range(n):
         value1, value2 = values[0, i, 0], values[1, i, 0]
         loss += alpha * drawn.log_prob[i] - min(value1, value2)
         mean_log_prob += drawn.log_prob[i]
         # Only the smaller value counts; torch halves the gradient between equal ones.
         share = F(1.0) if value1 < value2 else F(0.5) if value1 == value2 else F(0.0)
-        for j in range(n_free):
+        for j in range(n_action):
             action, log_s = drawn.actions[i, j], drawn.log_std[i, j]
             slope = F(1.0) - action * action
             d_value = share * d_actions[0, i, j] + (F(1.0) - share) * d_actions[1, i, j]
@@ -172,10 +172,10 @@ def _update_actor(
 @fast_njit
 def _actor_gradient(actor: Weights, layers: Layers, d_mean: Floats, d_log_std: Floats) -> None:
     """Fill the gradient of an actor's weights from that of its two heads."""
-    n, n_free, last = d_mean.shape[0], d_mean.shape[1], layers.sizes.size - 1
+    n, n_action, last = d_mean.shape[0], d_mean.shape[1], layers.sizes.size - 1
     features = layer_view(layers.values, layers.sizes, n, last)
     d_features, of_std = layer_view(layers.gradient, layers.sizes, n, last), np.empty_like(features)
-    n_head = n_free * (features.shape[1] + 1)
+    n_head = n_action * (features.shape[1] + 1)
     mean_head, std_head = actor.values.size - 2 * n_head, actor.values.size - n_head
     linear_gradient(features, d_mean, actor.gradient, mean_head)
     linear_gradient(features, d_log_std, actor.gradient, std_head)
@@ -241,7 +241,7 @@ def update(
     Args:
         transitions: All transitions of the replay buffer.
         indices: Indices of the transitions of each batch, shape (k, n).
-        noise: Standard normal noise for the actions after the transitions and before, shape (k, 2, n, n_free).
+        noise: Standard normal noise for the actions after the transitions and before, shape (k, 2, n, n_action).
         agent: Networks and settings.
         actor_layers: Memory for the actor's layers.
         critic_layers: Memory for a critic's layers.

@@ -103,7 +103,7 @@ class StepCollector(Collector[CollectStats]):
 
     @torch.no_grad()
     def _chosen_actions(self, observations: Observed) -> tuple[Actions, Actions]:
-        """Return the policy's actions and their standard deviations, each of shape (n_envs, n_free)."""
+        """Return the policy's actions and their standard deviations, each of shape (n_envs, n_action)."""
         policy: Any = self.policy
         is_sac = type(policy) is SACPolicy
         means_and_spreads = self._means_and_spreads(observations)
@@ -134,7 +134,7 @@ class StepCollector(Collector[CollectStats]):
 
         Args:
             observations: Observations of the current planes.
-            actions: Actions of the policy, which are stored, shape (n_envs, n_free).
+            actions: Actions of the policy, which are stored, shape (n_envs, n_action).
             sent: The same actions in the form that the environments take.
 
         Returns:

@@ -20,21 +20,21 @@ class SupervisedBuffer:
     Args:
         size: Maximum number of observations.
         space: Space of one observation.
-        n_free: Components of an action.
+        n_action: Components of an action.
     """
 
-    def __init__(self, size: int, space: spaces.Space[Any], n_free: int) -> None:
+    def __init__(self, size: int, space: spaces.Space[Any], n_action: int) -> None:
         boxes = boxes_of(space, "agent=regression")
         self._size = size
         self._parts = {name: np.empty((size, *box.shape), box.dtype) for name, box in boxes.items()}
-        self._optima = np.empty((size, n_free), np.float32)
+        self._optima = np.empty((size, n_action), np.float32)
         self._n_added = 0
 
     def __len__(self) -> int:
         return min(self._n_added, self._size)
 
     def add(self, observations: Observed, optima: FloatArray) -> None:
-        """Keep a batch: observations, each part shape (n, ...), and optimal actions, shape (n, n_free)."""
+        """Keep a batch: observations, each part shape (n, ...), and optimal actions, shape (n, n_action)."""
         places = np.arange(self._n_added, self._n_added + len(optima)) % self._size
         for name, part in parts_of(observations).items():
             self._parts[name][places] = part
@@ -42,7 +42,7 @@ class SupervisedBuffer:
         self._n_added += len(optima)
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[Observed, NDArray[np.float32]]:
-        """Return `n` observations and their optimal actions, shape (n, n_free), drawn with replacement."""
+        """Return `n` observations and their optimal actions, shape (n, n_action), drawn with replacement."""
         places = rng.integers(len(self), size=n)
         return observation_of({name: part[places] for name, part in self._parts.items()}), self._optima[places]
 

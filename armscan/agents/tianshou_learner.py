@@ -170,7 +170,7 @@ class TianshouLearner(BaseLearner):
         self._inference.begin([seed])
 
     def act(self, observation: Observed, reward: float) -> NDArray[np.float32]:
-        """Return the policy's action, shape (n_free,)."""
+        """Return the policy's action, shape (n_action,)."""
         return self._inference.action(observation)
 
     def begin_all(self, *, seeds: Sequence[int], bounds: Sequence[ActionBounds]) -> None:
@@ -178,7 +178,7 @@ class TianshouLearner(BaseLearner):
         self._inference.begin(seeds)
 
     def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the policy's action in each episode, shape (n, n_free)."""
+        """Return the policy's action in each episode, shape (n, n_action)."""
         return self._inference.actions(observations, episodes)
 
     def policy(self) -> Policy:

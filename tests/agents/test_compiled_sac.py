@@ -29,7 +29,7 @@ pytestmark = pytest.mark.xdist_group("compiled_sac")
 N_ENVS, N_STEPS = 3, 40
 
 
-def filled_replay(n_obs, n_free, kind=Replay, **arguments):
+def filled_replay(n_obs, n_action, kind=Replay, **arguments):
     """Return a buffer whose rings are filled to different lengths, with rewards and ends."""
     rng = np.random.default_rng(4)
     replay = kind(N_ENVS * N_STEPS, N_ENVS, **arguments)
@@ -40,7 +40,7 @@ def filled_replay(n_obs, n_free, kind=Replay, **arguments):
             Batch(
                 obs=rng.normal(size=shape).astype(np.float32),
                 obs_next=rng.normal(size=shape).astype(np.float32),
-                act=rng.uniform(-1, 1, (len(ids), n_free)).astype(np.float32),
+                act=rng.uniform(-1, 1, (len(ids), n_action)).astype(np.float32),
                 rew=rng.normal(size=len(ids)),
                 terminated=rng.random(len(ids)) < 0.2,
                 truncated=rng.random(len(ids)) < 0.1,
@@ -51,23 +51,23 @@ def filled_replay(n_obs, n_free, kind=Replay, **arguments):
     return replay
 
 
-def algorithm(kind, *, n_obs=5, n_free=2, hidden_sizes=(16, 16), activation="relu", alpha=None, **arguments):
+def algorithm(kind, *, n_obs=5, n_action=2, hidden_sizes=(16, 16), activation="relu", alpha=None, **arguments):
     torch.manual_seed(0)
     space, network = spaces.Box(-10, 10, (n_obs,)), MLP(hidden_sizes, activation)
     policy = sac.SACPolicy(
-        actor=network.actor(space, n_free, log_std=None),
-        action_space=spaces.Box(-1, 1, (n_free,)),
+        actor=network.actor(space, n_action, log_std=None),
+        action_space=spaces.Box(-1, 1, (n_action,)),
         observation_space=space,
     )
     return kind(
         policy=policy,
         policy_optim=arguments.pop("policy_optim", AdamOptimizerFactory(lr=1e-3)),
-        critic=network.critic(space, n_free),
+        critic=network.critic(space, n_action),
         critic_optim=AdamOptimizerFactory(lr=2e-3),
-        critic2=network.critic(space, n_free),
+        critic2=network.critic(space, n_action),
         tau=0.01,
         gamma=0.9,
-        alpha=alpha or sac.AutoAlpha(-float(n_free), math.log(0.1), AdamOptimizerFactory(lr=1e-2)),
+        alpha=alpha or sac.AutoAlpha(-float(n_action), math.log(0.1), AdamOptimizerFactory(lr=1e-2)),
         **arguments,
     )
 
@@ -110,7 +110,7 @@ def entropy_state(each):
 
 
 @pytest.mark.parametrize(
-    ("hidden_sizes", "n_obs", "n_free", "batch_size", "alpha"),
+    ("hidden_sizes", "n_obs", "n_action", "batch_size", "alpha"),
     [
         ([16, 16], 5, 2, 32, None),
         ([16, 16], 5, 2, 32, 0.2),
@@ -121,9 +121,9 @@ def entropy_state(each):
         ([1], 3, 2, 16, 0.05),
     ],
 )
-def test_compiled_updates_agree_with_those_of_tianshou(hidden_sizes, n_obs, n_free, batch_size, alpha):
-    shape = {"hidden_sizes": hidden_sizes, "n_obs": n_obs, "n_free": n_free, "alpha": alpha}
-    replay = filled_replay(n_obs, n_free)
+def test_compiled_updates_agree_with_those_of_tianshou(hidden_sizes, n_obs, n_action, batch_size, alpha):
+    shape = {"hidden_sizes": hidden_sizes, "n_obs": n_obs, "n_action": n_action, "alpha": alpha}
+    replay = filled_replay(n_obs, n_action)
     ours, theirs = compiled(replay, **shape), algorithm(sac.SAC, **shape)
     assert ours.why_tianshou is None
     for seed in range(10):
@@ -140,7 +140,7 @@ def test_compiled_updates_agree_with_those_of_tianshou(hidden_sizes, n_obs, n_fr
 
 
 def test_hundred_updates_at_the_default_size_agree_with_those_of_tianshou():
-    shape = {"hidden_sizes": [64, 64], "n_obs": 14, "n_free": 1}
+    shape = {"hidden_sizes": [64, 64], "n_obs": 14, "n_action": 1}
     replay = filled_replay(14, 1)
     ours, theirs = compiled(replay, **shape), algorithm(sac.SAC, **shape)
     for each in (ours, theirs):
@@ -168,7 +168,7 @@ from tests.agents.test_compiled_sac import *
 # The weights to begin with come from LAPACK, which a learner has on one thread.
 torch.set_num_threads(1)
 replay = filled_replay(14, 1)
-ours = compiled(replay, hidden_sizes=[64, 64], n_obs=14, n_free=1)
+ours = compiled(replay, hidden_sizes=[64, 64], n_obs=14, n_action=1)
 torch.set_num_threads(int(sys.argv[1]))
 updated(ours, replay, 20, batch_size=256, at_once=4)
 print(digest(ours))

@@ -17,9 +17,9 @@ BOUNDS = ActionBounds((90.0, 45.0), (97.2, 216.0))
 NAMES = ("rz", "rx", "tx", "ty")
 
 
-def agent_of(algorithm, phantom, n_free):
+def agent_of(algorithm, phantom, n_action):
     env_factory, _ = ENV_FACTORIES["vector"]
-    return algorithm.agent(setup_for(env_factory, phantom, action_names=NAMES[:n_free]))
+    return algorithm.agent(setup_for(env_factory, phantom, action_names=NAMES[:n_action]))
 
 
 def played(agent, n_planes, seed, optimum=0.3):
@@ -32,13 +32,13 @@ def played(agent, n_planes, seed, optimum=0.3):
     return np.array(planes), rewards[1:]
 
 
-@pytest.mark.parametrize("n_free", [1, 2, 4])
+@pytest.mark.parametrize("n_action", [1, 2, 4])
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_search_repeats_an_episode_and_stays_within_bounds(phantom, sampler, n_free):
-    agent = agent_of(OptunaSearch(sampler=sampler), phantom, n_free)
+def test_search_repeats_an_episode_and_stays_within_bounds(phantom, sampler, n_action):
+    agent = agent_of(OptunaSearch(sampler=sampler), phantom, n_action)
     assert not isinstance(agent, Learner)
     planes, _ = played(agent, 14, seed=3_000_000)
-    assert planes.shape == (14, n_free)
+    assert planes.shape == (14, n_action)
     assert np.abs(planes).max() <= 1.0
     other, _ = played(agent, 14, seed=3_000_001)
     assert not np.array_equal(other, planes)
@@ -48,12 +48,12 @@ def test_search_repeats_an_episode_and_stays_within_bounds(phantom, sampler, n_f
 @pytest.mark.parametrize(
     ("sampler", "n_episodes"), [("tpe", 20), ("cmaes", 20), pytest.param("gp", 2, marks=pytest.mark.full)]
 )
-@pytest.mark.parametrize("n_free", [1, 2])
-def test_search_beats_random_planes_where_the_reward_is_smooth(phantom, sampler, n_episodes, n_free):
+@pytest.mark.parametrize("n_action", [1, 2])
+def test_search_beats_random_planes_where_the_reward_is_smooth(phantom, sampler, n_episodes, n_action):
     # The later planes show whether the search has learned from the first ones, with one component as with two.
     last = {}
     for name, algorithm in (("search", OptunaSearch(sampler=sampler)), ("random", Random())):
-        agent = agent_of(algorithm, phantom, n_free)
+        agent = agent_of(algorithm, phantom, n_action)
         last[name] = np.mean([np.mean(played(agent, 30, seed)[1][20:]) for seed in range(n_episodes)])
     assert last["search"] > last["random"] / 2
 
