@@ -70,7 +70,7 @@ def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[str, Choice
     axes.set_xscale("log")
     axes.set_xlabel("trainings of the choice")
     axes.set_ylabel("mean steps above the best candidate")
-    axes.set_ylim(bottom=0)
+    axes.set_yscale("log")
     axes.set_title(title)
     axes.grid(alpha=0.3, which="both")
     # Below, because it would hide the races.

@@ -48,7 +48,7 @@ def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, pi
         raced = choices_of(candidates, RACES)
         races[top_k] = fixed, raced
         _print_races(top_k, fixed, compare(fixed, raced))
-    studies = studies_of(surrogate, control, sweep, rules(), n_studies=n_studies, n_trainings=n_trainings)
+    studies = studies_of(surrogate, sweep, rules(), n_studies=n_studies, n_trainings=n_trainings)
     ranks = ranked(studies)
     _print_ranks(ranks)
     if picture is not None:

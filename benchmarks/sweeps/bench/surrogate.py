@@ -167,7 +167,15 @@ class SimulatedConfig:
     @property
     def truth(self) -> float:
         """The mean steps on the test volumes over all trainings that could be drawn."""
-        logs = self.mean[-1] + self.surrogate.residuals[:, -1]
+        return self._truth_of(-1)
+
+    @property
+    def selection_truth(self) -> float:
+        """The same in the selection, on the validation volumes."""
+        return self._truth_of(-2)
+
+    def _truth_of(self, part: int) -> float:
+        logs = self.mean[part] + self.surrogate.residuals[:, part]
         return float(np.exp(logs.clip(*self.surrogate.bounds)) @ self.shares)
 
 
