@@ -12,17 +12,17 @@ import pandas as pd
 from armscan.stats.aggregation import band_over_seeds, probability_of_improvement
 from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.replay import Rule, choose, scores_of, search
-from benchmarks.sweeps.bench.surrogate import Surrogate
+from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "halving")
 # The Gaussian process takes a hundred times longer than others to propose a trial: a tenth of the studies, none of few.
 SLOW, FEWEST_STUDIES = ("gp",), 10
 # What all are compared with.
 REFERENCE = Rule("random", "none")
-# Candidates of the final evaluation, and the fewest and most seeds of each. The control is left out: chosen in place of
-# bad candidates, it would hide what a sampler finds.
+# Candidates of the final evaluation; the fewest and most seeds of each, and whether the control races beside them.
+# Rules are ranked without it: chosen in place of bad candidates, it hides what a sampler finds.
 TOP_K = 3
-FINALS = {"fixed": (5, 5), "race": (3, 8)}
+FINALS = {"fixed": (5, 5, False), "race": (3, 8, False), "control": (3, 8, True)}
 
 
 def rules() -> Iterator[Rule]:
@@ -34,12 +34,19 @@ def rules() -> Iterator[Rule]:
 
 
 def studies_of(
-    surrogate: Surrogate, sweep: str, compared: Iterable[Rule], *, n_studies: int, n_trainings: int
+    surrogate: Surrogate,
+    control: SimulatedConfig,
+    sweep: str,
+    compared: Iterable[Rule],
+    *,
+    n_studies: int,
+    n_trainings: int,
 ) -> pd.DataFrame:
     """Simulate studies, each with the same budget of environment steps in its search.
 
     Args:
         surrogate: Simulates the trainings.
+        control: The default configuration.
         sweep: Name of the sweep.
         compared: Rules of the studies.
         n_studies: Studies of each rule; a tenth of them with a slow sampler, none where that is fewer than ten.
@@ -57,10 +64,11 @@ def studies_of(
             found = search(surrogate, sweep, rule, n_trainings=n_trainings, seed=number)
             tops = [candidate.config for candidate in found.candidates[:TOP_K]]
             row = {**vars(rule), "study": number, "n_trials": found.n_trials, "search": tops[0].truth - best}
-            scores = scores_of(tops, max(high for _, high in FINALS.values()), np.random.default_rng(number))
-            for name, (low, high) in FINALS.items():
-                chosen = choose(scores, min_seeds=low, max_seeds=high)
-                row |= {name: tops[chosen.place].truth - best, f"{name}_trainings": chosen.n_trainings}
+            racing = [*tops, control]
+            scores = scores_of(racing, max(high for _, high, _ in FINALS.values()), np.random.default_rng(number))
+            for name, (low, high, has_control) in FINALS.items():
+                chosen = choose(scores if has_control else scores[:-1], min_seeds=low, max_seeds=high)
+                row |= {name: racing[chosen.place].truth - best, f"{name}_trainings": chosen.n_trainings}
             rows.append(row)
         print(f"{rule}: simulated", file=sys.stderr, flush=True)
     return pd.DataFrame(rows)

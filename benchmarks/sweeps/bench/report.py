@@ -48,7 +48,7 @@ def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, pi
         raced = choices_of(candidates, RACES)
         races[top_k] = fixed, raced
         _print_races(top_k, fixed, compare(fixed, raced))
-    studies = studies_of(surrogate, sweep, rules(), n_studies=n_studies, n_trainings=n_trainings)
+    studies = studies_of(surrogate, control, sweep, rules(), n_studies=n_studies, n_trainings=n_trainings)
     ranks = ranked(studies)
     _print_ranks(ranks)
     if picture is not None:
@@ -133,6 +133,7 @@ def _print_ranks(ranks: pd.DataFrame) -> None:
             f"{row.sampler}, {row.pruner}" + (f", {row.n_seeds} seeds" if row.n_seeds > 1 else ""),
             with_interval((row.regret, row.low, row.high)),
             f"{row.fixed:.3f}",
+            f"{row.control:.3f}",
             f"{row.search:.3f}",
             f"{row.race_trainings:.1f}, {row.fixed_trainings:.0f}",
             f"{row.n_trials:.0f}",
@@ -141,5 +142,13 @@ def _print_ranks(ranks: pd.DataFrame) -> None:
         )
         for row in ranks.itertuples()
     ]
-    head = ["sampler, pruner", "regret, race", "fixed", "search alone", "trainings: race, fixed", "trials"]
+    head = [
+        "sampler, pruner",
+        "regret, race",
+        "fixed",
+        "race with the control",
+        "search alone",
+        "trainings: race, fixed",
+        "trials",
+    ]
     print(f"\n{markdown([*head, 'better than random, none', 'studies'], rows)}", flush=True)
