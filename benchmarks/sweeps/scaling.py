@@ -85,10 +85,14 @@ class NoStore:
 
 def reporting(attempt: Attempt) -> dict[str, float]:
     """Report as a trial does, and do nothing else."""
-    total = N_REPORTS * STEPS_A_REPORT
     for part in range(1, N_REPORTS + 1):
-        at = {"n_env_steps": part * STEPS_A_REPORT, "grid": STEPS_A_REPORT, "total": total}
-        attempt.report({"mean_steps": 1.0 / part}, seed=0, **at)
+        attempt.report(
+            {"mean_steps": 1.0 / part},
+            seed=0,
+            n_env_steps=part * STEPS_A_REPORT,
+            report_every_env_steps=STEPS_A_REPORT,
+            total_env_steps=N_REPORTS * STEPS_A_REPORT,
+        )
     return {"mean_steps": 1.0}
 
 

@@ -34,8 +34,13 @@ class Sleeping:
         value = float(config.agent.lr)
 
         def report(part: int) -> None:
-            at = {"n_env_steps": part * STEPS_A_PART, "grid": STEPS_A_PART, "total": N_PARTS * STEPS_A_PART}
-            attempt.report({"mean_steps": value, "mean_return": -value}, seed=seed, **at)
+            attempt.report(
+                {"mean_steps": value, "mean_return": -value},
+                seed=seed,
+                n_env_steps=part * STEPS_A_PART,
+                report_every_env_steps=STEPS_A_PART,
+                total_env_steps=N_PARTS * STEPS_A_PART,
+            )
 
         waited = wait(attempt.trial.number, self._shortest_s, self._longest_s, report)
         return {"mean_steps": value, **waited._asdict()}
