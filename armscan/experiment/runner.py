@@ -116,8 +116,8 @@ def run_tracked(
         tell(f"playing {setup.n_episodes} episodes on the training volumes, and as many on the test volumes")
         reached = RunResult.of(setup, result)
         if job_label is None:
-            policy = f"{how} policy, " if how else ""
-            origin = f"{policy}as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
+            policy = f"{how} policy" if how else "policy"
+            origin = f"{policy}, as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
             print_results(f"results ({origin})", reached)
         tell("writing the results, the video of an episode, and the policy")
         record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)

@@ -142,7 +142,7 @@ def _check(folder: Path, policy: Policy, played: list[tuple[Observed, FloatArray
 
 
 def onnx_answers(file: Path, arrays: Arrays) -> NDArray[np.float32]:
-    """Return the actions of onnxruntime for a batch of observations, shape (n, n_free)."""
+    """Return the actions of onnxruntime for a batch of observations, shape (n, n_action)."""
     # Deferred: few commands need it.
     import onnxruntime
 

@@ -23,7 +23,7 @@ class PyfuncPolicy(PythonModel):
         model_input: np.ndarray,
         params: dict[str, Any] | None = None,
     ) -> NDArray[np.float32]:
-        """Return the actions, shape (n, n_free), within [-1, 1]."""
+        """Return the actions, shape (n, n_action), within [-1, 1]."""
         with torch.no_grad():
             if isinstance(model_input, dict):
                 actions = self._policy({name: _tensor(part) for name, part in model_input.items()})

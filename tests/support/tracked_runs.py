@@ -27,14 +27,14 @@ class Guesser:
     """A baseline: an algorithm and its agent, which draws planes."""
 
     def agent(self, setup):
-        self._n_free = len(setup.action_names)
+        self._n_action = len(setup.action_names)
         return self
 
     def begin(self, *, seed, bounds):
         self._rng = np.random.default_rng(seed)
 
     def act(self, observation, reward):
-        return self._rng.uniform(-1, 1, self._n_free)
+        return self._rng.uniform(-1, 1, self._n_action)
 
 
 class GuesserOfAnything(Guesser):

@@ -21,7 +21,6 @@ from armscan.utils.markdown import markdown_table
 LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
 # Of the note that was left at a study.
 NOTE_SUM = "note_sha256"
-# Before the metrics of a final training on the test volumes.
 
 
 def note_run(

@@ -174,7 +174,7 @@ class FinalEvaluation:
 
     @property
     def is_over(self) -> bool:
-        """Whether a configuration was chosen, and all trainings of the judgement have begun."""
+        """Whether the selection has ended, with or without a choice, and all trainings of the judgement have begun."""
         return self.race().is_over and not self.missing_of_judgement()
 
     def judged(self) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -15,10 +16,10 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from armscan.errors import printable
-from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
-from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings
+from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, training_of
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.warm_start import InitialTrials
 from armscan.utils.console import WHOLE_CHARS, wide_console
@@ -83,7 +84,7 @@ def _print_cost(
     # Final trainings are never pruned.
     whole_s = [spent_s for trial, spent_s in timed if trial.state == TrialState.COMPLETE]
     training_s = fmean(whole_s or seconds) / len(settings.seeds)
-    fewest, most = final_trainings_left(settings, final)
+    fewest, most = final_trainings_left(settings, final, n_left=n_left)
     hours = [(n_left * mean_s + n * training_s) / settings.workers / 3600 for n in (fewest, most)]
     console.print(
         f"cost       {sum(seconds) / 3600:.2f} hours of workers, {state.busy_hours:.2f} hours in all, "
@@ -95,15 +96,24 @@ def _print_cost(
     )
 
 
-def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None) -> tuple[int, int]:
-    """Return the fewest and the most final trainings that are left."""
+def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None, *, n_left: int) -> tuple[int, int]:
+    """Return the fewest and the most final trainings that are left.
+
+    Args:
+        settings: Settings of the study, which may have changed since the final evaluation was begun.
+        final: The final evaluation; None if it has not been started.
+        n_left: Trials of the search that are left: they may change the candidates.
+    """
     fewest, most = n_trainings(settings.final_eval)
-    if final is None:
+    if final is None or n_left:
         return fewest, most
-    if final.is_over:
-        return 0, 0
-    finals = final.selection, final.judgement
-    n_done = sum(len(each.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) for each in finals)
+    final = replace(final, settings=settings.final_eval)
+    race, complete = final.race(), final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    wanted = {(number, seed) for number in final.judged() or [CONTROL] for seed in final.judge_seeds}
+    n_judged = len(wanted & set(map(training_of, complete)))
+    if race.is_over:
+        return len(wanted) - n_judged, len(wanted) - n_judged
+    n_done = n_judged + sum(map(len, final.scores().values()))
     return max(0, fewest - n_done), max(0, most - n_done)
 
 

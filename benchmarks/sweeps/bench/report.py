@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
+from math import floor, isfinite
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,8 @@ def _print_table(curves: Curves, surrogate: Surrogate) -> None:
 def _print_power(power: pd.DataFrame) -> None:
     needed = needed_seeds(power)
     rows = [
-        (f"{difference:.0%}", *(f"{share:.0%}" for share in row), needed.get(float(difference), "") or "more")
+        # Rounded down, so that no share reads as enough that is not.
+        (f"{difference:.0%}", *(f"{floor(100 * share)}%" for share in row), needed.get(float(difference), "") or "more")
         for difference, row in power.iterrows()
     ]
     print(f"\n{markdown(['difference', *power.columns, 'seeds for 80 %'], rows)}", flush=True)

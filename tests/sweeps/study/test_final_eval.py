@@ -179,10 +179,17 @@ def test_control_that_was_judged_before_the_chosen_configuration_is_not_its_resu
 def test_plan_counts_the_final_trainings_that_are_left(storage_uri):
     final, (selection, _) = opened(storage_uri)
     settings = searched(storage_uri)[1]
-    fewest, most = final_trainings_left(settings, None)
+    fewest, most = final_trainings_left(settings, None, n_left=0)
     end(selection, selection.claim({}), TRUE)
-    assert final_trainings_left(settings, final) == (fewest - 1, most - 1)
-    assert final_trainings_left(settings, run(storage_uri)) == (0, 0)
+    assert final_trainings_left(settings, final, n_left=0) == (fewest - 1, most - 1)
+    final = run(storage_uri)
+    assert final_trainings_left(settings, final, n_left=0) == (0, 0)
+    # Further trials may change the candidates.
+    assert final_trainings_left(settings, final, n_left=1) == (fewest, most)
+    more = settings.model_copy(
+        update={"final_eval": settings.final_eval.model_copy(update={"judge_seeds": len(final.judge_seeds) + 2})}
+    )
+    assert final_trainings_left(more, final, n_left=0) == (4, 4)
 
 
 def test_control_that_is_the_best_is_the_result(storage_uri):
