@@ -6,7 +6,7 @@
                                         what both find with the same processor time, by real trainings
     python -m benchmarks.sweeps idle [folder=FOLDER] [trials=60] [shortest_s=1] [longest_s=5]
                                         the same of armscan alone, with trials that are over soon
-    python -m benchmarks.sweeps beside [folder=FOLDER] [trials=4]
+    python -m benchmarks.sweeps beside [folder=FOLDER] [trials=10]
                                         what a study adds to a training of a minute
     python -m benchmarks.sweeps kill [folder=FOLDER] [trials=200] [every_s=20] [storage=journal]
                                         200 trials, workers killed, the storage (or sqlite, postgresql) away twice

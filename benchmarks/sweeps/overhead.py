@@ -35,6 +35,8 @@ TRAINING = (
         "study.task._target_=benchmarks.sweeps.overhead.TimedTraining",
         f"study.workers={N_WORKERS}",
         "training.env_steps=20000",
+        # Of a trial that was pruned nothing is known.
+        "study/pruner=none",
     ),
     *("agent.utd_ratio=0.4", "agent.batch_size=128", "+study.sampler.n_startup_trials=1"),
 )
@@ -103,8 +105,8 @@ class Shares:
         return self.training_s + self.single_s + self.around_s + self.within_s
 
 
-def beside(folder: Path, *, trials: int = 4) -> None:
-    """Train, and print what the study took of each trial; of more than five some would be pruned."""
+def beside(folder: Path, *, trials: int = 10) -> None:
+    """Train, and print what the study took of each trial."""
     workers = by_worker(finish(folder, *TRAINING, f"study.n_trials={trials}")).values()
     shares = [Shares.of(trial) for of_worker in workers for trial in of_worker]
     between_s = [
