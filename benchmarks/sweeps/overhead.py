@@ -35,7 +35,7 @@ TRAINING = (
         "study.task._target_=benchmarks.sweeps.overhead.TimedTraining",
         f"study.workers={N_WORKERS}",
         "training.env_steps=20000",
-        # Of a trial that was pruned nothing is known.
+        # A pruned trial keeps no metrics.
         "study/pruner=none",
     ),
     *("agent.utd_ratio=0.4", "agent.batch_size=128", "+study.sampler.n_startup_trials=1"),

@@ -16,7 +16,7 @@ from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
 from armscan.sweeps.results.summary import ConfigResult, final_results, final_table, scores_of
-from armscan.sweeps.scheduling.state import CONTROL, METRICS, TEST_PREFIX
+from armscan.sweeps.scheduling.state import CONTROL, METRICS, TEST_PREFIX, metrics_of_test
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, name_of, settings_of, training_of
 from armscan.sweeps.study.study import OBJECTIVES, best_trials
@@ -217,7 +217,7 @@ def _differences(
     """Yield the differences of the metrics that all trainings have; both have the same seeds, in order."""
     metrics = [trial.user_attrs[METRICS] for trial in (*chosen, *control)]
     common = set.intersection(*map(set, metrics))
-    tested = [name.removeprefix(TEST_PREFIX) for name in metrics[0] if name in common and name.startswith(TEST_PREFIX)]
+    tested = [name for name in metrics_of_test(metrics[0]) if TEST_PREFIX + name in common]
     objectives = search.user_attrs[OBJECTIVES]
     # First what the configuration was selected by.
     for name in dict.fromkeys((*(name for name in objectives if name in tested), *leading_among(tested))):
