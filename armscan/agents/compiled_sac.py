@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,7 +88,8 @@ class CompiledSAC(sac.SAC[Any]):
         transitions = kernels.Transitions(buffer.obs, buffer.obs_next, buffer.act, buffer.rew, buffer.terminated)
         losses = np.empty((n_updates, 5))
         agent, (actor_layers, critic_layers) = self._agent(), self._layers_for(sample_size)
-        with _blas().limit(limits=1), compilation_told(COMPILING, lambda dispatcher: dispatcher is kernels.update):
+        compiling_is_told = compilation_told(COMPILING, lambda dispatcher: dispatcher is kernels.update)
+        with _blas().limit(limits=1), _flushed_denormals(), compiling_is_told:
             for start in range(0, n_updates, N_AT_ONCE):
                 part = losses[start : start + N_AT_ONCE]
                 indices = buffer.sample_indices(len(part) * sample_size).reshape(len(part), sample_size)
@@ -172,6 +175,16 @@ def _blas() -> ThreadpoolController:
     # Its BLAS is the one that numba calls.
     importlib.import_module("scipy.linalg.cython_blas")
     return ThreadpoolController().select(user_api="blas")
+
+
+@contextlib.contextmanager
+def _flushed_denormals() -> Iterator[None]:
+    """Let the processor flush denormal numbers to 0; Adam's averages for dead units become denormal, which is slow."""
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
 
 
 def _is_plain(optimiser: Any) -> bool:

@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from llvmlite.binding import get_host_cpu_features
 from numpy.typing import NDArray
 
 from armscan.utils.compilation import cached_njit
@@ -17,6 +18,10 @@ from armscan.utils.compilation import cached_njit
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 F = np.float32
+# For products of at most so many multiplications, OpenBLAS has faster kernels, if the processor has AVX-512.
+N_SMALL = 10**6 if get_host_cpu_features().get("avx512f") else 0
+# Rows that are multiplied at once where that makes a product small.
+N_ROWS = 64
 # Arrays are copied by loops: at an assignment to a slice, Numba compiles the text of its shape error, for two seconds.
 # Sums may be reordered, so that loops over them are vectorised. NaN stays NaN: a training that diverges must show it.
 fast_njit = cached_njit(
@@ -59,11 +64,24 @@ def layer_view(values: Floats, sizes: Ints, n_rows: int, which: int) -> Floats:
 
 
 @fast_njit
+def product(a: Floats, b: Floats, out: Floats) -> None:
+    """Fill `out` with the product of two matrices, by parts if that makes them small."""
+    n_rows = N_ROWS if N_ROWS * b.size <= N_SMALL else a.shape[0]
+    for start in range(0, a.shape[0], n_rows):
+        np.dot(a[start : start + n_rows], b, out[start : start + n_rows])
+
+
+@fast_njit
 def linear(x: Floats, weights: Floats, start: int, out: Floats, is_hidden: bool) -> int:
     """Fill a layer's values, of a hidden one after ReLU; returns where the next layer's weights start."""
     n_out: int = out.shape[1]
     end: int = start + n_out * x.shape[1]
-    np.dot(x, weights[start:end].reshape(n_out, x.shape[1]).T, out)
+    columns = weights[start:end].reshape(n_out, x.shape[1]).T
+    if N_ROWS * columns.size <= N_SMALL:
+        # Small kernels read transposed weights slowly.
+        product(x, np.ascontiguousarray(columns), out)
+    else:
+        np.dot(x, columns, out)
     bias = weights[end : end + n_out]
     for i in range(out.shape[0]):
         for j in range(n_out):
@@ -88,7 +106,7 @@ def linear_gradient(x: Floats, d_out: Floats, gradient: Floats, start: int) -> N
 def input_gradient(d_out: Floats, weights: Floats, start: int, d_x: Floats) -> None:
     """Fill the gradient of a layer's input."""
     n_out, n_in = d_out.shape[1], d_x.shape[1]
-    np.dot(d_out, weights[start : start + n_out * n_in].reshape(n_out, n_in), d_x)
+    product(d_out, weights[start : start + n_out * n_in].reshape(n_out, n_in), d_x)
 
 
 @fast_njit

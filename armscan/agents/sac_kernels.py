@@ -94,13 +94,21 @@ def _act(actor: Weights, layers: Layers, noise: Floats) -> Drawn:
 
 
 @fast_njit
-def _judge(critic: Floats, layers: Layers, obs: Floats, actions: Floats, values: Floats) -> int:
-    """Fill a critic's values, shape (n, 1); returns where the weights of its head start."""
+def _fill_input(layers: Layers, obs: Floats, actions: Floats) -> None:
+    """Fill the first of the critics' layers."""
     n, n_obs = obs.shape
     x = layer_view(layers.values, layers.sizes, n, 0)
     for i in range(n):
-        for j in range(x.shape[1]):
-            x[i, j] = obs[i, j] if j < n_obs else actions[i, j - n_obs]
+        for j in range(n_obs):
+            x[i, j] = obs[i, j]
+        for j in range(n_obs, x.shape[1]):
+            x[i, j] = actions[i, j - n_obs]
+
+
+@fast_njit
+def _judge(critic: Floats, layers: Layers, values: Floats) -> int:
+    """Fill a critic's values, shape (n, 1); returns where the weights of its head start."""
+    n: int = values.shape[0]
     head: int = forward(critic, layers, n)
     linear(layer_view(layers.values, layers.sizes, n, layers.sizes.size - 1), critic, head, values, False)
     return head
@@ -117,11 +125,11 @@ def _critic_gradient(critic: Weights, layers: Layers, head: int, d_values: Float
 
 
 @fast_njit
-def _update_critic(critic: Weights, layers: Layers, adam: Adam, obs: Floats, actions: Floats, returns: Floats) -> float:
+def _update_critic(critic: Weights, layers: Layers, adam: Adam, returns: Floats) -> float:
     """Take a gradient step of a critic; returns its loss."""
     n = returns.size
     values, d_values = np.empty((n, 1), F), np.empty((n, 1), F)
-    head = _judge(critic.values, layers, obs, actions, values)
+    head = _judge(critic.values, layers, values)
     loss = 0.0
     for i in range(n):
         error = values[i, 0] - returns[i]
@@ -141,8 +149,9 @@ def _update_actor(
     obs = layer_view(layers.values, layers.sizes, n, 0)
     drawn = _act(agent.actor, layers, noise)
     values, d_values, d_actions = np.empty((2, n, 1), F), np.ones((n, 1), F), np.empty((2, n, n_action), F)
+    _fill_input(critic_layers, obs, drawn.actions)
     for k in range(2):
-        head = _judge(agent.critics[k].values, critic_layers, obs, drawn.actions, values[k])
+        head = _judge(agent.critics[k].values, critic_layers, values[k])
         _critic_gradient(agent.critics[k], critic_layers, head, d_values, True)
         d_x = layer_view(critic_layers.gradient, critic_layers.sizes, n, 0)
         for i in range(n):
@@ -209,8 +218,9 @@ def _returns(
 ) -> Floats:
     """Return the critics' targets for a batch, from the actions drawn after it."""
     values, returns = np.empty((2, index.size, 1), F), np.empty(index.size, F)
+    _fill_input(layers, obs_next, drawn.actions)
     for k in range(2):
-        _judge(agent.targets[k], layers, obs_next, drawn.actions, values[k])
+        _judge(agent.targets[k], layers, values[k])
     for i in range(index.size):
         future = min(values[0, i, 0], values[1, i, 0]) - alpha * drawn.log_prob[i]
         is_over = transitions.terminated[index[i]]
@@ -257,10 +267,9 @@ def update(
         returns = _returns(transitions, index, obs, drawn, agent, critic_layers, alpha)
         _take(transitions.obs, index, obs)
         _take(transitions.act, index, actions)
+        _fill_input(critic_layers, obs, actions)
         for k in range(2):
-            losses[step, 1 + k] = _update_critic(
-                agent.critics[k], critic_layers, agent.adams[1 + k], obs, actions, returns
-            )
+            losses[step, 1 + k] = _update_critic(agent.critics[k], critic_layers, agent.adams[1 + k], returns)
         losses[step, 0], mean_log_prob = _update_actor(agent, actor_layers, critic_layers, noise[step, 1], alpha)
         losses[step, 3] = _update_coefficient(agent.entropy, mean_log_prob)
         losses[step, 4] = np.exp(agent.entropy.log_alpha.values[0])

@@ -1,40 +1,92 @@
-"""Measure the processor time of a compiled gradient step of SAC beside Tianshou's own.
+"""Measure the processor time of a compiled gradient step of SAC beside Tianshou's own, in turn in one run.
 
-    python -m benchmarks.speed.compiled_update [ROUNDS]
+    python -m benchmarks.speed.compiled_update [--before CHECKOUT] [--rounds N]
 
-Both learn from one replay buffer of random steps on phantoms, batches of 256, in turn in one process on one thread;
-the figures to quote are the ratios, medians over the rounds (default: 15). As many steps are taken at once as after a
-collection with the values of `agent=sac`.
+Both learn from the same random steps on phantoms, batches of 256, each in a process of its own, on one thread.
+Tianshou's step is taken with the code of the checkout, or else with this one. The figures to quote are the ratios,
+medians over the rounds. A call takes as many compiled steps as follow a collection with the values of `agent=sac`.
 """
 
 from __future__ import annotations
 
-import os
-
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ[_variable] = "1"
-
+import argparse
+import json
 import statistics
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
-
-import torch
-from tianshou.utils.torch_utils import policy_within_training_step
-
-from armscan.agents import MLP, SAC, AgentSetup, Compute
-from armscan.agents.tianshou_learner import TianshouLearner
-from armscan.envs import EnvFactory
-from armscan.utils.log import silence_libraries
-from armscan.volumes import load_phantoms
+from pathlib import Path
 
 N_RANDOM_STEPS, BATCH_SIZE, N_AT_ONCE, N_TIANSHOU, N_COMPILED = 1_000, 256, 4, 20, 100
 ACTIONS = {"y": ("ty",), "full": ("rz", "rx", "tx", "ty")}
-CASES = (("y", (64, 64)), ("full", (64, 64)), ("full", (256, 256)))
+# Projection, and units of the hidden layers.
+CASES: dict[str, tuple[str, tuple[int, ...]]] = {
+    "y, 64-64": ("y", (64, 64)),
+    "full, 64-64": ("full", (64, 64)),
+    "full, 256-256": ("full", (256, 256)),
+}
+COMPILED, TIANSHOU = "compiled", "Tianshou"
 
 
-def learner(projection: str, hidden_sizes: tuple[int, ...]) -> TianshouLearner:
-    """Return a learner whose replay buffer is filled."""
+def main() -> None:
+    """Print the table, or take gradient steps for another process that does."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--before", type=Path, help="checkout that takes Tianshou's steps (default: this one)")
+    parser.add_argument("--rounds", type=int, default=15, help="turns of each (default: 15)")
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.serve:
+        serve()
+        return
+    # Deferred: a process that serves another checkout has that checkout's benchmarks.
+    from benchmarks.speed.checkouts import HERE, ask, end, start
+
+    theirs, ours = (start(__file__, each) for each in (given.before or HERE, HERE))
+    print("| projection, network | Tianshou, ms | compiled, ms | ratio, median | least | most |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for case in CASES:
+        # The first turn compiles.
+        rounds = [
+            (ask(theirs, f"{case}, {TIANSHOU}"), ask(ours, f"{case}, {COMPILED}")) for _ in range(1 + given.rounds)
+        ][1:]
+        ratios = [tianshou / compiled for tianshou, compiled in rounds]
+        tianshou, compiled = (statistics.median(each) for each in zip(*rounds, strict=True))
+        print(
+            f"| {case} | {tianshou:.2f} | {compiled:.3f} | {statistics.median(ratios):.1f} | {min(ratios):.1f} "
+            f"| {max(ratios):.1f} |",
+            flush=True,
+        )
+    for process in (theirs, ours):
+        end(process)
+
+
+def serve() -> None:
+    """Answer each case that is asked for with the milliseconds of processor time of a gradient step."""
+    measures: dict[str, Callable[[], int]] = {}
+    # What is logged must not look like an answer.
+    answers, sys.stdout = sys.stdout, sys.stderr
+    for line in sys.stdin:
+        case = json.loads(line)
+        if case not in measures:
+            measures[case] = measured(*CASES[case.rpartition(", ")[0]], is_compiled=case.endswith(COMPILED))
+        start_s = time.process_time()
+        n_updates = measures[case]()
+        print((time.process_time() - start_s) / n_updates * 1000.0, file=answers, flush=True)
+
+
+def measured(projection: str, hidden_sizes: tuple[int, ...], *, is_compiled: bool) -> Callable[[], int]:
+    """Return a function that takes gradient steps, and returns their number."""
+    # Of the checkout that this process was started for.
+    import torch
+    from tianshou.algorithm.modelfree import sac
+    from tianshou.utils.torch_utils import policy_within_training_step
+
+    from armscan.agents import MLP, SAC, AgentSetup, Compute
+    from armscan.envs import EnvFactory
+    from armscan.volumes import load_phantoms
+
+    torch.set_num_threads(1)
     env_factory, volumes = EnvFactory(projection=projection), load_phantoms(range(2))
     setup = AgentSetup(
         make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
@@ -44,49 +96,22 @@ def learner(projection: str, hidden_sizes: tuple[int, ...]) -> TianshouLearner:
         seed=0,
         compute=Compute("cpu"),
     )
-    made = SAC(network=MLP(hidden_sizes), learning_starts=N_RANDOM_STEPS).agent(setup)
-    made.warm_up()
-    return made
+    learner = SAC(network=MLP(hidden_sizes), learning_starts=N_RANDOM_STEPS).agent(setup)
+    learner.warm_up()
+    algorithm, replay = learner._algorithm, learner._replay
 
+    def take_steps() -> int:
+        with policy_within_training_step(algorithm.policy):
+            if is_compiled:
+                for _ in range(N_COMPILED // N_AT_ONCE):
+                    algorithm.update_repeatedly(replay, BATCH_SIZE, N_AT_ONCE)
+                return N_COMPILED
+            for _ in range(N_TIANSHOU):
+                sac.SAC.update(algorithm, replay, BATCH_SIZE)
+            return N_TIANSHOU
 
-def milliseconds(made: TianshouLearner, n_updates: int, *, is_compiled: bool) -> float:
-    """Return the processor time of an update."""
-    algorithm, replay = made._algorithm, made._replay
-    start_s = time.process_time()
-    with policy_within_training_step(algorithm.policy):
-        if is_compiled:
-            for _ in range(n_updates // N_AT_ONCE):
-                algorithm.update_repeatedly(replay, BATCH_SIZE, N_AT_ONCE)
-        else:
-            for _ in range(n_updates):
-                super(type(algorithm), algorithm).update(replay, BATCH_SIZE)
-    return (time.process_time() - start_s) / n_updates * 1000.0
-
-
-def main(words: list[str]) -> None:
-    """Measure every case and print its table."""
-    silence_libraries()
-    torch.set_num_threads(1)
-    n_rounds = int(words[0]) if words else 15
-    print("| projection, network | Tianshou, ms | compiled, ms | ratio, median | least | most |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for projection, hidden_sizes in CASES:
-        made = learner(projection, hidden_sizes)
-        for is_compiled in (True, False):
-            milliseconds(made, N_AT_ONCE, is_compiled=is_compiled)
-        rounds = [
-            (milliseconds(made, N_TIANSHOU, is_compiled=False), milliseconds(made, N_COMPILED, is_compiled=True))
-            for _ in range(n_rounds)
-        ]
-        ratios = [theirs / ours for theirs, ours in rounds]
-        theirs, ours = (statistics.median(each) for each in zip(*rounds, strict=True))
-        network = "-".join(map(str, hidden_sizes))
-        print(
-            f"| {projection}, {network} | {theirs:.2f} | {ours:.3f} | {statistics.median(ratios):.1f} | "
-            f"{min(ratios):.1f} | {max(ratios):.1f} |",
-            flush=True,
-        )
+    return take_steps
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

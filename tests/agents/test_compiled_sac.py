@@ -139,6 +139,17 @@ def test_compiled_updates_agree_with_those_of_tianshou(hidden_sizes, n_obs, n_ac
         hand_over(theirs, ours)
 
 
+def test_denormal_averages_of_dead_units_become_zero():
+    replay = filled_replay(n_obs=5, n_action=2)
+    ours = compiled(replay, hidden_sizes=[16, 16])
+    actor, n_weights = ours._agent().actor, 5 * 16
+    actor.values[n_weights] = -1e6  # The bias of the first unit
+    actor.exp_avg[:5] = 1e-40
+    updated(ours, replay, 1)
+    assert (actor.exp_avg[:5] == 0.0).all()
+    assert np.float32(1e-40) * np.float32(0.5) > 0.0, "only the update flushes them"
+
+
 def test_hundred_updates_at_the_default_size_agree_with_those_of_tianshou():
     shape = {"hidden_sizes": [64, 64], "n_obs": 14, "n_action": 1}
     replay = filled_replay(14, 1)
