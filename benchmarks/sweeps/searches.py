@@ -24,7 +24,7 @@ from optuna.trial import TrialState
 from armscan.config.defaults import to_plain
 from armscan.sweeps.scheduling.race import Scores, race
 from armscan.sweeps.scheduling.scheduler import Plan, TrialScheduler
-from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.scheduling.state import ClaimStatus, StudyState
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.components import read_settings
@@ -98,9 +98,9 @@ class BudgetedScheduler(TrialScheduler):
         super().__init__(before.study, before.storage, before.limits, plan)
         self._is_used = is_used
 
-    def end(self, state: StudyState) -> str | None:
-        """See `TrialScheduler.end`."""
-        return "the budget is used" if self._is_used() else super().end(state)
+    def claim_status(self, state: StudyState) -> ClaimStatus:
+        """See `TrialScheduler.claim_status`."""
+        return ClaimStatus("the budget is used") if self._is_used() else super().claim_status(state)
 
 
 def search_by_armscan(words: Sequence[str], budget_s: float, _: Path) -> SearchResult:

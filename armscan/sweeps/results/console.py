@@ -37,8 +37,8 @@ def print_result(opened: OpenedStudy) -> int:
     if stopped := scheduler.look_for_stop():
         print_sentence(printable(f"the study was stopped {stopped}; the same command resumes it"))
         return 0
-    wrong = scheduler.broken(state)
-    if wrong is None and scheduler.end(state) is None:
+    wrong = scheduler.failure_reason(state)
+    if wrong is None and scheduler.end_reason(state) is None:
         wrong = (
             f"all workers have ended, but only {len(state.finished)} of {settings.n_trials} trials have finished: "
             f"their logs in {opened.folder / 'workers'} say why; the same command resumes the study"

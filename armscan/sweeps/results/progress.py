@@ -146,7 +146,7 @@ def status_line(opened: OpenedStudy, state: StudyState) -> str:
     if best := best_trials(opened.search.scheduler.study, 1):
         parts.append(f"best {values_of(best[0], settings.objectives)} (trial {best[0].number})")
     durations = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
-    if durations and opened.search.scheduler.end(state) is None:
+    if durations and opened.search.scheduler.end_reason(state) is None:
         left_s = (settings.n_trials - len(state.finished)) * fmean(durations) / settings.workers
         parts.append(f"about {left_s // 60:.0f} min left for the trials")
     return "; ".join(parts)

@@ -25,6 +25,7 @@ from armscan.sweeps.scheduling.state import (
     RETRIED,
     RETRY_OF,
     STOP,
+    ClaimStatus,
     Limits,
     PendingWrites,
     PlannedTrial,
@@ -93,11 +94,11 @@ class TrialScheduler:
             is_repeated = True
             if own:
                 return Trial(self.study, own[0]._trial_id)
-            if not self.has_more(state):
+            status = self.claim_status(state)
+            if not status.can_claim:
                 return None
-            if self._plan is not None and not state.waiting:
-                for planned in self._plan():
-                    self.study.enqueue_trial(dict(planned.params), user_attrs=dict(planned.attributes))
+            for planned in status.planned:
+                self.study.enqueue_trial(dict(planned.params), user_attrs=dict(planned.attributes))
             trial = self.study.ask()
             trial.set_user_attr(LEASE, dict(lease))
             return trial
@@ -117,33 +118,37 @@ class TrialScheduler:
         self.study.tell(trial, outcome.values, outcome.state)
         outcome.is_told = True
 
-    def has_more(self, state: StudyState) -> bool:
-        """Return whether a trial can be claimed now."""
-        enough = len(state.finished) + len(state.running) >= self.limits.n_trials
-        return not enough and self.end(state) is None and self._has_next(state)
+    def claim_status(self, state: StudyState) -> ClaimStatus:
+        """Return whether a trial can be claimed now, and whether one ever will be."""
+        if reason := self._early_end_reason(state):
+            return ClaimStatus(reason)
+        is_enough = len(state.finished) + len(state.running) >= self.limits.n_trials
+        planned = () if is_enough or self._plan is None or state.waiting else self._plan()
+        has_next = not is_enough and (self._plan is None or bool(state.waiting or planned))
+        # What comes of a running trial may be planned with.
+        if not has_next and not state.running:
+            return ClaimStatus(f"{len(state.finished)} trials have finished, {len(state.failed)} failed")
+        reason = self.limits.limit_reason(state)
+        return ClaimStatus(reason, can_claim=has_next and reason is None, planned=planned)
 
-    def _has_next(self, state: StudyState) -> bool:
-        return self._plan is None or bool(state.waiting) or bool(self._plan())
-
-    def end(self, state: StudyState) -> str | None:
+    def end_reason(self, state: StudyState) -> str | None:
         """Return why no further trial is claimed; None while trials are missing."""
+        return self.claim_status(state).end_reason
+
+    def _early_end_reason(self, state: StudyState) -> str | None:
+        """Return why the study ends, whether or not trials are planned; None if it does not."""
         if len(state.finished) >= self.limits.n_trials:
             return f"{len(state.finished)} trials have finished"
-        if broken := self.broken(state):
-            return broken
+        if reason := self.failure_reason(state):
+            return reason
         if self.termination is not None and (reason := self.termination.reason):
             return reason
-        if self.stopped:
-            return f"the study was stopped {self.stopped}"
-        # What comes of a running trial may be planned with.
-        if not state.running and not self._has_next(state):
-            return f"{len(state.finished)} trials have finished, {len(state.failed)} failed"
-        return self.limits.spent(state)
+        return f"the study was stopped {self.stopped}" if self.stopped else None
 
-    def broken(self, state: StudyState) -> str | None:
-        """See `Limits.broken`; failures before the last restart are ignored."""
+    def failure_reason(self, state: StudyState) -> str | None:
+        """See `Limits.failure_reason`; failures before the last restart are ignored."""
         reset = self.study.user_attrs.get(RESET_FAILURES, ()) if state.failed else ()
-        return self.limits.broken(state, reset)
+        return self.limits.failure_reason(state, reset)
 
     def look_for_end(self, state: StudyState | None = None) -> None:
         """Look whether the study ends before its last trial; see `Termination.look`."""
@@ -170,7 +175,7 @@ class TrialScheduler:
             How many there were; 0 if they have not ended it.
         """
         state = self.state()
-        if self.broken(state) is None:
+        if self.failure_reason(state) is None:
             return 0
         self.study.set_user_attr(RESET_FAILURES, [trial.number for trial in state.failed])
         return len(state.failed)

@@ -150,7 +150,7 @@ class Limits(Section):
     )
     max_env_steps: int | None = Field(default=None, ge=1, description="a whole number of at least 1, or null")
 
-    def spent(self, state: StudyState) -> str | None:
+    def limit_reason(self, state: StudyState) -> str | None:
         """Return which of time and environment steps is spent, so that running trials stop; None if neither is."""
         if self.timeout_hours is not None and state.busy_hours >= self.timeout_hours:
             return f"the {self.timeout_hours:g} hours of study.timeout_hours are over"
@@ -158,7 +158,7 @@ class Limits(Section):
             return f"the {self.max_env_steps} environment steps of study.max_env_steps are taken"
         return None
 
-    def broken(self, state: StudyState, reset: Collection[int]) -> str | None:
+    def failure_reason(self, state: StudyState, reset: Collection[int]) -> str | None:
         """Return why failures end the study, those of trials with the numbers `reset` ignored; None if they do not."""
         failed = [trial for trial in state.failed if trial.number not in reset]
         if len(failed) > self.max_failures:
@@ -212,6 +212,21 @@ class PlannedTrial:
 
     params: Mapping[str, Any]
     attributes: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class ClaimStatus:
+    """Whether a trial can be claimed.
+
+    Args:
+        end_reason: Why no further trial is claimed; None while trials are missing.
+        can_claim: Whether one can be claimed now. Default: False.
+        planned: Trials to enqueue before. Default: none.
+    """
+
+    end_reason: str | None
+    can_claim: bool = False
+    planned: Sequence[PlannedTrial] = ()
 
 
 @dataclass

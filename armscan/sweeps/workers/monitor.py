@@ -34,9 +34,9 @@ class StudyMonitor:
         for phase in self._opened.phases:
             stopped = phase.scheduler.look_for_stop()
             state = phase.scheduler.state()
-            if state.running or phase.scheduler.end(state) is None:
+            if state.running or phase.scheduler.end_reason(state) is None:
                 return False
-            if stopped or phase.scheduler.broken(state):
+            if stopped or phase.scheduler.failure_reason(state):
                 return True
         return True
 

@@ -19,7 +19,7 @@ from armscan.config.defaults import MULTIRUN, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.errors import StorageAwayError, TrackingAwayError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, TrialOutcome
+from armscan.sweeps.scheduling.state import ENV_STEPS, FAILURE, METRICS, ClaimStatus, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.components import make, read_settings
 from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_picture, shown_metrics, table_of_seeds
@@ -80,25 +80,24 @@ class Worker:
                 conclude = partial(self._conclude, outcome, self._tracked) if outcome else None
                 self._tracked = None
             else:
-                can_claim, reason = self._wait_for_trial()
-                if not can_claim:
-                    return reason
+                status = self._wait_for_trial()
+                if not status.can_claim:
+                    return status.end_reason
 
-    def _wait_for_trial(self) -> tuple[bool, str | None]:
-        """Wait for a trial; return whether one of this phase can be claimed, and otherwise what `work` returns."""
+    def _wait_for_trial(self) -> ClaimStatus:
+        """Wait until a trial of this phase can be claimed, or none ever will be, or only the other phase has some."""
         scheduler = self._phase.scheduler
         while True:
             scheduler.look_for_stop()
             state = scheduler.state()
             scheduler.look_for_end(state)
-            reason = scheduler.end(state)
+            status = scheduler.claim_status(state)
             # A running trial may yet have to be retried.
-            if reason is not None and not state.running:
-                return False, reason
-            if scheduler.has_more(state):
-                return True, None
-            if reason is None and self._other is not None and self._other.has_more(self._other.state()):
-                return False, None
+            if status.can_claim or (status.end_reason is not None and not state.running):
+                return status
+            other = self._other
+            if status.end_reason is None and other is not None and other.claim_status(other.state()).can_claim:
+                return status
             time.sleep(WAIT_S)
 
     def _run(self, trial: Trial) -> TrialOutcome | None:
@@ -226,5 +225,5 @@ def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None
             assert other is not None
             run_phase(other, phase)
         log(f"{phase.name}: {reason}")
-        if phase.scheduler.look_for_stop() or phase.scheduler.broken(phase.scheduler.state()):
+        if phase.scheduler.look_for_stop() or phase.scheduler.failure_reason(phase.scheduler.state()):
             return

@@ -117,7 +117,9 @@ def test_each_member_completes_each_generation_once_although_workers_die_and_tri
         assert not {each for each in after if each < n_before} - before
     assert max(len(kept) for _, kept in takeable) <= 3 * SIZE + 2 * n_workers
     assert simulation.population.takeable(trials) == set()
-    assert simulation.scheduler.end(simulation.scheduler.state()) == f"{SIZE * N_GENERATIONS} trials have finished"
+    assert (
+        simulation.scheduler.end_reason(simulation.scheduler.state()) == f"{SIZE * N_GENERATIONS} trials have finished"
+    )
 
 
 def test_decisions_follow_from_the_storage_and_the_seed_alone(tmp_path):

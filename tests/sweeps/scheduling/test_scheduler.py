@@ -43,10 +43,10 @@ def test_claim_gives_as_many_trials_as_are_wanted(make_scheduler):
     trials = [scheduler.claim({"worker": "a"}), other.claim({"worker": "b"}), scheduler.claim({"worker": "a"})]
     assert [trial.number for trial in trials] == [0, 1, 2]
     assert other.claim({"worker": "b"}) is None
-    assert other.end(other.state()) is None
+    assert other.end_reason(other.state()) is None
     for trial in trials:
         finish(scheduler, trial)
-    assert other.end(other.state()) == "3 trials have finished"
+    assert other.end_reason(other.state()) == "3 trials have finished"
 
 
 def test_trial_that_is_handed_back_is_the_next_to_be_run_with_the_same_values(make_scheduler):
@@ -63,31 +63,34 @@ def test_failed_trial_is_replaced_until_too_many_have_failed(make_scheduler):
     scheduler = make_scheduler(n_trials=2, max_failures=1)
     finish(scheduler, scheduler.claim({}))
     fail(scheduler, scheduler.claim({}), "no luck")
-    assert scheduler.end(scheduler.state()) is None
+    assert scheduler.end_reason(scheduler.state()) is None
     fail(scheduler, scheduler.claim({}), "none again")
     reason = "2 trials have failed, and at most 1 may: trial 2: none again"
-    assert scheduler.end(scheduler.state()) == scheduler.broken(scheduler.state()) == reason
+    assert scheduler.end_reason(scheduler.state()) == scheduler.failure_reason(scheduler.state()) == reason
     assert scheduler.claim({}) is None
 
 
 def test_study_whose_first_trials_all_fail_at_once_ends(make_scheduler):
     scheduler = make_scheduler(n_trials=100, max_failures=50)
     for _ in range(3):
-        assert scheduler.broken(scheduler.state()) is None
+        assert scheduler.failure_reason(scheduler.state()) is None
         fail(scheduler, scheduler.claim({}), "agent.lr is -1")
-    assert scheduler.broken(scheduler.state()).endswith("before they reported anything: trial 0: agent.lr is -1")
+    assert scheduler.failure_reason(scheduler.state()).endswith(
+        "before they reported anything: trial 0: agent.lr is -1"
+    )
 
 
 def test_limits_of_time_and_environment_steps_end_a_study(make_scheduler):
     scheduler = make_scheduler(max_env_steps=100)
     scheduler.claim({"env_steps": 99})
-    assert scheduler.end(scheduler.state()) is None
+    assert scheduler.end_reason(scheduler.state()) is None
     scheduler.claim({"env_steps": 1})
-    assert scheduler.end(scheduler.state()) == "the 100 environment steps of study.max_env_steps are taken"
-    assert make_scheduler(timeout_hours=1.0).end(scheduler.state()) is None
+    assert scheduler.end_reason(scheduler.state()) == "the 100 environment steps of study.max_env_steps are taken"
+    assert make_scheduler(timeout_hours=1.0).end_reason(scheduler.state()) is None
     time.sleep(0.1)
     assert (
-        make_scheduler(timeout_hours=1e-5).end(scheduler.state()) == "the 1e-05 hours of study.timeout_hours are over"
+        make_scheduler(timeout_hours=1e-5).end_reason(scheduler.state())
+        == "the 1e-05 hours of study.timeout_hours are over"
     )
 
 
@@ -164,7 +167,7 @@ def work(make_scheduler, n_trials):
         random.Random(os.getpid()),
     )
     lease = asdict(ProcessInfo.current())
-    while scheduler.end(scheduler.state()) is None:
+    while scheduler.end_reason(scheduler.state()) is None:
         scheduler.reclaim(liveness.is_dead)
         trial = scheduler.claim(lease)
         if trial is None:
@@ -185,7 +188,7 @@ def test_workers_killed_at_any_moment_lose_no_trial_and_make_none_too_many(make_
         return process
 
     workers = [started() for _ in range(3)]
-    while scheduler.end(scheduler.state()) is None:
+    while scheduler.end_reason(scheduler.state()) is None:
         time.sleep(chance.uniform(0.05, 0.4))
         one = chance.randrange(3)
         if workers[one].is_alive():
@@ -216,15 +219,31 @@ def test_study_with_a_plan_runs_what_is_planned_each_once_and_what_is_planned_af
     trials = [scheduler.claim({}), other.claim({})]
     assert [trial.user_attrs[FINALIST] for trial in trials] == [0, 1]
     assert scheduler.claim({}) is None
-    assert not scheduler.has_more(scheduler.state())
+    assert not scheduler.claim_status(scheduler.state()).can_claim
     for number, trial in enumerate(trials):
         assert trial.suggest_float("x", 0, 5) == number
         finish(scheduler, trial)
-    assert scheduler.end(scheduler.state()) is None
+    assert scheduler.end_reason(scheduler.state()) is None
     last = other.claim({})
     assert last.suggest_float("x", 0, 5) == 2.0
     finish(other, last)
-    assert scheduler.end(scheduler.state()) == "3 trials have finished, 0 failed"
+    assert scheduler.end_reason(scheduler.state()) == "3 trials have finished, 0 failed"
+
+
+def test_a_claim_plans_once(make_scheduler):
+    n_plans = 0
+
+    def plan():
+        nonlocal n_plans
+        n_plans += 1
+        return [PlannedTrial({"x": 0.0}, {FINALIST: 0, FINAL_SEED: n_plans})]
+
+    scheduler = make_scheduler(n_trials=2, plan=plan)
+    for n_claims in (1, 2):
+        assert scheduler.claim({}) is not None
+        assert n_plans == n_claims
+    assert scheduler.claim({}) is None
+    assert n_plans == 2, "as many run as are wanted"
 
 
 def test_retry_of_a_planned_trial_whose_worker_died_before_it_asked_for_its_values_has_them(make_scheduler):

@@ -55,7 +55,7 @@ def work_with(study, folder):
     scheduler = TrialScheduler(study, None, Limits(n_trials=1, max_failures=0, max_retries=0))
     state = scheduler.state()
     assert state.env_steps >= 0
-    scheduler.end(state)
+    scheduler.end_reason(state)
     for trial in state.running:
         LivenessCheck().is_dead(trial)
         scheduler._fail(trial, state)

@@ -131,4 +131,4 @@ def test_study_that_is_damaged_while_it_runs_says_so_in_one_line(opened):
     trial = scheduler.study.ask()
     scheduler.study.tell(trial, state=TrialState.FAIL)
     with pytest.raises(ValueError, match=r"study.user_attrs.forgiven is 3, but it must be a list of numbers"):
-        scheduler.broken(scheduler.state())
+        scheduler.failure_reason(scheduler.state())

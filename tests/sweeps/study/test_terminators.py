@@ -118,7 +118,7 @@ def test_every_worker_ends_where_one_has_found_that_the_study_ends(make):
     assert [run_one(first) is not None for _ in range(3)] == [True, True, False]
     # Found by the other, without a look of its own.
     assert second.claim({"worker": "b"}) is None
-    assert second.end(second.state()) == "2 are enough"
+    assert second.end_reason(second.state()) == "2 are enough"
 
 
 def test_ended_study_stays_ended_unless_something_else_is_asked_for(make):

@@ -168,7 +168,7 @@ def work(open_scheduler, n_trials):
     scheduler, liveness, chance = open_scheduler(n_trials=n_trials), LivenessCheck(), random.Random(os.getpid())
     holder = asdict(ProcessInfo.current())
     outcome = None
-    while outcome is not None or scheduler.end(scheduler.state()) is None:
+    while outcome is not None or scheduler.end_reason(scheduler.state()) is None:
         scheduler.reclaim(liveness.is_dead)
         trial = scheduler.claim(holder, outcome)
         outcome = None
