@@ -10,7 +10,7 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import TrialState
 
 from armscan.errors import StudyError
-from armscan.sweeps.scheduling.state import LEASE, STOP
+from armscan.sweeps.storage.attribute_names import LEASE, STOP
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES
 from armscan.sweeps.storage.storage import Storage, existing_storage, open_storage
 from armscan.sweeps.study.study import is_ours

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from armscan.sweeps.scheduling.state import RETRY_OF
+from armscan.sweeps.storage.attribute_names import RETRY_OF
 from armscan.sweeps.workers.supervisor import local_workers
 from benchmarks.sweeps.studies import JOURNAL, NAME, SLEEPING, started, state_in
 from tests.support.postgres import postgres_server

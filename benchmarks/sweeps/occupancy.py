@@ -13,7 +13,8 @@ from typing import Self
 
 from optuna.trial import FrozenTrial
 
-from armscan.sweeps.scheduling.state import METRICS, StudyState
+from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.storage.attribute_names import METRICS
 from benchmarks.sweeps.studies import N_WORKERS, SLEEPING, by_worker, finish
 from benchmarks.sweeps.wait import Waited
 

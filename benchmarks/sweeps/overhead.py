@@ -22,7 +22,7 @@ from typing import Any, Self
 from omegaconf import DictConfig
 from optuna.trial import FrozenTrial
 
-from armscan.sweeps.scheduling.state import METRICS
+from armscan.sweeps.storage.attribute_names import METRICS
 from armscan.sweeps.tasks.attempt import Attempt
 from armscan.sweeps.tasks.training import TrainingTask
 from benchmarks.sweeps.studies import by_worker, finish

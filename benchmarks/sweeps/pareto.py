@@ -26,7 +26,8 @@ from optuna.pruners import BasePruner, NopPruner
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from armscan.sweeps.scheduling.state import ENV_STEPS, env_steps_of, loss_signs
+from armscan.sweeps.scheduling.state import env_steps_of, loss_signs
+from armscan.sweeps.storage.attribute_names import ENV_STEPS
 from armscan.sweeps.storage.reports import REPORT, keep_report, reports_of
 from armscan.sweeps.study.pruners import ParetoPruner
 from benchmarks.sweeps.bench.table import VALIDATION, read_rows, table_file

@@ -10,7 +10,8 @@ from pathlib import Path
 import optuna
 from optuna.trial import FrozenTrial
 
-from armscan.sweeps.scheduling.state import LEASE, StudyState
+from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.storage.attribute_names import LEASE
 from armscan.sweeps.storage.storage import open_storage
 
 N_WORKERS = 4

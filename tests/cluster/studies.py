@@ -18,7 +18,7 @@ from mlflow.entities import Run
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.config.credentials import STORAGE_PASSWORD
-from armscan.sweeps.scheduling.state import LEASE, RETRY_OF
+from armscan.sweeps.storage.attribute_names import LEASE, RETRY_OF
 from armscan.sweeps.storage.storage import open_storage
 from tests.support.postgres import PASSWORD
 from tests.support.waiting import HANG_S, wait_until

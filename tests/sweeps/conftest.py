@@ -5,7 +5,8 @@ import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import FAILURE, Limits, PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.state import Limits, PendingWrites, TrialOutcome
+from armscan.sweeps.storage.attribute_names import FAILURE
 from armscan.sweeps.storage.storage import open_storage
 
 

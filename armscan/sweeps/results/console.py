@@ -17,8 +17,8 @@ from armscan.sweeps.results.progress import status_line
 from armscan.sweeps.results.selection import candidates_of, objective_of
 from armscan.sweeps.results.summary import final_table
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import FAILURE
 from armscan.sweeps.space.parameter import rounded_overrides
+from armscan.sweeps.storage.attribute_names import FAILURE
 from armscan.sweeps.storage.attributes import check_trials
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation
 from armscan.sweeps.study.open import OpenedStudy

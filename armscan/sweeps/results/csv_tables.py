@@ -15,26 +15,25 @@ from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.results.selection import Candidate, score_rows
 from armscan.sweeps.results.summary import ConfigResult
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import (
+from armscan.sweeps.scheduling.state import TEST_PREFIX, is_feasible, loss_signs
+from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.attribute_names import (
     ENV_STEPS,
     FAILURE,
     GENERATION,
     MEMBER,
     METRICS,
+    OBJECTIVES,
     PARENT,
     RETRIED,
     RETRY_OF,
+    RUN,
     SCHEDULE,
     STOP,
     TAKEN_FROM,
-    TEST_PREFIX,
-    is_feasible,
-    loss_signs,
 )
-from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.reports import reports_of
 from armscan.sweeps.study.final_eval import key_of
-from armscan.sweeps.tasks.attempt import RUN
 
 MIN_TRIALS_FOR_IMPORTANCE = 4
 
@@ -55,7 +54,7 @@ def all_numbers(
         candidates: Candidates of the selection; empty without one.
         judgement: Judgement of the chosen configuration; None before one was chosen.
     """
-    objectives = list(study.user_attrs["objectives"])
+    objectives = list(study.user_attrs[OBJECTIVES])
     return {
         "trials": [_trial_row(trial, objectives) for trial in trials],
         "reports": [

@@ -16,10 +16,11 @@ from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
 from armscan.sweeps.results.summary import ConfigResult, final_results, final_table, scores_of
-from armscan.sweeps.scheduling.state import CONTROL, METRICS, TEST_PREFIX, metrics_of_test
+from armscan.sweeps.scheduling.state import CONTROL, TEST_PREFIX, metrics_of_test
 from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, name_of, settings_of, training_of
-from armscan.sweeps.study.study import OBJECTIVES, best_trials
+from armscan.sweeps.study.study import best_trials
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
 from armscan.training.metric_display import is_rate, leading_among, title_of, value_text

@@ -14,7 +14,7 @@ from armscan.reports.chart_style import BLUE, GREY, ORANGE
 from armscan.reports.html import chart
 from armscan.sweeps.results.charts import HEIGHT_PX, SMALL_PX, key_axis
 from armscan.sweeps.scheduling.population import lineage
-from armscan.sweeps.scheduling.state import GENERATION, INTERVAL, MEMBER, PARENT, SCHEDULE
+from armscan.sweeps.storage.attribute_names import GENERATION, INTERVAL, MEMBER, PARENT, SCHEDULE
 from armscan.training.metric_display import title_of
 
 STEPS = "environment steps"

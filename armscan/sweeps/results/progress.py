@@ -17,18 +17,9 @@ from rich.text import Text
 from armscan.errors import ArmscanError, printable
 from armscan.sweeps.results.summary import values_of
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import (
-    ENV_STEPS,
-    FAILURE,
-    FINAL_SEED,
-    FINALIST,
-    LEASE,
-    RETRIED,
-    STOP,
-    StudyState,
-    is_feasible,
-)
+from armscan.sweeps.scheduling.state import StudyState, is_feasible
 from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.attribute_names import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, STOP
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, name_of
 from armscan.sweeps.study.open import OpenedStudy, Phase

@@ -17,19 +17,12 @@ from armscan.sweeps.results.judgement import HOW, Judgement, judge
 from armscan.sweeps.results.population_charts import population_charts
 from armscan.sweeps.results.selection import candidates_of, decided
 from armscan.sweeps.results.summary import ConfigResult, final_results, final_table
-from armscan.sweeps.scheduling.state import (
-    FINALIST,
-    LEASE,
-    TAKEN_FROM,
-    StudyState,
-    env_steps_of,
-    is_feasible,
-)
-from armscan.sweeps.scheduling.termination import REASON, TERMINATED
+from armscan.sweeps.scheduling.state import StudyState, env_steps_of, is_feasible
+from armscan.sweeps.scheduling.termination import REASON
 from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.attribute_names import FINALIST, FOLDER, LEASE, OBJECTIVES, RUN, TAKEN_FROM, TERMINATED
 from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, settings_of
 from armscan.sweeps.study.study import best_trials
-from armscan.sweeps.tasks.attempt import FOLDER, RUN
 from armscan.training.metric_display import title_of, value_text
 
 ID_CHARS = 8
@@ -60,7 +53,7 @@ def write_report(
     Returns:
         The HTML file.
     """
-    objectives = list(study.user_attrs["objectives"])
+    objectives = list(study.user_attrs[OBJECTIVES])
     trials = study.get_trials(deepcopy=False)
     judgement = judge(final) if final is not None else None
     candidates = candidates_of(final) if final is not None else []

@@ -16,8 +16,8 @@ from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.scheduling.race import DROP_LEVEL, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.attribute_names import OBJECTIVES
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of
-from armscan.sweeps.study.study import OBJECTIVES
 from armscan.training.metric_display import bounds_of, is_rate, title_of, value_text
 
 ROW_PX, AROUND_PX = 44, 110

@@ -18,18 +18,9 @@ from optuna.samplers import RandomSampler
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.agents.schedule import FROM
-from armscan.sweeps.scheduling.state import (
-    FINISHED,
-    GENERATION,
-    INTERVAL,
-    MEMBER,
-    PARENT,
-    RETRIED,
-    RETRY_OF,
-    SCHEDULE,
-    PlannedTrial,
-)
+from armscan.sweeps.scheduling.state import FINISHED, PlannedTrial
 from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.attribute_names import GENERATION, INTERVAL, MEMBER, PARENT, RETRIED, RETRY_OF, SCHEDULE
 from armscan.utils.validation import check_float, check_int
 
 TRAINING_SCHEDULE = "training.schedule"

@@ -15,6 +15,16 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.config.legacy import renamed
 from armscan.sweeps.scheduling.state import (
+    ClaimStatus,
+    Limits,
+    PendingWrites,
+    PlannedTrial,
+    StudyState,
+    TrialOutcome,
+    env_steps_of,
+)
+from armscan.sweeps.scheduling.termination import Termination
+from armscan.sweeps.storage.attribute_names import (
     ATTEMPT,
     ENV_STEPS,
     FAILURE,
@@ -25,15 +35,7 @@ from armscan.sweeps.scheduling.state import (
     RETRIED,
     RETRY_OF,
     STOP,
-    ClaimStatus,
-    Limits,
-    PendingWrites,
-    PlannedTrial,
-    StudyState,
-    TrialOutcome,
-    env_steps_of,
 )
-from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.storage import Storage
 
 # Optuna's system attribute of an enqueued trial: its values.

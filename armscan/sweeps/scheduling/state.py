@@ -12,33 +12,14 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 from pydantic import Field
 
+from armscan.sweeps.storage.attribute_names import ENV_STEPS, FAILURE, LEASE, RETRIED, TAKEN_FROM
 from armscan.sweeps.storage.reports import reports_of
 from armscan.utils.arrays import FloatArray
 from armscan.utils.section import Section
 
 T = TypeVar("T")
-# User attributes of a trial.
-LEASE, ENV_STEPS, METRICS, FAILURE = "lease", "env_steps", "figures", "failure"
-RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
-# Of a trial that a study has begun with: where it was run, or what its settings are of.
-TAKEN_FROM, ENQUEUED_FROM = "taken_from", "enqueued_from"
-# Of a final training: the trial whose configuration is trained, and the seed.
-FINALIST, FINAL_SEED = "judged", "judged_seed"
-# In place of a trial's number: the configuration of the study without what it searches.
+# In place of the number of a finalist: the configuration of the study without what it searches.
 CONTROL = -1
-# A system attribute: the episodes of the final evaluation.
-EPISODES = "episodes"
-# Of a trial, or of a study: who asked it to stop, and when; an empty text where a study goes on again.
-STOP = "stop"
-# Of a member of a population: its number, its generation, the environment steps at which that begins and ends, the
-# trial whose checkpoint it begins from, and all values since the first generation, as `training.schedule` has them.
-MEMBER, GENERATION, INTERVAL, PARENT, SCHEDULE = "member", "generation", "interval", "parent", "schedule"
-# What a retry has from the attempt before.
-KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED, STOP, ENQUEUED_FROM, MEMBER, GENERATION, INTERVAL, PARENT, SCHEDULE)
-# Of a study: trials whose failures are ignored.
-RESET_FAILURES = "forgiven"
-# In a lease: the worker that holds the trial.
-HOLDER = ("worker", "host", "pid", "started", "boot", "pid_namespace")
 # How the names of metrics on the test volumes begin.
 TEST_PREFIX = "test/"
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import optuna
 
 from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.storage.attribute_names import TERMINATED
 from armscan.sweeps.storage.storage import Storage
 
-# User attribute of a study: why it has ended, and what was asked of it then.
-TERMINATED = "terminated"
+# In the attribute of a study that has ended.
 REASON, ASKED = "reason", "asked"
 
 

@@ -12,6 +12,7 @@ from optuna.trial import FrozenTrial, TrialState
 from pydantic import ConfigDict, Field
 
 from armscan.errors import ArmscanError, StudyError, few
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, FIXED, METRICS, OBJECTIVES, PARENT, SPACE
 from armscan.sweeps.storage.reports import REPORT
 from armscan.utils.section import Section
 from armscan.utils.validation import LARGEST_SEED
@@ -19,10 +20,8 @@ from armscan.utils.validation import LARGEST_SEED
 # The studies of the final trainings are called like the study, with these suffixes: those that choose a configuration,
 # and those that judge it.
 SELECTION_SUFFIX, JUDGEMENT_SUFFIX = FINAL_SUFFIXES = ("-selection", "-judged")
-# What each of its trials has, and what those have that are complete.
-OF_FINAL, OF_FINISHED = ("judged", "judged_seed"), "figures"
 # What each study of armscan has.
-OF_STUDY = {"space", "fixed_config", "objectives"}
+OF_STUDY = {SPACE, FIXED, OBJECTIVES}
 # What Optuna's readers raise on what Optuna has not written.
 DAMAGED = (ValueError, TypeError, AttributeError, AssertionError)
 UNREADABLE = (*DAMAGED, LookupError)
@@ -45,7 +44,7 @@ class _Attributes(Section):
 
 
 class StudyAttributes(_Attributes):
-    """User attributes of a study; the names are those of `armscan.sweeps.study.study` and of the scheduler."""
+    """User attributes of a study; by the names in `attribute_names`."""
 
     space: dict[str, str] = Field(description="strings by the names of keys")
     fixed_config: dict[str, Any] = Field(description="values by the names of keys")
@@ -73,7 +72,7 @@ class _Lease(_Attributes):
 
 
 class TrialAttributes(_Attributes):
-    """User attributes of a trial; the names are those of `armscan.sweeps.scheduling.state` and of `Attempt`."""
+    """User attributes of a trial; by the names in `attribute_names`."""
 
     lease: _Lease = Field(default=_Lease(), description="what a worker writes")
     env_steps: Number = 0
@@ -136,8 +135,8 @@ def check_trial(trial: FrozenTrial, study_name: str, n_objectives: int) -> None:
     """
     where = place_of(study_name, trial)
     TrialAttributes.read(f"{where}.user_attrs", trial.user_attrs)
-    if trial.user_attrs.get("parent", -1) >= trial.number:
-        raise StudyError(f"{where}.user_attrs.parent is {trial.user_attrs['parent']}, but it must be a trial before it")
+    if trial.user_attrs.get(PARENT, -1) >= trial.number:
+        raise StudyError(f"{where}.user_attrs.parent is {trial.user_attrs[PARENT]}, but it must be a trial before it")
     if wrong := _wrong_numbers(trial, n_objectives):
         raise StudyError(f"{where} {wrong}")
     if study_name.endswith(FINAL_SUFFIXES):
@@ -181,12 +180,11 @@ def _is_finite(value: Any) -> bool:
 
 def _check_final(trial: FrozenTrial, where: str, n_searched: int | None = None) -> None:
     attributes = trial.user_attrs
-    needed = [*OF_FINAL, *([OF_FINISHED] if trial.state == TrialState.COMPLETE else [])]
+    needed = [FINALIST, FINAL_SEED, *([METRICS] if trial.state == TrialState.COMPLETE else [])]
     if missing := [name for name in needed if name not in attributes]:
         raise StudyError(f"{where}.user_attrs has no {missing[0]}, as each final training has")
-    finalist = OF_FINAL[0]
-    if n_searched is not None and attributes[finalist] >= n_searched:
+    if n_searched is not None and attributes[FINALIST] >= n_searched:
         raise StudyError(
-            f"{where}.user_attrs.{finalist} is {attributes[finalist]}, but it must be the number of one of "
+            f"{where}.user_attrs.{FINALIST} is {attributes[FINALIST]}, but it must be the number of one of "
             f"{n_searched} trials"
         )

@@ -11,6 +11,7 @@ from optuna.trial import Trial
 
 from armscan.config.services import MLFLOW_PORT
 from armscan.sweeps.scheduling.state import metrics_of_test
+from armscan.sweeps.storage.attribute_names import NOTE_SUM
 from armscan.tracking import TrackingStore
 from armscan.training.metric_display import COSTS, leading_among, title_of, value_text
 from armscan.utils.files import sha256
@@ -19,8 +20,6 @@ from armscan.utils.markdown import markdown_table
 
 # Where `armscan ui` serves the runs of a store that is no server, but where it was given another port.
 LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
-# Of the note that was left at a study.
-NOTE_SUM = "note_sha256"
 
 
 def note_run(

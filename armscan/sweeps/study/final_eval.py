@@ -20,15 +20,9 @@ from armscan.config.legacy import renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.race import Race, budget, race
-from armscan.sweeps.scheduling.state import (
-    CONTROL,
-    FINAL_SEED,
-    FINALIST,
-    RETRIED,
-    SCHEDULE,
-    PlannedTrial,
-)
+from armscan.sweeps.scheduling.state import CONTROL, PlannedTrial
 from armscan.sweeps.space.parameter import Value
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, RETRIED, SCHEDULE
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.settings import (

@@ -17,10 +17,11 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from armscan.config.defaults import to_plain
 from armscan.sweeps.scheduling.population import Population, searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL, FINALIST, SCHEDULE, Limits
+from armscan.sweeps.scheduling.state import CONTROL, Limits
 from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.attribute_names import FINALIST, RUN, SCHEDULE, STUDY_RUN
 from armscan.sweeps.storage.storage import Storage, open_storage
 from armscan.sweeps.study.components import make_terminator
 from armscan.sweeps.study.constraints import constrained
@@ -28,9 +29,9 @@ from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.final_eval import FinalEvaluation, training_of
 from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.study.study import STUDY_RUN, make_study, name_objectives
+from armscan.sweeps.study.study import make_study, name_objectives
 from armscan.sweeps.study.warm_start import values_of
-from armscan.sweeps.tasks.attempt import RUN, STORAGE_TAG, STUDY_TAG, TRIAL_TAG, Attempt, Task, trial_folder
+from armscan.sweeps.tasks.attempt import STORAGE_TAG, STUDY_TAG, TRIAL_TAG, Attempt, Task, trial_folder
 from armscan.tracking import TrackingStore, abandon, open_store, run_of_study, source
 from armscan.tracking.run import FAILURE_TAG
 from armscan.utils.files import LAST_CHECKPOINT

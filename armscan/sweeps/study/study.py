@@ -16,15 +16,14 @@ from armscan.config.defaults import ADDED, NOT_COMPARED
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import GENERATION, is_feasible
+from armscan.sweeps.scheduling.state import is_feasible
+from armscan.sweeps.storage.attribute_names import FIXED, GENERATION, OBJECTIVES, SPACE
 from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.components import make
 from armscan.sweeps.study.settings import StudySettings
 from armscan.tracking import flattened
 
-# User attributes of a study.
-SPACE, FIXED, STUDY_RUN, OBJECTIVES = "space", "fixed_config", "mlflow_run", "objectives"
 N_SHOWN = 5
 
 

@@ -14,7 +14,8 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.errors import InvalidValueError
-from armscan.sweeps.scheduling.state import SEEDS, StudyState, is_feasible, loss_signs
+from armscan.sweeps.scheduling.state import StudyState, is_feasible, loss_signs
+from armscan.sweeps.storage.attribute_names import SEEDS
 from armscan.sweeps.study.pruners import front_numbers
 from armscan.utils.validation import check_int
 

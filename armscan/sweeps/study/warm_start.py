@@ -16,24 +16,26 @@ from armscan.config.compose import compose_run
 from armscan.config.defaults import to_plain
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError, listed
-from armscan.sweeps.scheduling.state import (
-    ENQUEUED_FROM,
-    ENV_STEPS,
-    FINISHED,
-    METRICS,
-    SEEDS,
-    TAKEN_FROM,
-)
+from armscan.sweeps.scheduling.state import FINISHED
 from armscan.sweeps.space.parameter import Value, as_kept, overrides_of, written
 from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.attribute_names import (
+    BEGUN_WITH,
+    ENQUEUED_FROM,
+    ENV_STEPS,
+    FIXED,
+    METRICS,
+    OBJECTIVES,
+    SEEDS,
+    SPACE,
+    TAKEN_FROM,
+)
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.study.study import FIXED, OBJECTIVES, SPACE, best_trials, described, is_ours
+from armscan.sweeps.study.study import best_trials, described, is_ours
 
-# User attribute of a study: what it has begun with.
-BEGUN_WITH = "begun_with"
 PRESET, SOURCE = "preset {}", "study {}"
 # Best settings of a study with another configuration that are tried first.
 N_ENQUEUED = 5

@@ -18,14 +18,13 @@ from omegaconf import DictConfig, OmegaConf
 from optuna.trial import Trial
 
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.scheduling.state import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, SEEDS, PendingWrites
+from armscan.sweeps.scheduling.state import PendingWrites
+from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, RUN, SEEDS
 from armscan.sweeps.storage.reports import keep_report, reports_of
 from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
 from armscan.utils.validation import check_float
 
-# User attributes of a trial.
-RUN, FOLDER, CONFIG_SHA256 = "mlflow_run", "folder", "config_sha256"
 # Tags of tracked runs: the study, its storage, and the trial.
 STUDY_TAG, STORAGE_TAG, TRIAL_TAG = "study", "study.storage", "trial"
 TRIAL_DIGITS = 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from armscan.sweeps.scheduling.state import ENV_STEPS
+from armscan.sweeps.storage.attribute_names import ENV_STEPS
 from armscan.sweeps.tasks.attempt import Attempt
 from armscan.sweeps.tasks.generation import best_of_generation, inherited
 from armscan.training import Budget, EpochReport, Evaluation, TrainingResult

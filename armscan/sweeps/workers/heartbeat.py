@@ -13,7 +13,8 @@ import optuna
 from optuna.trial import FrozenTrial, Trial
 
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import HOLDER, LEASE, STOP, PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.state import PendingWrites, TrialOutcome
+from armscan.sweeps.storage.attribute_names import HOLDER, LEASE, STOP
 from armscan.utils.log import log
 from armscan.utils.processes import ProcessInfo
 

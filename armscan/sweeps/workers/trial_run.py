@@ -8,11 +8,12 @@ from typing import Any
 
 from optuna.trial import Trial
 
-from armscan.sweeps.scheduling.state import RETRY_OF, PendingWrites
+from armscan.sweeps.scheduling.state import PendingWrites
 from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.attribute_names import RETRY_OF, RUN
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.open import Phase
-from armscan.sweeps.tasks.attempt import RUN, STUDY_TAG, TRIAL_TAG, trial_folder
+from armscan.sweeps.tasks.attempt import STUDY_TAG, TRIAL_TAG, trial_folder
 from armscan.tracking import TrackedRun, run_of_study
 from armscan.tracking.run import PARENT_TAG, SHORT_WAIT_S
 from armscan.utils.files import CONFIG_FILE, SHA256_TAGS

@@ -10,7 +10,7 @@ from scipy.stats import ttest_1samp
 
 from armscan.errors import StudyError
 from armscan.sweeps.results.summary import final_results, final_table
-from armscan.sweeps.scheduling.state import EPISODES, FINAL_SEED, FINALIST, METRICS
+from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIST, METRICS
 from armscan.training import Evaluation
 from tests.training.test_result_table import made_episodes, recomputed
 

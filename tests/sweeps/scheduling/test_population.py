@@ -12,9 +12,10 @@ from optuna.trial import TrialState
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import Population, PopulationSampler, _perturb, lineage, searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import LEASE, Limits, PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.state import Limits, PendingWrites, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.attribute_names import LEASE
 from armscan.sweeps.storage.attributes import check_trials
 from armscan.sweeps.storage.storage import open_storage
 

@@ -11,17 +11,8 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.scheduling.state import (
-    ATTEMPT,
-    FAILURE,
-    FINAL_SEED,
-    FINALIST,
-    LEASE,
-    RETRIED,
-    RETRY_OF,
-    PlannedTrial,
-    StudyState,
-)
+from armscan.sweeps.scheduling.state import PlannedTrial, StudyState
+from armscan.sweeps.storage.attribute_names import ATTEMPT, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, RETRY_OF
 from armscan.sweeps.workers import heartbeat as lease_module
 from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
 from armscan.utils.processes import ProcessInfo, process_start

@@ -13,16 +13,8 @@ from armscan.sweeps.results.judgement import best_metrics, judge, result_note
 from armscan.sweeps.results.selection import candidates_of
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import (
-    CONTROL,
-    FINALIST,
-    GENERATION,
-    MEMBER,
-    METRICS,
-    RETRIED,
-    SCHEDULE,
-    Limits,
-)
+from armscan.sweeps.scheduling.state import CONTROL, Limits
+from armscan.sweeps.storage.attribute_names import FINALIST, GENERATION, MEMBER, METRICS, RETRIED, SCHEDULE
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, training_of
 from armscan.sweeps.study.plan import final_trainings_left

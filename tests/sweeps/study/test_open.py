@@ -10,10 +10,10 @@ from optuna.trial import TrialState
 from optuna_dashboard import get_note, save_note
 
 from armscan.errors import TrackingError
+from armscan.sweeps.storage.attribute_names import NOTE_SUM, STUDY_RUN
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.dashboard import NOTE_SUM, note_run
+from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.open import open_for_work
-from armscan.sweeps.study.study import STUDY_RUN
 from armscan.tracking import open_store
 from tests.sweeps.study.test_study import settings
 

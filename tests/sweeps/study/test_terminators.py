@@ -12,8 +12,9 @@ from optuna.trial import create_trial
 
 from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import SEEDS, Limits, StudyState
+from armscan.sweeps.scheduling.state import Limits, StudyState
 from armscan.sweeps.scheduling.termination import Termination
+from armscan.sweeps.storage.attribute_names import SEEDS
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.terminators import BelowSeedNoise, Stagnation, seed_noise

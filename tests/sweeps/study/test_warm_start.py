@@ -8,8 +8,9 @@ from armscan.config.defaults import to_plain
 from armscan.config.sources import sweeps_folder
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL, TAKEN_FROM, Limits, StudyState
+from armscan.sweeps.scheduling.state import CONTROL, Limits, StudyState
 from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.attribute_names import TAKEN_FROM
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
 from armscan.sweeps.study.components import read_settings

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.scheduling.state import LEASE
+from armscan.sweeps.storage.attribute_names import LEASE
 from armscan.sweeps.workers import heartbeat
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.sweeps.workers.supervisor import local_workers

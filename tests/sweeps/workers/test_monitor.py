@@ -9,7 +9,8 @@ import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import FINAL_SEED, FINALIST, METRICS, STOP, Limits, PlannedTrial
+from armscan.sweeps.scheduling.state import Limits, PlannedTrial
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, METRICS, STOP
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.workers import monitor as module
 from armscan.sweeps.workers.monitor import StudyMonitor

@@ -17,7 +17,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from armscan.errors import StorageAwayError
 from armscan.sweeps.results import progress as screen
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import LEASE, RETRY_OF, Limits, PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.state import Limits, PendingWrites, TrialOutcome
+from armscan.sweeps.storage.attribute_names import LEASE, RETRY_OF
 from armscan.sweeps.storage.database import why_away
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.workers import heartbeat as lease

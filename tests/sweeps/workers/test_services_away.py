@@ -11,7 +11,7 @@ import optuna
 import pytest
 from mlflow import MlflowClient
 
-from armscan.sweeps.scheduling.state import RETRY_OF
+from armscan.sweeps.storage.attribute_names import RETRY_OF
 from armscan.sweeps.storage.storage import open_storage
 from tests.support.mlflow_server import mlflow_server
 from tests.support.postgres import postgres_server

@@ -13,9 +13,10 @@ import pytest
 
 from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL, FINAL_SEED, FINALIST, LEASE, METRICS, STOP, Limits, PlannedTrial
+from armscan.sweeps.scheduling.state import CONTROL, Limits, PlannedTrial
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.stop import stop_study, stop_trial
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, LEASE, METRICS, STOP
 from armscan.sweeps.storage.reports import reports_of
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.open import Phase
