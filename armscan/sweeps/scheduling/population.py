@@ -114,7 +114,7 @@ class Population:
                 return [self._planned(member, generation, parent.number, values, parent.user_attrs[SCHEDULE])]
         return []
 
-    def takeable(self, trials: Sequence[FrozenTrial]) -> set[int]:
+    def checkpoints_to_keep(self, trials: Sequence[FrozenTrial]) -> set[int]:
         """Return the numbers of the trials from whose last checkpoints a member may still continue.
 
         Those of a generation that all members have passed are not among them, nor those that cannot be among the best.

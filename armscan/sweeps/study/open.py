@@ -84,7 +84,7 @@ class Phase:
         if self.population is None:
             return
         trials = self.scheduler.study.get_trials(deepcopy=False)
-        kept = self.population.takeable(trials)
+        kept = self.population.checkpoints_to_keep(trials)
         for trial in trials:
             if trial.number not in kept:
                 for file in trial_folder(self.folder, trial.number).glob(f"seed_*/{LAST_CHECKPOINT}"):

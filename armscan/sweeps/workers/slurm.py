@@ -18,45 +18,45 @@ SOON, NOW = signal.SIGUSR2, signal.SIGTERM
 ASKING_S = 60
 
 
-class Notice:
-    """A signal of Slurm, if there was one, and how the job reacts.
+class SlurmSignals:
+    """Handlers of Slurm's signals in a job, and the job's reaction.
 
     Args:
         requeue: Submitit's own handler, which requeues this job and leaves; None outside of Slurm.
     """
 
     def __init__(self, requeue: Any) -> None:
-        self.is_given = False
+        self.is_received = False
         self._requeue = requeue
         self._worker: subprocess.Popen[bytes] | None = None
 
     @classmethod
     @contextlib.contextmanager
-    def taken(cls) -> Iterator[Self]:
-        """Take the signals of a Slurm job in place of submitit; a context to supervise a worker in."""
+    def handled(cls) -> Iterator[Self]:
+        """Handle the signals of a Slurm job in place of submitit; a context to supervise a worker in."""
         if os.environ.get("SUBMITIT_EXECUTOR") != "slurm":
             yield cls(None)
             return
-        notice = cls(signal.getsignal(SOON))
-        before = {each: signal.signal(each, notice._take) for each in (SOON, NOW)}
+        signals = cls(signal.getsignal(SOON))
+        before = {each: signal.signal(each, signals._receive) for each in (SOON, NOW)}
         try:
-            yield notice
+            yield signals
         finally:
             for each, handler in before.items():
                 signal.signal(each, handler)
 
-    def pass_on_to(self, worker: subprocess.Popen[bytes]) -> None:
-        """Pass signals on to a worker."""
+    def forward_to(self, worker: subprocess.Popen[bytes]) -> None:
+        """Forward signals to a worker."""
         self._worker = worker
-        if self.is_given:
+        if self.is_received:
             worker.terminate()
 
-    def _take(self, number: int, frame: FrameType | None) -> None:
-        self.is_given = True
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        self.is_received = True
         if self._worker is not None and self._worker.returncode is None:
             os.kill(self._worker.pid, number)
 
-    def follow(self) -> None:
+    def requeue_job(self) -> None:
         """Requeue the job, unless Slurm ends it for good.
 
         Returns if it does: then the job has a result, and its launcher waits only for the others.

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from armscan.errors import ArmscanError, AwayError, StudyError
-from armscan.sweeps.workers.slurm import SOON, Notice
+from armscan.sweeps.workers.slurm import SOON, SlurmSignals
 from armscan.utils.processes import ProcessInfo, child_command, on_parent_exit
 
 LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
@@ -49,13 +49,13 @@ def run_worker(words: Sequence[str], number: int, folder: Path) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     study_input = pickle.dumps((list(words), number, folder))
     n_errors = 0
-    with Notice.taken() as notice, (folder / f"worker-{number}.log").open("ab") as log_file:
+    with SlurmSignals.handled() as signals, (folder / f"worker-{number}.log").open("ab") as log_file:
         for _ in range(MAX_RESTARTS):
             if not launcher.is_alive or (folder / STOP_FILE).exists():
                 return
-            code = _worked(study_input, launcher.directory, log_file, notice)
-            if notice.is_given and code not in (0, AWAY):
-                notice.follow()
+            code = _worked(study_input, launcher.directory, log_file, signals)
+            if signals.is_received and code not in (0, AWAY):
+                signals.requeue_job()
                 return
             if code in ENDS:
                 return
@@ -75,7 +75,7 @@ def _launcher_of(folder: Path) -> ProcessInfo:
     )
 
 
-def _worked(study_input: bytes, directory: str, log_file: BinaryIO, notice: Notice) -> int:
+def _worked(study_input: bytes, directory: str, log_file: BinaryIO, signals: SlurmSignals) -> int:
     """Run the process of a worker to its end; return its exit code."""
     with subprocess.Popen(
         child_command(__name__, worker_main.__name__),
@@ -86,7 +86,7 @@ def _worked(study_input: bytes, directory: str, log_file: BinaryIO, notice: Noti
         stderr=log_file,
         start_new_session=True,
     ) as worker:
-        notice.pass_on_to(worker)
+        signals.forward_to(worker)
         worker.communicate(study_input)
         return worker.returncode
 

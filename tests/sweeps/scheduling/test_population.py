@@ -93,10 +93,10 @@ def test_each_member_completes_each_generation_once_although_workers_die_and_tri
     tmp_path, n_workers, p_death, p_failure
 ):
     simulation = Simulation(tmp_path)
-    takeable = []
+    to_keep = []
 
     def seen():
-        takeable.append((len(simulation.trials), simulation.population.takeable(simulation.trials)))
+        to_keep.append((len(simulation.trials), simulation.population.checkpoints_to_keep(simulation.trials)))
 
     simulation.run(n_workers, random.Random(n_workers), p_death, p_failure, seen)
     trials = simulation.trials
@@ -109,15 +109,15 @@ def test_each_member_completes_each_generation_once_although_workers_die_and_tri
             assert parent.state == TrialState.COMPLETE
             assert parent.user_attrs["generation"] == trial.user_attrs["generation"] - 1
             # Every decision before its claim has kept the checkpoint of its parent.
-            before = [kept for n_trials, kept in takeable if parent.number < n_trials <= trial.number]
+            before = [kept for n_trials, kept in to_keep if parent.number < n_trials <= trial.number]
             assert all(parent.number in kept for kept in before)
         start = trial.user_attrs["generation"] * INTERVAL
         assert trial.user_attrs["interval"] == [start, start + INTERVAL]
     # What was given up once is never wanted again, and little is kept.
-    for (n_before, before), (_, after) in pairwise(takeable):
+    for (n_before, before), (_, after) in pairwise(to_keep):
         assert not {each for each in after if each < n_before} - before
-    assert max(len(kept) for _, kept in takeable) <= 3 * SIZE + 2 * n_workers
-    assert simulation.population.takeable(trials) == set()
+    assert max(len(kept) for _, kept in to_keep) <= 3 * SIZE + 2 * n_workers
+    assert simulation.population.checkpoints_to_keep(trials) == set()
     assert (
         simulation.scheduler.end_reason(simulation.scheduler.state()) == f"{SIZE * N_GENERATIONS} trials have finished"
     )
