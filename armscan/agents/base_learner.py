@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from armscan.agents.policy import Policy, clip_action
 from armscan.agents.protocols import AgentSetup
 from armscan.envs.vector_env import ArmscanVectorEnv
 from armscan.errors import CheckpointError, DivergedError
@@ -86,6 +87,10 @@ class SupervisedLearner(BaseLearner):
     def n_env_steps(self) -> int:
         """Environment steps taken so far, the starts of episodes included."""
         return self._n_env_steps
+
+    def policy(self) -> Policy:
+        """Return a copy of the network that `act` evaluates."""
+        return Policy(self._network, clip_action, self._compute)
 
     def warm_up(self) -> None:
         """Do nothing: the first planes already count for learning."""

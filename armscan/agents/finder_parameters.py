@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar
@@ -120,6 +121,11 @@ class FinderParameters:
         for name, limit in (("sure_mm", self.sure_mm), ("sure_deg", self.sure_deg)):
             if limit is not None:
                 check_float(f"agent.{name}", limit, above=0.0)
+
+    def lr_after(self, n_env_steps: int, total_env_steps: int) -> float:
+        """Return the learning rate after `n_env_steps`: half a cosine from `lr` to `lr_end_factor` times as much."""
+        fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, n_env_steps / total_env_steps)))
+        return self.lr * (self.lr_end_factor + (1.0 - self.lr_end_factor) * fall)
 
     @property
     def n_looks(self) -> int:

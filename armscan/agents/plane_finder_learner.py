@@ -15,7 +15,7 @@ from armscan.agents.base_learner import SupervisedLearner, diverged, teacher_of
 from armscan.agents.finder_parameters import FinderParameters
 from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork, PlaneModule, looks_of
 from armscan.agents.plane_geometry import common_geometry
-from armscan.agents.policy import Policy, batch_of, clip_action
+from armscan.agents.policy import batch_of
 from armscan.agents.protocols import AgentSetup
 from armscan.envs.actions import ActionBounds
 from armscan.envs.history import rows_of
@@ -117,8 +117,7 @@ class PlaneFinderLearner(SupervisedLearner):
         errors = torch.stack([off[:, 2].abs(), torch.rad2deg(off[:, :2].norm(dim=1))], dim=1)
         # The likelihood of errors that are distributed exponentially about their mean.
         doubt = (expected.log() + errors / expected).mean()
-        fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, self._n_env_steps / self._total_env_steps)))
-        self._set_lr(finder.lr * (finder.lr_end_factor + (1.0 - finder.lr_end_factor) * fall))
+        self._set_lr(finder.lr_after(self._n_env_steps, self._total_env_steps))
         self._optimiser.zero_grad()
         torch.autograd.backward(loss + DOUBT_WEIGHT * doubt)
         self._optimiser.step()
@@ -150,13 +149,12 @@ class PlaneFinderLearner(SupervisedLearner):
         with torch.no_grad():
             observations, _ = reset_each(envs, seed)
             optima = self._optima(envs)
-            for is_last in [False] * (self._finder.n_looks - 1) + [True]:
-                (actions, expected), _ = self._module(self._tensors(observations))
-                if is_last:
-                    break
+            for _ in range(self._finder.n_looks - 1):
+                (actions, _), _ = self._module(self._tensors(observations))
                 if self._has_stop:
                     actions[:, 4] = -1.0
                 observations = envs.step(actions.cpu().numpy())[0]
+            (actions, expected), _ = self._module(self._tensors(observations))
             errors = self._module.geometry.errors(self._module.geometry.planes(actions[:, :4]), optima)
             self._module.calibration.mul_(errors.mean(0) / expected.mean(0).clamp(min=1e-6))
         metrics = {}
@@ -212,7 +210,3 @@ class PlaneFinderLearner(SupervisedLearner):
             actions.append(self.act(rows_of(observations, row), reward))
             self.expected_errors[episode] = self.expected_error
         return np.array(actions)
-
-    def policy(self) -> Policy:
-        """Return a copy of the network that `act` evaluates."""
-        return Policy(self._network, clip_action, self._compute)

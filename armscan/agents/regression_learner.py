@@ -14,7 +14,7 @@ from armscan.agents.base_learner import SupervisedLearner, diverged, prepare_tor
 from armscan.agents.hyperparameters import Parameters
 from armscan.agents.inference import Inference
 from armscan.agents.networks import Network
-from armscan.agents.policy import Batch, Policy, clip_action
+from armscan.agents.policy import Batch, clip_action
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.supervised_buffer import SupervisedBuffer
 from armscan.envs.actions import ActionBounds
@@ -129,10 +129,6 @@ class RegressionLearner(SupervisedLearner):
     def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return the optimal action as predicted from each observation alone, shape (n, n_action)."""
         return self._inference.actions(observations, episodes)
-
-    def policy(self) -> Policy:
-        """Return a copy of the network that `act` asks."""
-        return Policy(self._network, clip_action, self._compute)
 
     def state(self) -> dict[str, Any]:
         """Return network, optimiser, examples and counters."""

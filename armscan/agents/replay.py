@@ -26,8 +26,8 @@ class Replay(VectorReplayBuffer):
     def hasnull(self) -> bool:
         """Return False: nothing is NaN.
 
-        Tianshou's collectors ask at every collection, and searching all that is kept costs more the fuller it is; the
-        environment's observations are clipped counts and finite by construction.
+        Tianshou's collectors ask at every collection, and searching all that is kept costs more the fuller it is.
+        Weights that have diverged are found after each epoch.
         """
         return False
 
@@ -56,7 +56,7 @@ class Replay(VectorReplayBuffer):
         return places, returns, lengths, starts + self._offset[ids]
 
     def seed(self, seed: int) -> None:
-        """Seed the drawing of samples; every ring has a generator of its own, all with the same seed."""
+        """Seed the generators of the buffer and of its rings, each with a child of the seed."""
         children = np.random.SeedSequence(seed).spawn(1 + len(self.buffers))
         for ring, child in zip((self, *self.buffers), children, strict=True):
             ring._random_state.seed(child.generate_state(1))

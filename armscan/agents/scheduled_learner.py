@@ -56,6 +56,26 @@ class ScheduledLearner:
         """Return how the actions of evaluations are chosen, if the learner has such a note."""
         return getattr(self._learner, "validation_note", None)
 
+    @property
+    def warm_up_note(self) -> str | None:
+        """Return what the learner did before its first gradient step, if it has such a note."""
+        return getattr(self._learner, "warm_up_note", None)
+
+    @property
+    def expected_error(self) -> tuple[float, float] | None:
+        """Return the error of the last plane that the learner expects, in mm and degrees, if it expects one."""
+        return getattr(self._learner, "expected_error", None)
+
+    @property
+    def expected_errors(self) -> FloatArray:
+        """Return `expected_error` of each episode side by side, shape (n, 2).
+
+        Raises:
+            AttributeError: If the learner expects none.
+        """
+        errors: FloatArray = self._batch.expected_errors  # type: ignore[attr-defined]
+        return errors
+
     def warm_up(self) -> None:
         """See `Learner.warm_up`."""
         self._learner.warm_up()

@@ -160,8 +160,9 @@ def evaluate(
     console = wide_console()
     for part in evaluation.report_tables(report, console.width):
         console.print(part)
-    for label, table in report.tables().items():
-        print_table(label, table, how=label == list(report.tables())[-1])
+    tables = report.tables()
+    for label, table in tables.items():
+        print_table(label, table, how=label == [*tables][-1])
     print_where_to_look(Path.cwd(), tracking, files=(str(file),))
 
 

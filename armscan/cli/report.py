@@ -48,10 +48,10 @@ def report(study: str | None, runs: str | None, out: Path | None, watch: bool, s
         nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
         if not nearest.is_dir():
             raise InvalidValueError(f"--out is {str(out)!r}, but {nearest} is not a folder: name one, or a new one")
-    # Deferred: a mistake on the command line is answered before these are loaded.
-    from armscan.reports.runs import compare_runs
-
     if runs is not None:
+        # Deferred: a mistake on the command line is answered before these are loaded.
+        from armscan.reports.runs import compare_runs
+
         file = compare_runs(runs, tracking, None if out is None else str(out))
     elif study is not None:
         write = _reporter_on_study(study, storage, out)

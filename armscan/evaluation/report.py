@@ -86,8 +86,7 @@ class EvaluationReport:
         """Return evaluations by the name of their volumes, with all of them together if they are to be pooled."""
         if not self.has_total or len(evaluations) < 2:
             return dict(evaluations)
-        everything = tuple(episode for each in evaluations.values() for episode in each.episodes)
-        return {**evaluations, TOTAL: Evaluation(everything, next(iter(evaluations.values())).on_plane)}
+        return {**evaluations, TOTAL: Evaluation.pooled([*evaluations.values()])}
 
     @cached_property
     def by_volume(self) -> dict[str, dict[str, MetricEstimates]]:
@@ -131,10 +130,10 @@ class EvaluationReport:
         for volumes in self.by_volume.values():
             for name, metrics in volumes.items():
                 groups[f"volume/{REFUSED_BY_MLFLOW.sub('_', name)}"] = metrics.metrics()
+        shown = {label: [column.metric for column in table.quantities] for label, table in self.tables().items()}
         for name, by_split in self.baselines_by_split.items():
-            for label, table in self.tables().items():
-                shown = [column.metric for column in table.quantities]
-                groups[f"{name}/{label}".replace(" ", "_")] = by_split[label].shown_metrics(shown)
+            for label, names in shown.items():
+                groups[f"{name}/{label}".replace(" ", "_")] = by_split[label].shown_metrics(names)
         return groups
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,7 +43,10 @@ def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
         for name, evaluation in _evaluations(folder).items():
             title = ", ".join(filter(None, (name, others)))
             tested.setdefault(title, {}).setdefault(training, []).append(evaluation)
-    joined = {title: _joined(each) for title, each in tested.items()}
+    joined = {
+        title: {training: Evaluation.pooled(each) for training, each in by_training.items()}
+        for title, by_training in tested.items()
+    }
     figures = {title: MetricEstimates.of_trainings(each) for title, each in joined.items()}
     ours: dict[str, MetricEstimates] = {}
     randoms: dict[str, MetricEstimates] = {}
@@ -63,14 +65,6 @@ def _evaluations(folder: Path) -> dict[str, Evaluation]:
     return {AGENT: agent, **{f"{name}{ALL_FOLDS}": Evaluation.of_dict(each) for name, each in baselines.items()}}
 
 
-def _joined(by_training: Mapping[str, Sequence[Evaluation]]) -> dict[str, Evaluation]:
-    """Return the episodes of all folds of each training together."""
-    return {
-        training: Evaluation(tuple(e for each in evaluations for e in each.episodes), evaluations[0].on_plane)
-        for training, evaluations in by_training.items()
-    }
-
-
 def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: str) -> None:
     """Keep the table of all folds in the grid's folder, and with its figures in the grid's run.
 
@@ -79,13 +73,15 @@ def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: s
     """
     from mlflow.entities import Metric
 
+    from armscan.tracking.outbox import now_ms
+
     file = folder / RESULTS_PAGE
     text = page("all folds (test)", table.html())
     atomic_write(file, methodcaller("write", text.encode()))
-    now_ms = int(time.time() * 1000)
+    time_ms = now_ms()
     groups = {title: TEST_GROUP if title == AGENT else title.removesuffix(ALL_FOLDS) for title in table.results}
     metrics = [
-        Metric(f"{group}/{name}", value, now_ms, 0)
+        Metric(f"{group}/{name}", value, time_ms, 0)
         for title, group in groups.items()
         # Of several kinds of runs the page tells.
         if title.endswith(ALL_FOLDS)

@@ -37,6 +37,7 @@ from armscan.utils.files import LAST_CHECKPOINT, RESULTS_PAGE, atomic_write
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
+    from armscan.tracking import TrackingStore
     from armscan.training import ResultTable
 
 # Hydra's own overrides that say that there are several jobs, and where.
@@ -126,17 +127,17 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
     word = json.loads((Multirun.folder / PARENT_FILE).read_text())
     try:
-        runs, is_known = _close_parent(Multirun.folder, word, status, failed), True
+        store, runs = _close_parent(Multirun.folder, word, status, failed)
     except TrackingError as error:
         print(f"{error}; {armscan_command('runs', 'sync', str(Multirun.folder))} delivers the rest", file=sys.stderr)
-        runs, is_known = [], False
+        store, runs = None, []
     if outcomes:
         from armscan.experiment.console import print_jobs, print_where_to_look
 
         table = print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
-        if runs:
-            _keep_page(table, Multirun.folder, word)
-            _pool_folds(Multirun.folder, word, outcomes, runs)
+        if store is not None and runs:
+            _keep_page(table, Multirun.folder, word, store)
+            _pool_folds(Multirun.folder, word, outcomes, runs, store)
             print_where_to_look(Multirun.folder, word["tracking"]["uri"], files=(RESULTS_PAGE, ""))
             compare = armscan_command("report", "--runs", word["run_id"], tracking=word["tracking"]["uri"])
             print(f"compare   {compare}")
@@ -151,45 +152,49 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     if runs and status != "FINISHED":
         again = resume_command(word["run_id"], word["tracking"]["uri"], trust=word["trust"])
         print(f"resume all with: {again}", file=sys.stderr)
-    if is_known and not runs:
+    if store is not None and not runs:
         remove_run_folder(Multirun.folder)
     return 1 if failed or not outcomes else 0
 
 
-def _keep_page(table: ResultTable, folder: Path, word: Mapping[str, Any]) -> None:
+def _keep_page(table: ResultTable, folder: Path, word: Mapping[str, Any], store: TrackingStore) -> None:
     """Keep the table of the jobs as a page, in the grid's folder and with its parent run."""
     from armscan.reports.html import page
-    from armscan.tracking import open_store
     from armscan.tracking.uploader import leave_note
 
     file, n_jobs = folder / RESULTS_PAGE, sum(map(bool, table.facts["outcome"]))
     body = f"<p><code>{html.escape(' '.join(word['overrides']))}</code></p>{table.html()}"
     atomic_write(file, methodcaller("write", page(f"Grid of {n_jobs} job{'s' if n_jobs > 1 else ''}", body).encode()))
-    store, _ = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
     store.log_artifact(word["run_id"], str(file))
     leave_note(store, word["run_id"], table.markdown())
 
 
-def _pool_folds(folder: Path, word: Mapping[str, Any], outcomes: Mapping[str, JobOutcome], runs: Sequence[Run]) -> None:
+def _pool_folds(
+    folder: Path,
+    word: Mapping[str, Any],
+    outcomes: Mapping[str, JobOutcome],
+    runs: Sequence[Run],
+    store: TrackingStore,
+) -> None:
     """Print one table over all folds of a cross-validation, and keep it with the parent run."""
     from armscan.experiment.console import print_table
     from armscan.launch.folds_table import folds_table, keep_table
-    from armscan.tracking import open_store
 
     finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
     table = folds_table((Path(run.data.tags["folder"]), outcomes[run.data.tags[JOB_TAG]].varied) for run in finished)
     if table is not None:
         left_out = len(outcomes) - len(finished)
         print_table("all folds (test)", table, [f"{left_out} of {len(outcomes)} jobs are missing"] if left_out else [])
-        store, _ = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
         keep_table(table, folder, store, word["run_id"])
 
 
-def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Mapping[str, JobOutcome]) -> list[Run]:
+def _close_parent(
+    folder: Path, word: Mapping[str, Any], status: str, failed: Mapping[str, JobOutcome]
+) -> tuple[TrackingStore, list[Run]]:
     """Close the parent run and the open runs of killed jobs; delete the parent if no job has started a run.
 
     Returns:
-        The runs of the jobs that started one, in the order of the jobs.
+        The tracking store, and the runs of the jobs that started one, in the order of the jobs.
     """
     from armscan.launch.best_job import show_best
     from armscan.tracking import note_end, open_store, sync
@@ -216,4 +221,4 @@ def _close_parent(folder: Path, word: Mapping[str, Any], status: str, failed: Ma
         store.delete_run(word["run_id"])
     else:
         show_best(store, word["run_id"], children)
-    return sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))
+    return store, sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from armscan.reports.charts import MANY, Curves, colours, final_chart, learning_curves
-from armscan.reports.csv_tables import all_numbers, run_rows
+from armscan.reports.csv_tables import all_numbers
 from armscan.reports.curves import AXES, curve_of
 from armscan.reports.groups import Group
 from armscan.reports.html import Markup, chart, folded, table, write_page
@@ -82,6 +82,8 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     reached = [final_metrics(group) for group in groups]
     pairs = compare_groups(groups)
     final = final_table(groups, reached)
+    tables = all_numbers(groups, curves, reached, pairs)
+    titles = validation_titles(figures)
     parts = [
         f"<p><strong>{html.escape(final.headline)}</strong></p>" if final.headline else "",
         _summary(groups),
@@ -90,11 +92,11 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
         *_final(groups, reached, replace(final, headline="")),
         *_better(groups, pairs),
         videos(groups),
-        *_of_the_training(groups, curves, [figure for figure in figures if figure not in validation_titles(figures)]),
+        *_of_the_training(groups, curves, [figure for figure in figures if figure not in titles]),
         "<h2>Runs</h2>",
-        table(run_rows(groups), what="runs"),
+        table(tables["runs"], what="runs"),
     ]
-    return write_page(folder, title, parts, all_numbers(groups, curves, reached, pairs))
+    return write_page(folder, title, parts, tables)
 
 
 def _figures(groups: Sequence[Group]) -> list[str]:

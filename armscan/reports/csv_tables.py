@@ -9,7 +9,7 @@ from armscan.reports.charts import Curves
 from armscan.reports.groups import Group
 from armscan.reports.html import Row
 from armscan.reports.load import TrackedTraining
-from armscan.reports.significance import Pair, evaluations_by_seed, metrics_by_volume
+from armscan.reports.significance import Pair, metrics_by_volume
 from armscan.training import MetricEstimates
 
 
@@ -66,8 +66,10 @@ def _seed_rows(groups: Sequence[Group]) -> Iterator[Row]:
 
 def _final_rows(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Iterator[Row]:
     for group, figures in zip(groups, reached, strict=True):
-        for name, estimate in figures.estimates.items() if figures else ():
-            yield {"group": group.name, "seeds": len(evaluations_by_seed(group)), "figure": name, **estimate._asdict()}
+        if figures is None:
+            continue
+        for name, estimate in figures.estimates.items():
+            yield {"group": group.name, "seeds": figures.n_seeds, "figure": name, **estimate._asdict()}
 
 
 def _volume_rows(groups: Sequence[Group]) -> Iterator[Row]:

@@ -14,7 +14,7 @@ from mlflow.store.artifact.artifact_repository_registry import get_artifact_repo
 
 from armscan.config.legacy import migrate
 from armscan.errors import TrackingError
-from armscan.reports.select import ID_CHARS, SelectedRuns
+from armscan.reports.select import SelectedRuns
 from armscan.stats.on_plane import leading_of, limits_among
 from armscan.tracking import TrackingStore
 from armscan.tracking.histories import History, metric_histories
@@ -22,7 +22,7 @@ from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
 from armscan.training import TEST, Evaluation
 from armscan.utils.arrays import FloatArray
-from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE, sha256
+from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, ID_CHARS, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE, sha256
 
 WALL = "wall_s"
 VALIDATION = {

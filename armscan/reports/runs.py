@@ -9,8 +9,9 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from armscan.reports.select import EXPERIMENT, ID_CHARS, find_trainings, read_runs
+from armscan.reports.select import EXPERIMENT, find_trainings, read_runs
 from armscan.tracking import open_existing_store
+from armscan.utils.files import ID_CHARS
 
 REPORTS = Path("reports")
 # A folder of more runs than fit is named by a sum of them.

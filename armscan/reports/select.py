@@ -21,7 +21,6 @@ PRUNED_TAG, TRIAL_TAG, JOB_TAG = "pruned", "trial", "job"
 # A loaded server takes longer for more than it is waited for.
 PAGE_SIZE = 100
 N_SHOWN = 6
-ID_CHARS = 8
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def evaluations_by_seed(group: Group) -> dict[str, Evaluation]:
     for training in group.trainings:
         if training.evaluation is not None:
             played[training.seed or training.run_id].append(training.evaluation)
-    return {seed: _joined(evaluations) for seed, evaluations in played.items()}
+    return {seed: Evaluation.pooled(evaluations) for seed, evaluations in played.items()}
 
 
 def final_metrics(group: Group) -> MetricEstimates | None:
@@ -54,7 +54,9 @@ def final_metrics(group: Group) -> MetricEstimates | None:
     played, random = evaluations_by_seed(group), _baselines(group).get(RANDOM)
     if not played:
         return None
-    return beside_random(MetricEstimates.of_trainings(played), [*played.values()], _joined(random) if random else None)
+    return beside_random(
+        MetricEstimates.of_trainings(played), [*played.values()], Evaluation.pooled(random) if random else None
+    )
 
 
 def compare_groups(groups: Sequence[Group]) -> dict[str, list[Pair]]:
@@ -91,7 +93,7 @@ def baseline_metrics(groups: Sequence[Group]) -> list[dict[str, MetricEstimates]
     on the same volumes by the same rules.
     """
     metrics = cache(MetricEstimates.of)
-    return [{name: metrics(_joined(each)) for name, each in _baselines(group).items()} for group in groups]
+    return [{name: metrics(Evaluation.pooled(each)) for name, each in _baselines(group).items()} for group in groups]
 
 
 def _baselines(group: Group) -> dict[str, list[Evaluation]]:
@@ -99,11 +101,6 @@ def _baselines(group: Group) -> dict[str, list[Evaluation]]:
     of_fold = {each.fold: each.baselines for each in reversed(group.trainings) if each.baselines}
     names = dict.fromkeys(name for baselines in of_fold.values() for name in baselines)
     return {name: [each[name] for each in of_fold.values() if name in each] for name in names}
-
-
-def _joined(evaluations: Sequence[Evaluation]) -> Evaluation:
-    episodes = tuple(episode for each in evaluations for episode in each.episodes)
-    return Evaluation(episodes, evaluations[0].on_plane)
 
 
 def _scores(trainings: Sequence[Mapping[str, Mapping[str, float]]], figure: str) -> FloatArray:

@@ -43,13 +43,13 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
         settings.check_workers(len(os.sched_getaffinity(0)))
     population_of(settings, config)
     # Before the space is checked, which takes seconds, and anything is made.
-    existing = existing_study(settings, to_plain(config))
+    storage = existing_storage(settings.storage)
+    existing = existing_study(storage, settings, to_plain(config))
     if not given.is_plan:
         check_launcher(launcher)
     check_space(settings, task, trial_words, config)
     initial = initial_trials(settings, trial_words, to_plain(config), existing)
     if given.is_plan:
-        storage = existing_storage(settings.storage)
         final = FinalEvaluation.stored(storage, existing) if storage is not None and existing is not None else None
         print_plan(settings, existing, final, initial)
         return 0

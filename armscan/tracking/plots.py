@@ -17,6 +17,8 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    from armscan.training.callbacks import best_of
+
     steps = [report.n_env_steps for report in reports]
     figure = Figure(figsize=(8, 5.4))
     # A layout that matplotlib finds by itself takes a second drawing.
@@ -37,7 +39,7 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
     ]
     if trained:
         lengths.plot(*zip(*trained, strict=True), marker=".", alpha=0.6, label="training, exploring")
-    best = [report for report in reports if report.is_best][-1]
+    best = best_of(reports)
     for axes in (rates, lengths):
         axes.axvline(best.n_env_steps, color="grey", linestyle=":", label=f"best epoch, kept: step {best.n_env_steps}")
     lengths.set_ylabel("steps, mean")

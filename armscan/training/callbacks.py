@@ -30,6 +30,11 @@ class EpochReport:
     is_best: bool
 
 
+def best_of(reports: Sequence[EpochReport]) -> EpochReport:
+    """Return the best epoch, whose weights are kept."""
+    return [report for report in reports if report.is_best][-1]
+
+
 class Callback(Protocol):
     """Receives the events of a training."""
 

@@ -16,7 +16,7 @@ from typing import Any
 from armscan.agents.protocols import Learner
 from armscan.errors import CheckpointError
 from armscan.stats.on_plane import ON_PLANE
-from armscan.training.callbacks import EpochReport
+from armscan.training.callbacks import EpochReport, best_of
 from armscan.training.checkpoint_file import load_checkpoint, save_checkpoint
 from armscan.training.episode_results import Evaluation
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprints_in
@@ -78,7 +78,7 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
     if not last.exists():
         return []
     reports = _restore(learner, last, provenance)
-    best_report = [report for report in reports if report.is_best][-1]
+    best_report = best_of(reports)
     if best_report is reports[-1]:
         # A kill may have come before this was written.
         save_checkpoint(best, learner.weights(), _facts(best_report, provenance))
@@ -115,7 +115,7 @@ def take_over_checkpoints(
     weights, best_facts = load_checkpoint(source / BEST_CHECKPOINT)
     theirs.check(source / BEST_CHECKPOINT, best_facts)
     reports = _restore(learner, source / LAST_CHECKPOINT, theirs)
-    best_report = [report for report in reports if report.is_best][-1]
+    best_report = best_of(reports)
     save_checkpoint(folder / BEST_CHECKPOINT, weights, _facts(best_report, own))
     # Last: from then on this training can be resumed.
     save_checkpoint(

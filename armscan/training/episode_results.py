@@ -128,6 +128,11 @@ class Evaluation:
         return cls(tuple(_episode_of(each) for each in episodes), check_on_plane("on_plane", on_plane))
 
     @classmethod
+    def pooled(cls, evaluations: Sequence[Evaluation]) -> Self:
+        """Return the episodes of evaluations together, one at least, with the limits of the first."""
+        return cls(tuple(episode for each in evaluations for episode in each.episodes), evaluations[0].on_plane)
+
+    @classmethod
     def of_dict(cls, contents: Mapping[str, Any]) -> Self:
         """Return the evaluation that `to_dict` has given; see `of_plain`."""
         return cls.of_plain(contents["episodes"], contents.get("on_plane", ON_PLANE))

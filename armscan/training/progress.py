@@ -99,8 +99,7 @@ class ProgressLines:
 def _summary(report: EpochReport) -> str:
     """Return the figures of an epoch's validation, the leading rate first."""
     evaluation = report.evaluation
-    leading, metrics = evaluation.on_plane[0], evaluation.metrics()
     return (
-        f"{leading.title} {evaluation.on_plane_rate:4.0%}  success {metrics['success_rate']:4.0%}  "
-        f"steps {metrics['mean_steps']:5.2f}"
+        f"{evaluation.on_plane[0].title} {evaluation.on_plane_rate:4.0%}  success {evaluation.success_rate:4.0%}  "
+        f"steps {evaluation.mean_steps:5.2f}"
     )

@@ -116,9 +116,9 @@ def nifti_data(
 
     Args:
         path: Folder of the volumes.
-        validation: Share of the subjects, in (0, 1), rounded up, or names of subjects or volumes. None: the manifest's
+        validation: Share of the subjects, in (0, 1], rounded up, or names of subjects or volumes. None: the manifest's
             splits; a quarter if it has none or `test` is given; the next fold with `folds`.
-        test: Share of the subjects, in (0, 1), rounded up, or names of subjects or volumes. None: the manifest's
+        test: Share of the subjects, in (0, 1], rounded up, or names of subjects or volumes. None: the manifest's
             splits; a quarter if it has none or `validation` is given. Must be None with `folds`.
         split_seed: Seed that draws the subjects of shares and folds. Default: 0.
         folds: Cross-validation: `leave_one_out` makes each subject a fold; a number gives the number of folds. Default:

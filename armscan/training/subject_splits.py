@@ -136,7 +136,7 @@ def _share(name: str, given: object) -> float:
         return check_float(name, given, above=0.0, at_most=1.0)
     except InvalidValueError as error:
         raise InvalidValueError(
-            f"{name} is {given!r}, but it must be a share above 0 and below 1, or names of subjects or volumes"
+            f"{name} is {given!r}, but it must be a share above 0 and at most 1, or names of subjects or volumes"
         ) from error
 
 

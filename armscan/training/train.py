@@ -11,7 +11,7 @@ from typing import Any
 from armscan.agents.protocols import Learner
 from armscan.agents.schedule import Segment, read_schedule
 from armscan.errors import InvalidValueError
-from armscan.training.callbacks import Callback, EpochReport
+from armscan.training.callbacks import Callback, EpochReport, best_of
 from armscan.training.checkpoint_file import load_checkpoint
 from armscan.training.checkpoints import CheckpointProvenance, save_checkpoints
 from armscan.training.episode_results import BEST_BY, SUCCESS, Evaluation
@@ -101,7 +101,7 @@ class TrainingResult:
     @property
     def best(self) -> EpochReport:
         """The epoch whose weights the learner holds."""
-        return [report for report in self.reports if report.is_best][-1]
+        return best_of(self.reports)
 
 
 def train(
@@ -144,13 +144,14 @@ def train(
             metrics = learner.learn(min(budget.eval_every_env_steps, budget.env_steps - learner.n_env_steps))
             evaluation = validate()
             by = budget.best_by
+            score = evaluation.score(by)
             report = EpochReport(
                 epoch=len(reports) + 1,
                 n_env_steps=learner.n_env_steps,
                 wall_s=time.perf_counter() - start_s,
                 metrics=metrics,
                 evaluation=evaluation,
-                is_best=all(evaluation.score(by) > before.evaluation.score(by) for before in reports),
+                is_best=all(score > before.evaluation.score(by) for before in reports),
             )
             reports.append(report)
             save_checkpoints(learner, reports, folder, provenance)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from armscan.config.services import MLFLOW_PORT
+from armscan.sweeps.storage import attribute_names as names
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
@@ -16,20 +17,23 @@ if TYPE_CHECKING:
 STUDIES = re.compile(r"/api/studies(/\d+)?")
 # Where notes of runs lead that no server keeps.
 LOCAL_RUNS = re.compile(rf"http://127\.0\.0\.1:{MLFLOW_PORT}(?=/#/)")
-# Attributes that are kept of a study and of its trials, by which they are known.
-OF_STUDY, OF_TRIAL = {"space", "fixed_config", "objectives"}, {"lease", "config_sha256", "judged"}
-HIDDEN_OF_STUDY = OF_STUDY | {"mlflow_run", "note_sha256", "forgiven"}
-# The note has the run, the folder and the figures of the seeds.
-HIDDEN = {"lease", "figures", "seeds", "config_sha256", "attempt", "retried", "mlflow_run", "folder"}
+# Attributes by which trials of armscan are known.
+OF_TRIAL = {names.LEASE, names.CONFIG_SHA256, names.FINALIST}
+HIDDEN_OF_STUDY = names.OF_STUDY | {names.STUDY_RUN, names.NOTE_SUM, names.RESET_FAILURES}
+# The note has the run, the folder and the metrics of the seeds.
+HIDDEN = {
+    *(names.LEASE, names.METRICS, names.SEEDS, names.CONFIG_SHA256),
+    *(names.ATTEMPT, names.RETRIED, names.RUN, names.FOLDER),
+}
 NAMES = {
-    "env_steps": "environment steps",
-    "retry_of": "retry of trial",
-    "judged": "final training of trial (-1: the control)",
-    "judged_seed": "seed",
-    "stop": "stopped",
+    names.ENV_STEPS: "environment steps",
+    names.RETRY_OF: "retry of trial",
+    names.FINALIST: "final training of trial (-1: the control)",
+    names.FINAL_SEED: "seed",
+    names.STOP: "stopped",
 }
 # Of a running trial, from what its worker reports.
-PROGRESS = {"worker": "worker", "seed": "seed", "env_steps": "environment steps", "return": "return, mean"}
+PROGRESS = {"worker": "worker", "seed": "seed", names.ENV_STEPS: "environment steps", "return": "return, mean"}
 TELL = re.compile(r"/api/trials/(\d+)/tell")
 
 
@@ -73,7 +77,7 @@ class DashboardView:
             text = LOCAL_RUNS.sub(lambda _: str(self._mlflow), text)
         answer = json.loads(text)
         for study in (answer, *answer.get("study_summaries", ())):
-            if {each["key"] for each in study.get("user_attrs", ())} >= OF_STUDY:
+            if {each["key"] for each in study.get("user_attrs", ())} >= names.OF_STUDY:
                 study["user_attrs"] = [each for each in study["user_attrs"] if each["key"] not in HIDDEN_OF_STUDY]
         trials = [*answer.get("trials", ()), *answer.get("best_trials", ())]
         ours = [trial for trial in trials if OF_TRIAL & {each["key"] for each in trial["user_attrs"]}]
@@ -92,7 +96,7 @@ def _attributes(trial: Mapping[str, Any]) -> list[dict[str, str]]:
     if trial["state"] == "Running":
         lease: Any = {}
         with contextlib.suppress(ValueError):
-            lease = json.loads(values.get("lease", "{}"))
+            lease = json.loads(values.get(names.LEASE, "{}"))
         if isinstance(lease, dict):
             progress = {name: lease[key] for key, name in PROGRESS.items() if key in lease}
             shown |= {

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -21,7 +20,7 @@ from pathlib import Path
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, RunTag
 
-from benchmarks.speed.checkouts import HERE
+from benchmarks.speed.checkouts import HERE, children_processor_s
 from tests.support.mlflow_server import mlflow_server
 
 SMALL = (
@@ -40,7 +39,7 @@ AT_ONCE = 1000
 
 def armscan(checkout: Path, folder: Path, *words: str, uri: str) -> tuple[float, float]:
     """Return the processor seconds of a command, and its wall seconds."""
-    before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    before_s, start_s = children_processor_s(), time.perf_counter()
     subprocess.run(
         [sys.executable, "-m", "armscan", *words],
         cwd=folder,
@@ -48,9 +47,7 @@ def armscan(checkout: Path, folder: Path, *words: str, uri: str) -> tuple[float,
         capture_output=True,
         check=True,
     )
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    processor_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return processor_s, time.perf_counter() - start_s
+    return children_processor_s() - before_s, time.perf_counter() - start_s
 
 
 def copy_run(client: MlflowClient, folder: Path, *, n_runs: int, n_epochs: int) -> None:

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import signal
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.speed.checkouts import HERE
+from benchmarks.speed.checkouts import HERE, children_processor_s
 
 N_PROCESSES = 3
 RUN = "import sys; from armscan.__main__ import main; sys.exit(main())"
@@ -55,7 +54,7 @@ def processor_s(checkout: Path, folder: str, words: tuple[str, ...] | None, unti
         until: Beginning of the printed line at which the process is killed; None, if it ends by itself.
     """
     program = STORE if words is None else RUN
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before_s = children_processor_s()
     with subprocess.Popen(
         [sys.executable, "-c", program, *(words or ())],
         cwd=folder,
@@ -69,8 +68,7 @@ def processor_s(checkout: Path, folder: str, words: tuple[str, ...] | None, unti
         for line in process.stdout:
             if until is not None and line.startswith(until):
                 os.killpg(process.pid, signal.SIGKILL)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return children_processor_s() - before_s
 
 
 def main() -> None:

@@ -41,10 +41,12 @@ def main() -> None:
     if given.serve:
         serve()
         return
+    if given.before is None:
+        parser.error("--before is not given: name the checkout to compare with")
     # Deferred: a process that serves another checkout has that checkout's benchmarks.
     from benchmarks.speed.checkouts import HERE, ask, end, start
 
-    processes = [start(__file__, each) for each in (HERE, given.before) if each]
+    processes = [start(__file__, each) for each in (HERE, given.before)]
     for case in CASES:
         for process in processes:
             ask(process, case)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -21,7 +20,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.speed.checkouts import HERE
+from benchmarks.speed.checkouts import HERE, children_processor_s
 
 CASES = {"default": ["training.solved=null"], "make_run": [], "best_full": ["experiment=best_full"]}
 DEFAULT_CASES = ("default", "make_run")
@@ -54,7 +53,7 @@ class Run(NamedTuple):
 
 def run(checkout: Path, *words: str) -> Run:
     """Run the command with the code of a checkout, and measure it."""
-    before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    before_s, start_s = children_processor_s(), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         said = subprocess.run(
             [sys.executable, "-c", PROGRAM, *words],
@@ -66,10 +65,9 @@ def run(checkout: Path, *words: str) -> Run:
             check=True,
         ).stdout
         wall_s = time.perf_counter() - start_s
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    processor_s = children_processor_s() - before_s
     (line,) = (line for line in said.splitlines() if line.startswith("trained "))
     _, seconds, n_steps = line.split()
-    processor_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return Run(float(seconds), processor_s, wall_s, int(n_steps))
 
 

@@ -75,13 +75,15 @@ def main() -> None:
     parser.add_argument("--before", type=Path, help="another checkout to compare with")
     parser.add_argument("--trials", type=int, default=4, help="trials of each (default: 4)")
     given = parser.parse_args()
+    if given.trials < 2:
+        parser.error(f"--trials is {given.trials}: the first is not warm, so it must be 2 or more")
     seconds = [trial_seconds(each.resolve(), given.trials) for each in (HERE, given.before) if each]
-    print("| trial | processor s | before | ratio |\n| --- | --- | --- | --- |")
+    columns = ["trial", "processor s", *(["before", "ratio"] if given.before else [])]
+    print(f"| {' | '.join(columns)} |\n|{' --- |' * len(columns)}")
     for number, (now, *before) in enumerate(zip(*seconds, strict=True)):
         first = " (the first)" if number == 0 else ""
-        print(
-            f"| {number}{first} | {now:.1f} | " + " | ".join(f"{each:.1f} | {each / now:.1f}" for each in before) + " |"
-        )
+        cells = [f"{number}{first}", f"{now:.1f}", *(f"{each:.1f} | {each / now:.1f}" for each in before)]
+        print(f"| {' | '.join(cells)} |")
     warm = [sum(each[1:]) / (given.trials - 1) for each in seconds]
     print(f"\nwarm, mean: {' and before '.join(f'{each:.1f} s' for each in warm)}")
     print(f"two quiet cores would finish {2 * 3600 / warm[0]:.0f} an hour")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from armscan.agents import Compute, Learner, PlaneFinder
+from armscan.agents import Compute, Learner, PlaneFinder, ScheduledLearner
 from armscan.agents.look_network import FinderModule
 from armscan.agents.policy import batch_of
 from armscan.agents.torch_export import export_program
@@ -167,6 +167,16 @@ def test_episodes_side_by_side_are_those_played_one_by_one_with_what_was_expecte
     assert side_by_side == alone
     assert len({each.expected_mm for each in alone}) > 1
     assert min(min(each.expected_mm, each.expected_deg) for each in alone) > 0.0
+
+
+def test_errors_are_expected_with_a_schedule_too(phantom):
+    learner, env = made(phantom)
+    scheduled = ScheduledLearner(learner, [(48, made(phantom, lr=1e-4)[0])])
+    scheduled.learn(48)
+    scheduled.learn(48)
+    for each in (play(scheduled, env, phantom.name, seed=3), *evaluate(scheduled, env, n_episodes=2, seed=3).episodes):
+        assert each.expected_mm > 0.0
+        assert each.expected_deg > 0.0
 
 
 def test_expected_errors_are_right_on_average_where_they_were_calibrated(phantom):

@@ -52,6 +52,12 @@ def test_learner_with_a_schedule_is_a_learner_that_plays_side_by_side(make_sched
     assert isinstance(make_scheduled(), BatchAgent)
 
 
+def test_learner_with_a_schedule_has_the_notes_of_its_learner(make_scheduled):
+    scheduled, learner = make_scheduled(), make_scheduled(is_scheduled=False)
+    for note in ("update_note", "validation_note", "warm_up_note"):
+        assert getattr(scheduled, note) == getattr(learner, note, None)
+
+
 @pytest.mark.parametrize("resumed_at", [20, 40, 60, 80])
 def test_learner_with_a_schedule_goes_on_from_any_epoch_bit_for_bit(make_scheduled, resumed_at):
     whole, first, second = (make_scheduled() for _ in range(3))

@@ -27,6 +27,7 @@ HEIGHT_PX, SMALL_PX, BAR_PX = 360, 260, 34
 MOST_TICKS = 20
 # Room on either side of a range, as a share of it.
 MARGIN = 0.03
+LEGEND = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0}
 
 
 def charts_of(
@@ -80,9 +81,13 @@ def _axis(metric: str) -> dict[str, Any]:
     return {"title": title_of(metric)} | (RATE_AXIS if is_rate(metric) else {})
 
 
-def _said(trial: FrozenTrial) -> str:
-    """Return the hover text of a trial."""
-    return "<br>".join(map(html.escape, (f"trial {trial.number}", *overrides_of(searched_values(trial)))))
+def _hover(trials: Sequence[FrozenTrial]) -> dict[str, Any]:
+    """Return what points of trials show under the mouse: value, number and settings."""
+    said = [
+        "<br>".join(map(html.escape, (f"trial {trial.number}", *overrides_of(searched_values(trial)))))
+        for trial in trials
+    ]
+    return {"text": said, "hovertemplate": "%{y:.4g}<br>%{text}<extra></extra>"}
 
 
 def _history(trials: Sequence[FrozenTrial], number: int, objective: str, direction: StudyDirection) -> Figure:
@@ -90,7 +95,7 @@ def _history(trials: Sequence[FrozenTrial], number: int, objective: str, directi
     figure = Figure()
     for name, color, is_drawn in (("trial", BLUE, is_feasible), ("infeasible trial", GREY, _is_infeasible)):
         drawn = list(filter(is_drawn, trials))
-        hover = {"text": list(map(_said, drawn)), "hovertemplate": "%{y:.4g}<br>%{text}<extra></extra>"}
+        hover = _hover(drawn)
         points: dict[str, Any] = {"mode": "markers", "marker": {"color": color, "size": 7, "opacity": 0.7}}
         numbers, values = [trial.number for trial in drawn], list(map(_value(number), drawn))
         if drawn:
@@ -101,8 +106,7 @@ def _history(trials: Sequence[FrozenTrial], number: int, objective: str, directi
     best = list(accumulate(values, max if direction == StudyDirection.MAXIMIZE else min))
     line = {"color": ORANGE, "width": 2, "shape": "hv"}
     figure.add_scatter(x=numbers, y=best, mode=mode(len(best)), line=line, marker={"size": 4}, name="best so far")
-    legend = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0}
-    return figure.update_layout(height=HEIGHT_PX, xaxis=axis, yaxis=_axis(objective), legend=legend)
+    return figure.update_layout(height=HEIGHT_PX, xaxis=axis, yaxis=_axis(objective), legend=LEGEND)
 
 
 def _is_infeasible(trial: FrozenTrial) -> bool:
@@ -130,7 +134,7 @@ def _slice(trials: Sequence[FrozenTrial], key: str, number: int, objective: str)
     found = having[0].distributions[key]
     is_choice = isinstance(found, CategoricalDistribution)
     places = [str(trial.params[key]) if is_choice else trial.params[key] for trial in having]
-    hover = {"text": list(map(_said, having)), "hovertemplate": "%{y:.4g}<br>%{text}<extra></extra>"}
+    hover = _hover(having)
     points = {"mode": "markers", "marker": {"color": BLUE, "size": 7, "opacity": 0.5}}
     figure = Figure(Scatter(x=places, y=[_value(number)(trial) for trial in having], **points, **hover))
     return figure.update_layout(height=SMALL_PX, xaxis=key_axis(key, found), yaxis=_axis(objective))
@@ -176,6 +180,5 @@ def _reports(trials: Sequence[FrozenTrial], number: int, objective: str) -> Figu
             **style,
         )
         named.add(name)
-    legend = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0}
     axes = {"xaxis_title": "environment steps, of all seeds", "yaxis": _axis(objective)}
-    return figure.update_layout(height=HEIGHT_PX, legend=legend, **axes)
+    return figure.update_layout(height=HEIGHT_PX, legend=LEGEND, **axes)

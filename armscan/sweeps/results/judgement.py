@@ -19,7 +19,14 @@ from armscan.sweeps.results.summary import ConfigResult, final_results, final_ta
 from armscan.sweeps.scheduling.state import CONTROL, TEST_PREFIX, metrics_of_test
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
-from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, name_of, settings_of, training_of
+from armscan.sweeps.study.final_eval import (
+    NOTHING_SEARCHED,
+    FinalEvaluation,
+    judged_if,
+    name_of,
+    settings_of,
+    training_of,
+)
 from armscan.sweeps.study.study import best_trials
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
@@ -158,7 +165,7 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         return None
     complete = final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     judged = {training_of(trial): trial for trial in complete}
-    both = final.judged()
+    both = judged_if(chosen)
     now = [judged[number, seed] for number in both for seed in final.judge_seeds if (number, seed) in judged]
     seeds = [seed for seed in final.judge_seeds if all((number, seed) in judged for number in both)]
     pairs = [[judged[number, seed] for seed in seeds] for number in both]

@@ -10,7 +10,7 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.reports.html import folded, table, video_address, write_page
+from armscan.reports.html import Row, folded, table, video_address, write_page
 from armscan.sweeps.results.charts import charts_of
 from armscan.sweeps.results.csv_tables import all_numbers, cause_of
 from armscan.sweeps.results.judgement import HOW, Judgement, judge
@@ -24,11 +24,10 @@ from armscan.sweeps.storage.attribute_names import FINALIST, FOLDER, LEASE, OBJE
 from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, settings_of
 from armscan.sweeps.study.study import best_trials
 from armscan.training.metric_display import title_of, value_text
+from armscan.utils.files import ID_CHARS
 
-ID_CHARS = 8
 # How people say the states of trials.
 STATES = {"complete": "finished", "fail": "failed"}
-Row = dict[str, Any]
 # How a GIF begins.
 GIF = b"GIF8"
 
@@ -54,20 +53,21 @@ def write_report(
         The HTML file.
     """
     objectives = list(study.user_attrs[OBJECTIVES])
-    trials = study.get_trials(deepcopy=False)
+    trials, best = study.get_trials(deepcopy=False), best_trials(study, 1)
+    state = StudyState.of(trials)
     judgement = judge(final) if final is not None else None
     candidates = candidates_of(final) if final is not None else []
     # Of an earlier version: its best configurations, without a control.
     found = final_results(final_trials) if final is None else judgement.results if judgement is not None else ()
     tables = all_numbers(study, trials, found, candidates, judgement)
     parts = [
-        _summary(study, trials, objectives),
+        _summary(study, state, best, objectives),
         "<h2>Result</h2>",
         _judgement(judgement) if judgement is not None else "",
         _result(found, trials) if found else "<p>No final evaluation yet.</p>",
-        decided(final, judgement, candidates, StudyState.of(trials)) if final is not None else "",
-        _running(trials),
-        *population_charts(trials, objectives[0], *best_trials(study, 1) or (None,)),
+        decided(final, judgement, candidates, state) if final is not None else "",
+        _running(state.running),
+        *population_charts(trials, objectives[0], *best or (None,)),
         *charts_of(study, trials, objectives, tables["importances"]),
         _videos(final_trials),
         "<h2>Trials</h2>",
@@ -80,8 +80,7 @@ def write_report(
     return write_page(folder, f"Study {study.study_name}", parts, tables, refresh_s=refresh_s)
 
 
-def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
-    state, best = StudyState.of(trials), best_trials(study, 1)
+def _summary(study: optuna.Study, state: StudyState, best: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
     n_infeasible = sum(not is_feasible(trial) for trial in state.finished)
     taken = f"; {len(state.taken)} were taken from other studies" if state.taken else ""
     violating = f", {n_infeasible} infeasible" if n_infeasible else ""
@@ -102,18 +101,18 @@ def _summary(study: optuna.Study, trials: Sequence[FrozenTrial], objectives: Seq
     return f"<p>{text}</p>"
 
 
-def _running(trials: Sequence[FrozenTrial]) -> str:
+def _running(running: Sequence[FrozenTrial]) -> str:
     """Return a table of the running trials, nothing if there are none."""
     rows = [
         {
             "trial": trial.number,
-            "worker": str(trial.user_attrs.get(LEASE, {}).get("worker", "–")),
-            "seed": trial.user_attrs.get(LEASE, {}).get("seed", "–"),
+            "worker": str(lease.get("worker", "–")),
+            "seed": lease.get("seed", "–"),
             "environment steps": f"{env_steps_of(trial):,}",
-            "return, mean": trial.user_attrs.get(LEASE, {}).get("return", "–"),
+            "return, mean": lease.get("return", "–"),
             **_settings(trial),
         }
-        for trial in StudyState.of(trials).running
+        for trial, lease in ((each, each.user_attrs.get(LEASE, {})) for each in running)
     ]
     return f"<h2>Running now</h2>{table(rows)}" if rows else ""
 

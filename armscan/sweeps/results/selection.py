@@ -17,7 +17,7 @@ from armscan.sweeps.scheduling.race import DROP_LEVEL, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import OBJECTIVES
-from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of
+from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of, settings_of
 from armscan.training.metric_display import bounds_of, is_rate, title_of, value_text
 
 ROW_PX, AROUND_PX = 44, 110
@@ -81,7 +81,7 @@ def candidates_of(final: FinalEvaluation) -> list[Candidate]:
                 estimate.clipped(*bounds_of(objective_of(final))),
                 standing.n_seeds,
                 _outcome(race, number, scores),
-                "" if number == CONTROL else " ".join(overrides_of(searched[number].params)),
+                " ".join(overrides_of(settings_of(searched, number))),
             )
         )
     return sorted(found, key=lambda each: (each.number != race.chosen, -each.n_seeds, -sign * each.estimate.value))

@@ -116,11 +116,12 @@ class Limits(Section):
     """Limits at which a study ends.
 
     Args:
-        n_trials: Number of trials to finish.
-        max_failures: Number of failed trials, without retried ones, after which the study ends. Default: 10.
-        max_retries: Number of retries of a trial whose worker died. Default: 1.
-        timeout_hours: Wall time of the whole study, in hours. Default: None, no limit.
-        max_env_steps: Environment steps of all trials together. Default: None, no limit.
+        n_trials: Number of trials to finish, 1 or more.
+        max_failures: Largest number of failed trials, without retried ones, 0 or more; one more ends the study.
+            Default: 10.
+        max_retries: Number of retries of a trial whose worker died, 0 or more. Default: 1.
+        timeout_hours: Wall time of the whole study, in hours, above 0. Default: None, no limit.
+        max_env_steps: Environment steps of all trials together, 1 or more. Default: None, no limit.
     """
 
     n_trials: int = Field(ge=1, description="a whole number of at least 1")

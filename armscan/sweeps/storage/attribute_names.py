@@ -2,6 +2,8 @@
 
 # Of a study: its space, its configuration without what it searches, and the directions of its objectives.
 SPACE, FIXED, OBJECTIVES = "space", "fixed_config", "objectives"
+# What each study of armscan has.
+OF_STUDY = {SPACE, FIXED, OBJECTIVES}
 # Its tracked run, the SHA-256 of the note that was left at it, and what it has begun with.
 STUDY_RUN, NOTE_SUM, BEGUN_WITH = "mlflow_run", "note_sha256", "begun_with"
 # Why it has ended, and what was asked of it then; trials whose failures are ignored.

@@ -12,7 +12,7 @@ from optuna.trial import FrozenTrial, TrialState
 from pydantic import ConfigDict, Field
 
 from armscan.errors import ArmscanError, StudyError, few
-from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, FIXED, METRICS, OBJECTIVES, PARENT, SPACE
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, METRICS, PARENT
 from armscan.sweeps.storage.reports import REPORT
 from armscan.utils.section import Section
 from armscan.utils.validation import LARGEST_SEED
@@ -20,8 +20,6 @@ from armscan.utils.validation import LARGEST_SEED
 # The studies of the final trainings are called like the study, with these suffixes: those that choose a configuration,
 # and those that judge it.
 SELECTION_SUFFIX, JUDGEMENT_SUFFIX = FINAL_SUFFIXES = ("-selection", "-judged")
-# What each study of armscan has.
-OF_STUDY = {SPACE, FIXED, OBJECTIVES}
 # What Optuna's readers raise on what Optuna has not written.
 DAMAGED = (ValueError, TypeError, AttributeError, AssertionError)
 UNREADABLE = (*DAMAGED, LookupError)

@@ -10,9 +10,9 @@ from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.errors import ArmscanError
+from armscan.sweeps.storage.attribute_names import OF_STUDY
 from armscan.sweeps.storage.attributes import (
     DAMAGED,
-    OF_STUDY,
     UNREADABLE,
     StudyAttributes,
     TrialAttributes,

@@ -171,17 +171,13 @@ class FinalEvaluation:
         """Whether the selection has ended, with or without a choice, and all trainings of the judgement have begun."""
         return self.race().is_over and not self.missing_of_judgement()
 
-    def judged(self) -> list[int]:
-        """Return the configurations that the test volumes are opened for: the chosen one and the control."""
-        return _judged(self.race().chosen)
-
     def missing_of_judgement(self) -> list[PlannedTrial]:
         """Return the trainings of the judgement that no worker has begun; during the selection, those of the control.
 
         The control is always judged, so idle workers train it before the race ends.
         """
         race = self.race()
-        judged = _judged(race.chosen) if race.is_over else [CONTROL]
+        judged = judged_if(race.chosen) if race.is_over else [CONTROL]
         return self._planned([(number, seed) for seed in self.judge_seeds for number in judged], self.judgement)
 
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
@@ -194,7 +190,8 @@ class FinalEvaluation:
         ]
 
 
-def _judged(chosen: int | None) -> list[int]:
+def judged_if(chosen: int | None) -> list[int]:
+    """Return the configurations that the test volumes are opened for: the chosen one, if any, and the control."""
     return [] if chosen is None else list(dict.fromkeys((chosen, CONTROL)))
 
 
@@ -224,7 +221,7 @@ def settings_of(searched: Sequence[FrozenTrial], number: int) -> dict[str, Any]:
 
 
 def _attributes(searched: Sequence[FrozenTrial], number: int, seed: int) -> dict[str, Any]:
-    schedule = {} if number == CONTROL else searched[number].user_attrs.get(SCHEDULE, {})
+    schedule = [] if number == CONTROL else searched[number].user_attrs.get(SCHEDULE, [])
     return {FINALIST: number, FINAL_SEED: seed} | ({SCHEDULE: schedule} if schedule else {})
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import optuna
 from omegaconf import DictConfig
-from optuna.trial import FrozenTrial, Trial, TrialState
+from optuna.trial import FrozenTrial, Trial
 
 from armscan.config.defaults import to_plain
 from armscan.sweeps.scheduling.population import Population, searched_values
@@ -113,14 +113,15 @@ class Phase:
         )
         state = self.scheduler.state()
         failed = [*state.failed, *state.retried]
-        requeued = self.scheduler.study.get_trials(deepcopy=False, states=(TrialState.WAITING,))
         for run in running:
             run_id, tags = run.info.run_id, run.data.tags.items()
             # A study in another storage may have the same name.
             if any(self.tags_of(trial).items() <= tags for trial in failed):
                 self.client.set_tag(run_id, FAILURE_TAG, WORKER_DIED)
                 self.client.set_terminated(run_id, "FAILED")
-            elif any(self.tags_of(trial).items() <= tags and trial.user_attrs.get(RUN) != run_id for trial in requeued):
+            elif any(
+                self.tags_of(trial).items() <= tags and trial.user_attrs.get(RUN) != run_id for trial in state.waiting
+            ):
                 self.client.set_terminated(run_id, "KILLED")
 
 

@@ -17,9 +17,9 @@ from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible
-from armscan.sweeps.storage.attribute_names import FIXED, GENERATION, OBJECTIVES, SPACE
+from armscan.sweeps.storage.attribute_names import FIXED, GENERATION, OBJECTIVES, OF_STUDY, SPACE
 from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
-from armscan.sweeps.storage.storage import Storage, existing_storage
+from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.components import make
 from armscan.sweeps.study.settings import StudySettings
 from armscan.tracking import flattened
@@ -70,9 +70,17 @@ def name_objectives(study: optuna.Study, names: Sequence[str]) -> None:
             study.set_metric_names(list(names))
 
 
-def existing_study(settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study | None:
-    """Return the study that these settings would continue with, to look at; None if they would begin one."""
-    storage = existing_storage(settings.storage)
+def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study | None:
+    """Return the study that these settings would continue with, to look at; None if they would begin one.
+
+    Args:
+        storage: Storage of the study; None if there is none yet.
+        settings: Settings of the study.
+        fixed: Configuration of its trials without the searched values.
+
+    Raises:
+        StudyError: If the study searches another space, has other objectives, or has trials with another configuration.
+    """
     study = storage.study(settings.name) if storage is not None else None
     if study is not None and not settings.allow_config_changes:
         _check_same(settings, study, described(settings, fixed))
@@ -101,7 +109,7 @@ def is_ours(study: optuna.Study) -> bool:
         InvalidValueError: If a user attribute of it is of another type than armscan writes.
     """
     there = study.user_attrs
-    if not {SPACE, FIXED, OBJECTIVES} <= there.keys():
+    if not there.keys() >= OF_STUDY:
         return False
     StudyAttributes.read(f"{study.study_name}.user_attrs", there)
     return [direction.name.lower() for direction in study.directions] == [*there[OBJECTIVES].values()]

@@ -139,14 +139,15 @@ def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], stor
     source, wanted = _source(settings, name, storage), described(settings, fixed)
     trials = [trial for trial in source.get_trials(deepcopy=False) if trial.state in FINISHED]
     difference = _difference(source.user_attrs, wanted)
-    before = migrate(source.user_attrs[FIXED])
+    # Only if the configurations agree: others may have values that no space has.
+    before, now = ({}, {}) if difference else map(_plain, (migrate(source.user_attrs[FIXED]), wanted[FIXED]))
     fitting: list[tuple[FrozenTrial, dict[str, Value]]] = []
     misfits = Counter[str]()
     for trial in trials:
         params = renamed(trial.params)
-        chosen, misfit = settings.space.fit(params if difference else _plain(before) | params, partly=bool(difference))
+        chosen, misfit = settings.space.fit(before | params, partly=bool(difference))
         if not difference:
-            misfit = misfit or _not_searched(params, chosen, _plain(wanted[FIXED]))
+            misfit = misfit or _not_searched(params, chosen, now)
         if misfit:
             misfits[misfit] += 1
         else:

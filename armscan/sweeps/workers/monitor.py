@@ -26,7 +26,7 @@ class StudyMonitor:
 
     def __init__(self, opened: OpenedStudy) -> None:
         self._opened = opened
-        # One for each phase: trials of both have the same numbers.
+        # One for each phase: trials of all phases have the same numbers.
         self._liveness: dict[str, LivenessCheck] = defaultdict(LivenessCheck)
 
     def is_over(self) -> bool:
