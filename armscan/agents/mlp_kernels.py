@@ -18,9 +18,9 @@ from armscan.utils.compilation import cached_njit
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 F = np.float32
-# For products of at most so many multiplications, OpenBLAS has faster kernels, if the processor has AVX-512.
+# Most multiplications of a product for which OpenBLAS has faster kernels; it has them for processors with AVX-512.
 N_SMALL = 10**6 if get_host_cpu_features().get("avx512f") else 0
-# Rows that are multiplied at once where that makes a product small.
+# Rows that are multiplied at once where a product is small then.
 N_ROWS = 64
 # Arrays are copied by loops: at an assignment to a slice, Numba compiles the text of its shape error, for two seconds.
 # Sums may be reordered, so that loops over them are vectorised. NaN stays NaN: a training that diverges must show it.
@@ -64,9 +64,16 @@ def layer_view(values: Floats, sizes: Ints, n_rows: int, which: int) -> Floats:
 
 
 @fast_njit
+def is_small(b: Floats) -> bool:
+    """Return whether the product of `N_ROWS` rows with a matrix is small."""
+    small: bool = N_ROWS * b.size <= N_SMALL
+    return small
+
+
+@fast_njit
 def product(a: Floats, b: Floats, out: Floats) -> None:
-    """Fill `out` with the product of two matrices, by parts if that makes them small."""
-    n_rows = N_ROWS if N_ROWS * b.size <= N_SMALL else a.shape[0]
+    """Fill `out`, shape (n, m), with `a @ b`, shapes (n, k) and (k, m), in small parts if possible."""
+    n_rows = N_ROWS if is_small(b) else a.shape[0]
     for start in range(0, a.shape[0], n_rows):
         np.dot(a[start : start + n_rows], b, out[start : start + n_rows])
 
@@ -77,7 +84,7 @@ def linear(x: Floats, weights: Floats, start: int, out: Floats, is_hidden: bool)
     n_out: int = out.shape[1]
     end: int = start + n_out * x.shape[1]
     columns = weights[start:end].reshape(n_out, x.shape[1]).T
-    if N_ROWS * columns.size <= N_SMALL:
+    if is_small(columns):
         # Small kernels read transposed weights slowly.
         product(x, np.ascontiguousarray(columns), out)
     else:

@@ -16,6 +16,9 @@ from armscan.utils.arrays import FloatArray
 if TYPE_CHECKING:
     from armscan.agents.policy import Policy
 
+# Attributes that evaluations and runs ask a learner for, and that it may lack.
+OPTIONAL = ("validation_note", "warm_up_note", "expected_error", "expected_errors")
+
 
 class ScheduledLearner:
     """A learner that another one replaces at a given environment step.
@@ -51,30 +54,11 @@ class ScheduledLearner:
         """See `Learner.update_note`."""
         return self._learner.update_note
 
-    @property
-    def validation_note(self) -> str | None:
-        """Return how the actions of evaluations are chosen, if the learner has such a note."""
-        return getattr(self._learner, "validation_note", None)
-
-    @property
-    def warm_up_note(self) -> str | None:
-        """Return what the learner did before its first gradient step, if it has such a note."""
-        return getattr(self._learner, "warm_up_note", None)
-
-    @property
-    def expected_error(self) -> tuple[float, float] | None:
-        """Return the error of the last plane that the learner expects, in mm and degrees, if it expects one."""
-        return getattr(self._learner, "expected_error", None)
-
-    @property
-    def expected_errors(self) -> FloatArray:
-        """Return `expected_error` of each episode side by side, shape (n, 2).
-
-        Raises:
-            AttributeError: If the learner expects none.
-        """
-        errors: FloatArray = self._batch.expected_errors  # type: ignore[attr-defined]
-        return errors
+    def __getattr__(self, name: str) -> Any:
+        """Return what only some learners have: a note, or the errors that they expect."""
+        if name in OPTIONAL:
+            return getattr(self._learner, name)
+        raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
 
     def warm_up(self) -> None:
         """See `Learner.warm_up`."""

@@ -7,6 +7,7 @@ must not import from `benchmarks` at its top.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import resource
@@ -16,6 +17,14 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parents[2]
+
+
+def parser_of(description: str) -> argparse.ArgumentParser:
+    """Return a parser of the options of a script that serves: the checkout, and the number of rounds."""
+    parser = argparse.ArgumentParser(description=description.partition("\n")[0])
+    parser.add_argument("--before", type=Path, metavar="CHECKOUT", help="another checkout to compare with")
+    parser.add_argument("--rounds", type=int, default=15, help="turns of each (default: 15)")
+    return parser
 
 
 def children_processor_s() -> float:

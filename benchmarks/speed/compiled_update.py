@@ -9,14 +9,12 @@ medians over the rounds. A call takes as many compiled steps as follow a collect
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 N_RANDOM_STEPS, BATCH_SIZE, N_AT_ONCE, N_TIANSHOU, N_COMPILED = 1_000, 256, 4, 20, 100
 ACTIONS = {"y": ("ty",), "full": ("rz", "rx", "tx", "ty")}
@@ -31,17 +29,13 @@ COMPILED, TIANSHOU = "compiled", "Tianshou"
 
 def main() -> None:
     """Print the table, or take gradient steps for another process that does."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--before", type=Path, help="checkout that takes Tianshou's steps (default: this one)")
-    parser.add_argument("--rounds", type=int, default=15, help="turns of each (default: 15)")
-    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.serve:
+    if sys.argv[1:] == ["--serve"]:
         serve()
         return
     # Deferred: a process that serves another checkout has that checkout's benchmarks.
-    from benchmarks.speed.checkouts import HERE, ask, end, start
+    from benchmarks.speed.checkouts import HERE, ask, end, parser_of, start
 
+    given = parser_of(__doc__).parse_args()
     theirs, ours = (start(__file__, each) for each in (given.before or HERE, HERE))
     print("| projection, network | Tianshou, ms | compiled, ms | ratio, median | least | most |")
     print("| --- | --- | --- | --- | --- | --- |")

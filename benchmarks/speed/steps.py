@@ -9,13 +9,11 @@ rounds, those of the processor time of the process.
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 N_STEPS = 2000
@@ -33,19 +31,16 @@ CASES: dict[str, tuple[int, dict[str, Any]]] = {
 
 def main() -> None:
     """Print the table, or take steps for another process that does."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--before", type=Path, help="another checkout to compare with")
-    parser.add_argument("--rounds", type=int, default=15, help="turns of each (default: 15)")
-    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.serve:
+    if sys.argv[1:] == ["--serve"]:
         serve()
         return
+    # Deferred: a process that serves another checkout has that checkout's benchmarks.
+    from benchmarks.speed.checkouts import HERE, ask, end, parser_of, start
+
+    parser = parser_of(__doc__)
+    given = parser.parse_args()
     if given.before is None:
         parser.error("--before is not given: name the checkout to compare with")
-    # Deferred: a process that serves another checkout has that checkout's benchmarks.
-    from benchmarks.speed.checkouts import HERE, ask, end, start
-
     processes = [start(__file__, each) for each in (HERE, given.before)]
     for case in CASES:
         for process in processes:

@@ -55,7 +55,7 @@ def test_learner_with_a_schedule_is_a_learner_that_plays_side_by_side(make_sched
 def test_learner_with_a_schedule_has_the_notes_of_its_learner(make_scheduled):
     scheduled, learner = make_scheduled(), make_scheduled(is_scheduled=False)
     for note in ("update_note", "validation_note", "warm_up_note"):
-        assert getattr(scheduled, note) == getattr(learner, note, None)
+        assert getattr(scheduled, note, None) == getattr(learner, note, None)
 
 
 @pytest.mark.parametrize("resumed_at", [20, 40, 60, 80])

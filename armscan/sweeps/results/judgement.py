@@ -22,9 +22,9 @@ from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
 from armscan.sweeps.study.final_eval import (
     NOTHING_SEARCHED,
     FinalEvaluation,
-    judged_if,
     name_of,
     settings_of,
+    to_judge,
     training_of,
 )
 from armscan.sweeps.study.study import best_trials
@@ -165,7 +165,7 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         return None
     complete = final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     judged = {training_of(trial): trial for trial in complete}
-    both = judged_if(chosen)
+    both = to_judge(chosen)
     now = [judged[number, seed] for number in both for seed in final.judge_seeds if (number, seed) in judged]
     seeds = [seed for seed in final.judge_seeds if all((number, seed) in judged for number in both)]
     pairs = [[judged[number, seed] for seed in seeds] for number in both]

@@ -177,7 +177,7 @@ class FinalEvaluation:
         The control is always judged, so idle workers train it before the race ends.
         """
         race = self.race()
-        judged = judged_if(race.chosen) if race.is_over else [CONTROL]
+        judged = to_judge(race.chosen) if race.is_over else [CONTROL]
         return self._planned([(number, seed) for seed in self.judge_seeds for number in judged], self.judgement)
 
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
@@ -190,7 +190,7 @@ class FinalEvaluation:
         ]
 
 
-def judged_if(chosen: int | None) -> list[int]:
+def to_judge(chosen: int | None) -> list[int]:
     """Return the configurations that the test volumes are opened for: the chosen one, if any, and the control."""
     return [] if chosen is None else list(dict.fromkeys((chosen, CONTROL)))
 

@@ -19,7 +19,7 @@ from armscan.errors import printable
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
-from armscan.sweeps.study.final_eval import FinalEvaluation, judged_if, n_trainings, training_of
+from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, to_judge, training_of
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.warm_start import InitialTrials
 from armscan.utils.console import WHOLE_CHARS, wide_console
@@ -109,7 +109,7 @@ def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None,
         return fewest, most
     final = replace(final, settings=settings.final_eval)
     race, complete = final.race(), final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    wanted = {(number, seed) for number in judged_if(race.chosen) or [CONTROL] for seed in final.judge_seeds}
+    wanted = {(number, seed) for number in to_judge(race.chosen) or [CONTROL] for seed in final.judge_seeds}
     n_judged = len(wanted & set(map(training_of, complete)))
     if race.is_over:
         return len(wanted) - n_judged, len(wanted) - n_judged
