@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
@@ -118,19 +117,18 @@ def _launch_elsewhere(opened: OpenedStudy, folder: Path, launcher: str, launch: 
 @contextlib.contextmanager
 def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: float) -> Iterator[None]:
     """Leave no worker and no open run behind; a context to launch the workers in."""
-    status, is_asked = "FINISHED", threading.Event()
-    deadline = threading.Timer(leave_s, os.kill, (os.getpid(), signal.SIGINT))
-    deadline.daemon = True
+    status, is_asked = "FINISHED", False
 
     def ask(*_: object) -> None:
-        """Ask the workers to leave; an interrupted launcher may kill them before they can."""
-        if is_asked.is_set():
+        """Ask the workers to leave; an interrupted launcher may kill them before they can. A handler takes no lock."""
+        nonlocal is_asked
+        if is_asked:
             raise KeyboardInterrupt
-        is_asked.set()
+        is_asked = True
         (folder / STOP_FILE).touch()
-        deadline.start()
+        signal.setitimer(signal.ITIMER_REAL, leave_s)
 
-    asking = [signal.SIGINT, signal.SIGTERM]
+    asking = [signal.SIGINT, signal.SIGTERM, signal.SIGALRM]
     # Its terminal was closed; where `nohup` has it go on, it does.
     asking += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else []
     before = {each: signal.signal(each, ask) for each in asking}
@@ -140,7 +138,7 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
         status = "KILLED"
         raise
     finally:
-        deadline.cancel()
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
         for each in before:
             signal.signal(each, signal.SIG_IGN)
         (folder / STOP_FILE).touch()
@@ -156,10 +154,10 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
                 tracked.set_note(note)
                 where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder
                 note_run(opened.search.scheduler.study, *where, note)
-        _deliver(opened, tracked, "KILLED" if is_asked.is_set() else status)
+        _deliver(opened, tracked, "KILLED" if is_asked else status)
         for each, handler in before.items():
             signal.signal(each, handler)
-    if is_asked.is_set():
+    if is_asked:
         raise KeyboardInterrupt
 
 

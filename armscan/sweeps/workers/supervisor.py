@@ -11,14 +11,14 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 from armscan.errors import ArmscanError, AwayError, StudyError
-from armscan.sweeps.workers.slurm import SOON, SlurmSignals
+from armscan.sweeps.workers.leave_request import LeaveRequest
+from armscan.sweeps.workers.slurm import NOW, SOON, SlurmSignals
 from armscan.utils.processes import ProcessInfo, child_command, on_parent_exit
 
 LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
@@ -31,8 +31,6 @@ GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"
 MAX_RESTARTS = 100
 # One that crashes, and is not killed, will crash again.
 MAX_ERRORS = 5
-# Time that a worker has for its current epoch when it is told to leave soon.
-SOON_S = 60.0
 
 
 def local_workers(folder: Path) -> list[ProcessInfo]:
@@ -108,28 +106,19 @@ def _environment() -> dict[str, str]:
 
 def worker_main() -> None:
     """Run the process of a worker, which reads its study from standard input."""
-    is_asked, is_asked_soon = threading.Event(), threading.Event()
-    on_parent_exit(is_asked.set)
+    request = LeaveRequest()
+    on_parent_exit(request.ask_now)
     words, number, folder = pickle.load(sys.stdin.buffer)
     ProcessInfo.current().write(folder / f"worker-{number}.json")
     launcher = ProcessInfo.read(folder / LAUNCHER_FILE)
-    late = threading.Timer(SOON_S, is_asked.set)
-    late.daemon = True
-
-    def ask_soon(*_: object) -> None:
-        # Slurm may signal it, and the supervisor again.
-        if not is_asked_soon.is_set():
-            is_asked_soon.set()
-            late.start()
-
-    for asking in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(asking, lambda *_: is_asked.set())
-    signal.signal(SOON, ask_soon)
+    # Slurm's come twice: Slurm sends them to all processes of the job, and the supervisor forwards them.
+    for sent, ask in ((signal.SIGINT, request.ask_now), (NOW, request.ask_now), (SOON, request.ask_soon)):
+        signal.signal(sent, ask)
     # The launcher may have blocked it.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def is_told_to_leave() -> bool:
-        return is_asked.is_set() or not launcher.is_alive or (folder / STOP_FILE).exists()
+        return request.is_now or not launcher.is_alive or (folder / STOP_FILE).exists()
 
     from armscan.sweeps.workers.heartbeat import Heartbeat
     from armscan.sweeps.workers.worker import work
@@ -139,7 +128,7 @@ def worker_main() -> None:
         Heartbeat,
         worker=f"{folder.name}/{number}",
         is_told_to_leave=is_told_to_leave,
-        is_told_to_leave_soon=is_asked_soon.is_set,
+        is_told_to_leave_soon=lambda: request.is_soon,
         leave=partial(os._exit, LEFT),
     )
     try:
