@@ -226,6 +226,18 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
     assert "Traceback" not in printed
 
 
+@pytest.mark.full
+def test_interrupted_study_kills_a_worker_that_does_not_leave_and_enqueues_its_trial_again(tmp_path):
+    words = [*TINY, "study.n_trials=2", "study.final_eval.top_k=0", "training.env_steps=200000"]
+    process = started(*words, cwd=tmp_path)
+    wait_until(lambda: sum(bool(trial.intermediate_values) for trial in trials_of(tmp_path)) == 2, process=process)
+    os.kill(workers_in(tmp_path)[0], signal.SIGSTOP)
+    os.kill(process.pid, signal.SIGINT)
+    assert process.wait(HANG_S) == 130
+    assert processes_in(tmp_path) == []
+    assert sorted(trial.state.name for trial in trials_of(tmp_path)) == ["FAIL", "WAITING", "WAITING"]
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [

@@ -194,10 +194,17 @@ def _block_sigint() -> Iterator[None]:
 
 
 def _end_workers(folder: Path) -> None:
-    """Wait for the workers on this machine to leave, and kill those that do not."""
-    until_s = time.monotonic() + LEAVE_S
+    """Wait for the workers on this machine to leave, kill those that do not, and wait for their end."""
+    if alive := _alive_after(LEAVE_S, folder):
+        for worker in alive:
+            if worker.is_alive:
+                os.kill(worker.pid, signal.SIGKILL)
+        _alive_after(LEAVE_S, folder)
+
+
+def _alive_after(wait_s: float, folder: Path) -> list[ProcessInfo]:
+    """Wait for the workers on this machine to end; return those that are alive after `wait_s`."""
+    until_s = time.monotonic() + wait_s
     while (alive := local_workers(folder)) and time.monotonic() < until_s:
         time.sleep(0.05)
-    for worker in alive:
-        if worker.is_alive:
-            os.kill(worker.pid, signal.SIGKILL)
+    return alive
