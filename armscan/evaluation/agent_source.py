@@ -14,7 +14,8 @@ from armscan.config.compose import compose
 from armscan.config.defaults import CHANGES
 from armscan.errors import CheckpointError, InvalidValueError
 from armscan.experiment.build import check_sections
-from armscan.tracking.lookup import DOMAIN_TAG, EVALUATED_TAG, FoundRun, load_run
+from armscan.tracking.lookup import FoundRun, load_run
+from armscan.tracking.tags import DOMAIN_TAG, EVALUATED_TAG
 from armscan.training import CheckpointProvenance, Fingerprints, TrainingDomain, load_weights
 
 # Files and folders that the section `data` names.

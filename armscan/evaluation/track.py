@@ -15,7 +15,8 @@ from armscan.evaluation.report import EvaluationReport
 from armscan.evaluation.runner import PreparedAgent
 from armscan.evaluation.volumes import check_out, data_name, file_name
 from armscan.reports.html import page
-from armscan.tracking import EVALUATED_TAG, TrackedRun, check_artifacts, deliver_pending, open_store
+from armscan.tracking import TrackedRun, check_artifacts, deliver_pending, open_store
+from armscan.tracking.tags import EVALUATED_TAG
 from armscan.utils.files import atomic_write
 
 FOLDER, SUFFIX = Path("evaluations"), ".json"

@@ -22,10 +22,6 @@ from armscan.utils.files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SU
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
-# Of a job's run: its number.
-JOB_TAG = "job"
-# Of a grid: the words that it is repeated with.
-GRID_TAG = "grid"
 NO_OUTCOME, INTERRUPTED = "ended without a word", "interrupted"
 
 

@@ -15,10 +15,8 @@ from omegaconf import DictConfig
 import armscan
 from armscan.config.defaults import to_plain
 from armscan.experiment.build import Experiment
-from armscan.experiment.job import JOB_TAG, Invocation
+from armscan.experiment.job import Invocation
 from armscan.tracking import (
-    DOMAIN_TAG,
-    VERSION_TAG,
     TrackedRun,
     deliver_pending,
     environment_file,
@@ -27,6 +25,7 @@ from armscan.tracking import (
     source,
     tags_of,
 )
+from armscan.tracking.tags import CHOICE, DOMAIN_TAG, FOLDER_TAG, HOST_TAG, JOB_TAG, VERSION_TAG
 from armscan.training import Fingerprints, TrainingDomain
 from armscan.utils.files import (
     CONFIG_FILE,
@@ -84,7 +83,7 @@ def start_tracking(
             "command": invocation.command,
             "seed": str(resolved["seed"]),
             "overrides": " ".join(invocation.overrides),
-            **{f"choice.{group}": choices[group] for group in CHOICES_IN_TAGS},
+            **{f"{CHOICE}{group}": choices[group] for group in CHOICES_IN_TAGS},
             **volume_tags(setup.fingerprints),
             # Where it is applied to other volumes, later, the agent must see what it has learned to see.
             DOMAIN_TAG: TrainingDomain.of(setup.training_env, setup.smallest_slice_px).to_json(),
@@ -129,7 +128,7 @@ def volume_tags(prints: Fingerprints) -> dict[str, str]:
 
 def place_tags(folder: Path) -> dict[str, str]:
     """Return folder, host and version of a run as its tags."""
-    return {"folder": str(folder.resolve()), "host": socket.gethostname(), VERSION_TAG: armscan.__version__}
+    return {FOLDER_TAG: str(folder.resolve()), HOST_TAG: socket.gethostname(), VERSION_TAG: armscan.__version__}
 
 
 def run_name(config: dict[str, Any], choices: dict[str, str]) -> str:

@@ -20,10 +20,10 @@ from armscan.config.defaults import RESUME, TRACKING_URI, default_tracking
 from armscan.config.trust import TRUST, check_stored_words, stored_config
 from armscan.errors import InvalidValueError, ResumeError, UntrustedError, printable
 from armscan.experiment.build import set_up
-from armscan.experiment.job import GRID_TAG
 from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
 from armscan.tracking import TrackedRun, TrackingStore, check_run_id, check_version, find_run, open_existing_store, sync
+from armscan.tracking.tags import FOLDER_TAG, GRID_TAG
 from armscan.training import Fingerprints, check_unchanged, fingerprints_in, resume_from_checkpoint
 from armscan.utils.files import (
     CONFIG_FILE,
@@ -143,14 +143,14 @@ def _read(words: Sequence[str]) -> tuple[str, str]:
 def _folder_of(run: Run) -> Path:
     """Return the folder of a run that this version can continue with."""
     run_id, tags = run.info.run_id, run.data.tags
-    if "folder" not in tags:
+    if FOLDER_TAG not in tags:
         raise ResumeError(
             f"run {run_id} cannot be resumed: it was not started by armscan run, which tags a run with its folder"
         )
     check_version(run)
     # Asked before the folder, which may have been cleared away since.
     _check_unfinished(run)
-    folder = Path(tags["folder"])
+    folder = Path(tags[FOLDER_TAG])
     if not folder.is_dir():
         raise ResumeError(
             f"run {run_id} cannot be resumed: its folder {folder} is not there; it last ran on the host "

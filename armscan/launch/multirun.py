@@ -21,17 +21,9 @@ from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.trust import needs_trust, untrusted_word
 from armscan.errors import InvalidValueError, TrackingError
-from armscan.experiment.job import (
-    GRID_TAG,
-    INTERRUPTED,
-    JOB_TAG,
-    NO_OUTCOME,
-    OUTCOME_FOLDER,
-    PARENT_FILE,
-    JobOutcome,
-    remove_run_folder,
-)
+from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, OUTCOME_FOLDER, PARENT_FILE, JobOutcome, remove_run_folder
 from armscan.launch.launchers import LAUNCHER, check_launcher
+from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
 from armscan.utils.files import LAST_CHECKPOINT, RESULTS_PAGE, atomic_write
 
 if TYPE_CHECKING:
@@ -145,7 +137,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
         print(f"  again alone: {run_command([])} {outcome.overrides}", file=sys.stderr)
     for run in runs:
-        if run.info.status != "FINISHED" and (Path(run.data.tags["folder"]) / LAST_CHECKPOINT).exists():
+        if run.info.status != "FINISHED" and (Path(run.data.tags[FOLDER_TAG]) / LAST_CHECKPOINT).exists():
             uri = word["tracking"]["uri"]
             again = resume_command(run.info.run_id, uri, trust=needs_trust(run.data.params))
             print(f"resume job {run.data.tags[JOB_TAG]} with: {again}", file=sys.stderr)
@@ -181,7 +173,7 @@ def _pool_folds(
     from armscan.launch.folds_table import folds_table, keep_table
 
     finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
-    table = folds_table((Path(run.data.tags["folder"]), outcomes[run.data.tags[JOB_TAG]].varied) for run in finished)
+    table = folds_table((Path(run.data.tags[FOLDER_TAG]), outcomes[run.data.tags[JOB_TAG]].varied) for run in finished)
     if table is not None:
         left_out = len(outcomes) - len(finished)
         print_table("all folds (test)", table, [f"{left_out} of {len(outcomes)} jobs are missing"] if left_out else [])
@@ -198,7 +190,6 @@ def _close_parent(
     """
     from armscan.launch.best_job import show_best
     from armscan.tracking import note_end, open_store, sync
-    from armscan.tracking.run import FAILURE_TAG
     from armscan.tracking.sync import PROCESS_DIED
 
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
@@ -206,11 +197,9 @@ def _close_parent(
     store, experiment_id = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
     # With what jobs have left because the store was away.
     sync(folder, lambda _: store)
-    below = store.search_runs([experiment_id], f"tags.mlflow.parentRunId = '{word['run_id']}'")
+    below = store.children(experiment_id, word["run_id"])
     # Others may have put a run of theirs below it.
-    children = [
-        child for child in below if child.data.tags.get(JOB_TAG, "").isdecimal() and "folder" in child.data.tags
-    ]
+    children = [run for run in below if run.data.tags.get(JOB_TAG, "").isdecimal() and FOLDER_TAG in run.data.tags]
     for child in children:
         # `sync` has ended those whose processes had no time to do so.
         if child.info.status == "RUNNING" or child.data.tags.get(FAILURE_TAG) == PROCESS_DIED:

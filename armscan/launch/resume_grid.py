@@ -12,13 +12,13 @@ from omegaconf import DictConfig
 
 from armscan.config.defaults import to_plain
 from armscan.experiment.build import check_keys, set_up
-from armscan.experiment.job import JOB_TAG, Invocation, Job
+from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import provenance_files, sha256_tags
 from armscan.experiment.results import LAST_VALIDATION, figures_of
 from armscan.experiment.resume import resume_run
 from armscan.experiment.runner import run_experiment
 from armscan.tracking import TrackingStore, open_store
-from armscan.tracking.run import PARENT_TAG
+from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, PARENT_TAG
 from armscan.utils.files import LAST_CHECKPOINT
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
             _adopt(client, run, job)
             return _metrics_of(run)
     for run in earlier:
-        folder = run.data.tags.get("folder")
+        folder = run.data.tags.get(FOLDER_TAG)
         if run.info.status != "RUNNING" and folder is not None and (Path(folder) / LAST_CHECKPOINT).exists():
             _adopt(client, run, job)
             # Its configuration is this job's.

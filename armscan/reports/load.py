@@ -20,6 +20,7 @@ from armscan.tracking import TrackingStore
 from armscan.tracking.histories import History, metric_histories
 from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
+from armscan.tracking.tags import CHOICE
 from armscan.training import TEST, Evaluation
 from armscan.utils.arrays import FloatArray
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, ID_CHARS, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE, sha256
@@ -36,7 +37,6 @@ OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
 BUDGET = "training.env_steps"
 # Of a cross-validation, and MLflow's parameter of what is not set.
 FOLDS, FOLD, UNSET = "data.folds", "data.fold", "None"
-CHOICE = "choice."
 T = TypeVar("T")
 
 

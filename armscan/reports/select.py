@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from mlflow.entities import Run
 
 from armscan.errors import InvalidValueError, TrackingError, listed
-from armscan.tracking import EVALUATED_TAG, TrackingStore, check_version, find_run
-from armscan.tracking.run import MAX_DEPTH, PARENT_TAG
+from armscan.tracking import TrackingStore, check_version, find_run
+from armscan.tracking.run import MAX_DEPTH
 from armscan.tracking.store import store_errors
+from armscan.tracking.tags import AGENT_TAG, EVALUATED_TAG, JOB_TAG, PARENT_TAG, PRUNED_TAG, TRIAL_TAG
 
 # How a whole experiment of MLflow is named, instead of runs.
 EXPERIMENT = "experiment:"
-# Only a run of `armscan run` or a training of a study has it, not its parents.
-OF_A_TRAINING = "choice.agent"
-PRUNED_TAG, TRIAL_TAG, JOB_TAG = "pruned", "trial", "job"
-# A loaded server takes longer for more than it is waited for.
-PAGE_SIZE = 100
 N_SHOWN = 6
 
 
@@ -84,11 +79,11 @@ def _meant(store: TrackingStore, name: str) -> list[Run]:
 
 def _below(store: TrackingStore, run: Run, depth: int = 0) -> Iterator[Run]:
     """Yield a run if it is a training, else those of its jobs, trials and seeds."""
-    if OF_A_TRAINING in run.data.tags:
+    if AGENT_TAG in run.data.tags:
         yield run
-    if OF_A_TRAINING in run.data.tags or depth > MAX_DEPTH:
+    if AGENT_TAG in run.data.tags or depth > MAX_DEPTH:
         return
-    children = [*_runs(store, run.info.experiment_id, f"tags.`{PARENT_TAG}` = '{run.info.run_id}'")]
+    children = store.children(run.info.experiment_id, run.info.run_id)
     # Jobs of a grid start side by side: by their numbers, so that they stand as the grid's own table has them.
     numbers = {child.info.run_id: child.data.tags.get(JOB_TAG, "") for child in children}
     for child in sorted(children, key=lambda each: (len(numbers[each.info.run_id]), numbers[each.info.run_id])):
@@ -99,10 +94,10 @@ def _in_experiment(store: TrackingStore, name: str) -> list[Run]:
     wanted = name.removeprefix(EXPERIMENT)
     experiment = store.get_experiment_by_name(wanted)
     if experiment is None or experiment.lifecycle_stage != "active":
-        names = [each.name for each in store.search_experiments(max_results=PAGE_SIZE)][:N_SHOWN]
+        names = [each.name for each in store.search_experiments(max_results=N_SHOWN)]
         there = f"only {listed(names)}" if names else "none at all"
         raise TrackingError(f"the experiment is {wanted!r}, but in {store.uri!r} there is {there}")
-    trainings = [run for run in _runs(store, experiment.experiment_id) if OF_A_TRAINING in run.data.tags]
+    trainings = [run for run in store.runs([experiment.experiment_id]) if AGENT_TAG in run.data.tags]
     if not trainings:
         raise TrackingError(f"the experiment is {wanted!r}, but in {store.uri!r} it has no armscan training")
     return trainings
@@ -120,17 +115,6 @@ def _selected(store: TrackingStore, runs: Sequence[Run]) -> list[SelectedRuns]:
     pruned = {
         (experiment_id, each.info.run_id)
         for experiment_id in {experiment_id for experiment_id, _ in trials.values()}
-        for each in _runs(store, experiment_id, f"tags.`{PRUNED_TAG}` IS NOT NULL")
+        for each in store.runs([experiment_id], f"tags.`{PRUNED_TAG}` IS NOT NULL")
     }
     return [SelectedRuns(run, trials.get(run.info.run_id) in pruned) for run in runs]
-
-
-def _runs(store: TrackingStore, experiment_id: str, condition: str = "") -> Iterator[Run]:
-    """Yield the runs of an experiment in the order of their starts."""
-    token: Any = None
-    while True:
-        order = ["attributes.start_time ASC"]
-        page = store.search_runs([experiment_id], condition, max_results=PAGE_SIZE, order_by=order, page_token=token)
-        yield from page
-        if not (token := page.token):
-            return

@@ -12,7 +12,8 @@ from armscan.config.command_hints import armscan_command
 from armscan.errors import TrackingError
 from armscan.evaluation import EvaluationReport
 from armscan.evaluation.report import REFUSED_BY_MLFLOW
-from armscan.tracking import EVALUATED_TAG, FoundRun
+from armscan.tracking import FoundRun
+from armscan.tracking.tags import EVALUATED_TAG
 from armscan.training import ON_PLANE, TEST, Evaluation, ResultTable
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE
 

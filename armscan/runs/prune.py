@@ -12,13 +12,13 @@ from mlflow.entities import Run
 from rich.filesize import decimal
 
 from armscan.errors import TrackingError
-from armscan.runs.query import experiment_ids, search
+from armscan.runs.query import experiment_ids
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.tracking import TrackingStore, check_version
 from armscan.tracking.client import reason_in
 from armscan.tracking.notes import forget
-from armscan.tracking.run import PARENT_TAG
 from armscan.tracking.sync import ENDED
+from armscan.tracking.tags import FOLDER_TAG, PARENT_TAG
 from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
 CHECKPOINTS, FOLDERS = "checkpoints", "folders"
@@ -41,14 +41,14 @@ class PruneItem:
 
 def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneItem]:
     """Plan the removal of the `CHECKPOINTS` or `FOLDERS` of runs; remove nothing."""
-    everything = {run.info.run_id: run for run in search(client, experiment_ids(client))}
+    everything = {run.info.run_id: run for run in client.runs(experiment_ids(client))}
     noted = defaultdict(set)
     for run_id, run in everything.items():
-        noted[run.data.tags.get("folder")].add(run_id)
+        noted[run.data.tags.get(FOLDER_TAG)].add(run_id)
     items = []
     for run in runs:
         try:
-            folder = _folder(run, everything, noted[run.data.tags.get("folder")] - {run.info.run_id})
+            folder = _folder(run, everything, noted[run.data.tags.get(FOLDER_TAG)] - {run.info.run_id})
             with folder.held(is_planned=True):
                 items.append(PruneItem(run, sum(_files(folder, what).values())))
         except (RunSkippedError, TrackingError) as error:
@@ -71,7 +71,7 @@ def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
     with folder.held():
         # Another process may have begun to use it, or have removed it, since it was planned.
         condition = f"attributes.run_id IN ('{run_id}', '{parent_id}')"
-        now = {run.info.run_id: run for run in search(client, experiment_ids(client), condition)}
+        now = {run.info.run_id: run for run in client.runs(experiment_ids(client), condition)}
         if run_id not in now:
             raise RunSkippedError("it has been deleted meanwhile")
         for file in _files(_folder(now[run_id], now), what):

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from datetime import datetime
-from typing import Any
 
 from mlflow.entities import Run
 from mlflow.exceptions import MlflowException
 
 from armscan.errors import InvalidValueError, listed
 from armscan.tracking import TrackingStore, find_run
-from armscan.tracking.client import reason_in
-
-# A loaded server takes longer for more than it is waited for.
-PER_PAGE = 100
+from armscan.tracking.client import all_pages, reason_in
+from armscan.tracking.tags import AGENT_TAG, OBS_TAG, PARENT_TAG
 
 
 def find(
@@ -57,9 +54,9 @@ def find(
     ]
     conditions += [where] if where else []
     if parent is not None:
-        conditions.append(f"tags.mlflow.parentRunId = '{find_run(client, parent).info.run_id}'")
+        conditions.append(f"tags.`{PARENT_TAG}` = '{find_run(client, parent).info.run_id}'")
     try:
-        runs = search(client, experiments, " and ".join(conditions))
+        runs = client.runs(experiments, " and ".join(conditions))
     except MlflowException as error:
         if where is None or error.error_code != "INVALID_PARAMETER_VALUE":
             raise
@@ -68,7 +65,7 @@ def find(
 
     def is_fit(run: Run) -> bool:
         tags, given = run.data.tags, run.data.params.get("projection")
-        values = (run.info.status.lower(), tags.get("choice.agent"), tags.get("choice.obs"), given)
+        values = (run.info.status.lower(), tags.get(AGENT_TAG), tags.get(OBS_TAG), given)
         allowed = (status, agent, obs, projections)
         return all(not some or value in some for value, some in zip(values, allowed, strict=True))
 
@@ -90,21 +87,3 @@ def experiment_ids(client: TrackingStore, name: str | None = None) -> list[str]:
         there = listed(each.name for each in experiments) if experiments else "none"
         raise InvalidValueError(f"--experiment is {name!r}, but {client.uri} has only {there}")
     return found
-
-
-def search(client: TrackingStore, experiments: list[str], condition: str = "") -> list[Run]:
-    """Return all runs of experiments that match an MLflow filter."""
-    if not experiments:
-        return []
-    return all_pages(lambda **page: client.search_runs(experiments, filter_string=condition, **page))
-
-
-def all_pages(ask: Callable[..., Any]) -> list[Any]:
-    """Return all that MLflow returns page by page."""
-    found: list[Any] = []
-    token = None
-    while True:
-        page = ask(max_results=PER_PAGE, page_token=token)
-        found += page
-        if not (token := page.token):
-            return found

@@ -19,9 +19,10 @@ from armscan.experiment.job import Invocation, remove_if_untracked
 from armscan.experiment.provenance import CHOICES_IN_TAGS, start_tracking
 from armscan.experiment.runner import run_tracked
 from armscan.runs.compare import Comparison, compare_runs
-from armscan.tracking import EVALUATED_TAG, FoundRun, environment_tags, load_run, source
+from armscan.tracking import FoundRun, environment_tags, load_run, source
 from armscan.tracking.environment import COMMIT, CONSTRAINTS_SUM, DIFF_SUM, DIRTY, TOLD, environment
 from armscan.tracking.sync import ENDED
+from armscan.tracking.tags import CHOICE, EVALUATED_TAG
 from armscan.training import check_unchanged
 from armscan.utils.files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
 
@@ -132,7 +133,7 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
         raise InvalidValueError(f"--out is {str(folder)!r}, but it exists and is not an empty folder: name another")
     is_ours = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    choices = {group: run.tags.get(f"choice.{group}", "unknown") for group in CHOICES_IN_TAGS}
+    choices = {group: run.tags.get(f"{CHOICE}{group}", "unknown") for group in CHOICES_IN_TAGS}
     overrides = run.tags.get("overrides", "").split()
     uri = original.config.tracking.uri
     command = armscan_command("runs", "reproduce", run.run_id, tracking=uri, trust=original.setup.needs_trust)

@@ -17,8 +17,9 @@ from requests import RequestException
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.stats.on_plane import OnPlane, leading_of
 from armscan.tracking import TrackingStore
-from armscan.tracking.run import MAX_DEPTH, PARENT_TAG
+from armscan.tracking.run import MAX_DEPTH
 from armscan.tracking.sync import ENDED
+from armscan.tracking.tags import PARENT_TAG
 
 # What rows are sorted by.
 SORTS = {

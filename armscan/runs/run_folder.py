@@ -16,6 +16,7 @@ from mlflow.entities import Run
 from armscan.config.command_hints import armscan_command
 from armscan.errors import ArmscanError, TrackingError
 from armscan.tracking.outbox import DELIVERED, LOCK, SUFFIX, OutboxFile, file_and_place, file_of
+from armscan.tracking.tags import FOLDER_TAG, HOST_TAG
 from armscan.utils.files import (
     CONFIG_FILE,
     LOCK_FILE,
@@ -138,7 +139,7 @@ class OwnFolder:
 
 def _noted(run: Run) -> Path:
     """Return the folder on this machine that was noted for a run."""
-    folder, host = run.data.tags.get("folder"), run.data.tags.get("host")
+    folder, host = run.data.tags.get(FOLDER_TAG), run.data.tags.get(HOST_TAG)
     if folder is None:
         raise RunSkippedError("no folder was noted for it")
     if host is None:

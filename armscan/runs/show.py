@@ -13,12 +13,11 @@ from armscan.config.command_hints import armscan_command, resume_command
 from armscan.config.trust import TRUST, needs_trust
 from armscan.errors import printable
 from armscan.experiment.results import figures_of, result_table
-from armscan.runs.query import experiment_ids, search
 from armscan.runs.rows import RunRow, artifacts_of
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.runs.tables import format_duration, narrow_table
-from armscan.tracking import EVALUATED_TAG, TrackingStore
-from armscan.tracking.run import FAILURE_TAG, PARENT_TAG
+from armscan.tracking import TrackingStore
+from armscan.tracking.tags import EVALUATED_TAG, FAILURE_TAG, PARENT_TAG
 from armscan.utils.console import wide_console
 from armscan.utils.files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
 
@@ -42,7 +41,7 @@ def show(client: TrackingStore, run: Run, uri: str) -> None:
         _print_pairs(console, f"artifacts in {run.info.artifact_uri}: their store does not answer", {})
     else:
         _print_sizes(console, f"artifacts in {run.info.artifact_uri}", artifacts)
-    children = search(client, experiment_ids(client), f"tags.mlflow.parentRunId = '{run.info.run_id}'")
+    children = client.children(run.info.experiment_id, run.info.run_id)
     if children:
         console.print("\nchildren", style="bold")
         table = narrow_table("id", "name", "status")

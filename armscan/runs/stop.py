@@ -10,8 +10,7 @@ from mlflow.entities import Run
 
 from armscan.errors import TrackingError
 from armscan.tracking.notes import Note
-
-STUDY_TAG, TRIAL_TAG = "study", "trial"
+from armscan.tracking.tags import STUDY_TAG, TRIAL_TAG
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from armscan.errors import printable
 from armscan.runs.prune import PruneItem
 from armscan.runs.rows import RunRow
 from armscan.stats.on_plane import ON_PLANE
-from armscan.tracking.run import PARENT_TAG
+from armscan.tracking.tags import AGENT_TAG, FOLDER_TAG, HOST_TAG, OBS_TAG, PARENT_TAG
 from armscan.utils.console import print_table, wide_console
 from armscan.utils.csv_file import write_csv
 from armscan.utils.files import ID_CHARS
@@ -119,8 +119,8 @@ def _values(row: RunRow) -> dict[str, Any]:
         *(row.started.isoformat(timespec="seconds"), row.duration_s),
         *(row.on_plane_rate, *row.on_plane, row.success_rate, row.mean_steps),
         *(row.n_bytes, row.in_folder, row.in_store, len(row.below)),
-        *(tags.get("choice.agent"), tags.get("choice.obs"), row.run.data.params.get("projection")),
-        *(tags.get("folder"), tags.get("host")),
+        *(tags.get(AGENT_TAG), tags.get(OBS_TAG), row.run.data.params.get("projection")),
+        *(tags.get(FOLDER_TAG), tags.get(HOST_TAG)),
     )
     return dict(zip(COLUMNS, values, strict=True))
 

@@ -3,9 +3,6 @@
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import environment_file, environment_tags, source
 from armscan.tracking.lookup import (
-    DOMAIN_TAG,
-    EVALUATED_TAG,
-    VERSION_TAG,
     FoundRun,
     check_run_id,
     check_version,
@@ -21,9 +18,6 @@ from armscan.tracking.store import check_artifacts, check_settings, open_existin
 from armscan.tracking.sync import abandon, deliver_pending, note_end, sync
 
 __all__ = [
-    "DOMAIN_TAG",
-    "EVALUATED_TAG",
-    "VERSION_TAG",
     "FoundRun",
     "TrackedRun",
     "TrackingStore",

@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import re
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from armscan.config.credentials import mask_passwords
 from armscan.errors import TrackingAwayError
 from armscan.tracking.sanitize import tags_of
+from armscan.tracking.tags import PARENT_TAG
 from armscan.utils.retry import RetryPolicy
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Run
+    from mlflow.store.entities import PagedList
 
 T = TypeVar("T")
 # What MLflow says of a store that it cannot reach, of one that fails, and of what is not there.
 AWAY, NOT_THERE = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "REQUEST_LIMIT_EXCEEDED"), "RESOURCE_DOES_NOT_EXIST"
 MAX_REASON_CHARS = 300
+# A loaded server takes longer for more than it is waited for.
+PER_PAGE = 100
 # What is worth telling of an HTTP client's account of its attempts.
 SHORT = re.compile(
     r"\[Errno -?\d+\] ([\w -]+)|(Connection reset by peer|Connection aborted|[Rr]ead timed out)|(too many 50\d)"
@@ -76,6 +80,17 @@ class TrackingStore:
 
         return self._asked(create)
 
+    def runs(self, experiment_ids: Sequence[str], condition: str = "") -> list[Run]:
+        """Return all runs of experiments that match an MLflow filter, in the order of their starts."""
+        if not experiment_ids:
+            return []
+        order = ["attributes.start_time ASC"]
+        return all_pages(partial(self.search_runs, [*experiment_ids], condition, order_by=order))
+
+    def children(self, experiment_id: str, run_id: str) -> list[Run]:
+        """Return the runs directly below a run, in the order of their starts."""
+        return self.runs([experiment_id], f"tags.`{PARENT_TAG}` = '{run_id}'")
+
     def _asked(self, operate: Callable[..., T], *args: Any, **kwargs: Any) -> T:
         asked = partial(operate, *args, **kwargs)
         if self._retry_policy is not None:
@@ -86,6 +101,17 @@ class TrackingStore:
             if (reason := why_away(error)) is None:
                 raise
             raise TrackingAwayError(f"tracking.uri is {self.uri!r}, but this store cannot be used: {reason}") from error
+
+
+def all_pages(ask: Callable[..., PagedList[T]]) -> list[T]:
+    """Return all that MLflow returns page by page."""
+    found: list[T] = []
+    token = None
+    while True:
+        page = ask(max_results=PER_PAGE, page_token=token)
+        found += page
+        if not (token := page.token):
+            return found
 
 
 def why_away(error: BaseException) -> str | None:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from armscan.tracking.tags import CHOICE
 from armscan.utils.files import BEST_CHECKPOINT
 from armscan.utils.log import log
 
@@ -17,7 +18,6 @@ MODEL_TYPE = "policy"
 # MLflow's own, by which its UI links a model with the versions that were registered of it.
 VERSIONS_TAG = "mlflow.modelVersions"
 CONTEXT_TAG = "mlflow.data.context"
-CHOICE = "choice."
 PARAMS = ("projection", "seed")
 # What MLflow refuses in the name of a model.
 REFUSED = re.compile(r"[/:.%\"']")

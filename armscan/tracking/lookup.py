@@ -16,6 +16,7 @@ from armscan.config.trust import needs_trust, stored_config
 from armscan.errors import TrackingError, listed
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.store import open_existing_store, store_errors
+from armscan.tracking.tags import EVALUATED_TAG, VERSION_TAG
 from armscan.utils.files import BEST_CHECKPOINT, CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
 from armscan.utils.strict_yaml import load_yaml
 
@@ -24,12 +25,6 @@ if TYPE_CHECKING:
 
     from armscan.training import Fingerprints
 
-# What a run's agent was trained on, as `armscan.training.TrainingDomain` writes it.
-DOMAIN_TAG = "trained_on"
-# Which run an evaluation is of; only evaluations have it.
-EVALUATED_TAG = "evaluation.of"
-# Which version of armscan a run was made by.
-VERSION_TAG = "armscan.version"
 ID = re.compile(r"[0-9a-f]{1,32}")
 MAX_EXPERIMENTS = 1000
 N_SHOWN = 4
@@ -124,7 +119,7 @@ def load_run(uri: str, run_id: str) -> FoundRun:
     with store_errors(uri):
         run = find_run(client, run_id)
         check_version(run)
-        children = client.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
+        children = client.children(run.info.experiment_id, run.info.run_id)
         if jobs := [child.info.run_id for child in children if EVALUATED_TAG not in child.data.tags]:
             raise TrackingError(
                 f"run {run.info.run_id} is the parent of a multirun: give one of its jobs, {listed(jobs)}"

@@ -16,6 +16,7 @@ from armscan.tracking.notes import forget
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
 from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
+from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG
 from armscan.tracking.uploader import Uploader
 from armscan.utils.files import RESULTS, RESUMED_DIFF_FILE, atomic_write
 from armscan.utils.log import log
@@ -28,12 +29,8 @@ if TYPE_CHECKING:
 MODEL_FILE = "MLmodel"
 # After the name of a run whose trial was pruned.
 PRUNED = " (pruned)"
-# MLflow's own, of the run that a run is shown below.
-PARENT_TAG = "mlflow.parentRunId"
 # No run of armscan has so many runs above it; a stranger's may be above themselves.
 MAX_DEPTH = 8
-# Why a run ended before its end.
-FAILURE_TAG = "failure"
 MAX_REASON_CHARS, MAX_DIGITS = 5000, 9
 # For a store that is away, where somebody waits for this process to end.
 SHORT_WAIT_S = 2.0
@@ -145,7 +142,7 @@ class TrackedRun:
 
     def set_pruned(self) -> None:
         """Show that the trial of this run was pruned: by a tag, and by the name."""
-        self.set_tags({"pruned": "true", "mlflow.runName": f"{self.name.removesuffix(PRUNED)}{PRUNED}"})
+        self.set_tags({PRUNED_TAG: "true", "mlflow.runName": f"{self.name.removesuffix(PRUNED)}{PRUNED}"})
 
     def log_datasets(self, prints: Mapping[str, Mapping[str, str]]) -> None:
         """Log the volumes as datasets of the run.

@@ -13,9 +13,10 @@ from armscan.errors import FolderInUseError, TrackingError, UntrustedError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in
 from armscan.tracking.notes import Note, forget, notes
 from armscan.tracking.outbox import CHANNELS, Address, Outbox, now_ms, outbox_files
-from armscan.tracking.run import FAILURE_TAG, SHORT_WAIT_S, TrackedRun
+from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.store import absolute
+from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG
 from armscan.tracking.uploader import deliver
 from armscan.utils.log import log
 
@@ -146,7 +147,7 @@ def _check_own(outbox: Outbox, store: TrackingStore) -> None:
     note = Note.of(run_id)
     if note is not None and note.outbox == outbox.file.absolute():
         return
-    noted = store.mlflow.get_run(run_id).data.tags.get("folder")
+    noted = store.mlflow.get_run(run_id).data.tags.get(FOLDER_TAG)
     if noted != str(folder):
         raise UntrustedError(
             f"the run was not tracked from here on this machine, and its own folder is {noted or 'not known'}; if you "

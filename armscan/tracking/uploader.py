@@ -15,6 +15,7 @@ from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, why_awa
 from armscan.tracking.logged_model import deliver_model
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
 from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, shortened
+from armscan.tracking.tags import NOTE_TAG
 from armscan.utils.files import RESULTS_PAGE, VOLUMES_FILE, sha256
 from armscan.utils.log import log
 from armscan.utils.retry import FIRST_PAUSE_S
@@ -29,7 +30,7 @@ ENTRIES_AT_ONCE = 200
 # Of a dataset, at most 36 in MLflow.
 DIGEST_CHARS = 16
 # MLflow's own, of the description of a run.
-NOTE_TAG, NOTE_SUM_TAG = "mlflow.note.content", "note.sha256"
+NOTE_SUM_TAG = "note.sha256"
 LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
 
 

@@ -23,6 +23,7 @@ from armscan.config.defaults import PHANTOM, default_tracking
 from armscan.evaluation.agent_source import agent_of_run
 from armscan.evaluation.runner import FIRST_SEED, apply
 from armscan.tracking import find_run, open_existing_store
+from armscan.tracking.tags import AGENT_TAG
 from armscan.training import TEST, evaluate
 from armscan.training.episode_results import EpisodeResult
 
@@ -34,8 +35,8 @@ def runs_of(tracking: str, run_id: str) -> list[str]:
     """Return the IDs of a grid's runs, or that of the run itself."""
     store = open_existing_store(tracking)
     run = find_run(store, run_id)
-    children = store.search_runs([run.info.experiment_id], f"tags.mlflow.parentRunId = '{run.info.run_id}'")
-    return [child.info.run_id for child in children if "choice.agent" in child.data.tags] or [run.info.run_id]
+    children = store.children(run.info.experiment_id, run.info.run_id)
+    return [child.info.run_id for child in children if AGENT_TAG in child.data.tags] or [run.info.run_id]
 
 
 def played(

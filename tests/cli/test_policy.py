@@ -11,7 +11,7 @@ import pytest
 from armscan.policies.build import SUM_TAG
 from armscan.policies.model import model_sha256
 from armscan.runs.model_card import MAX_CHARS
-from armscan.tracking import EVALUATED_TAG
+from armscan.tracking.tags import EVALUATED_TAG
 from armscan.training import load_checkpoint, save_checkpoint
 from armscan.utils.files import BEST_CHECKPOINT
 from tests.support.tracked_runs import GUESSER, IMAGES, store_of, tracked

@@ -8,12 +8,11 @@ import pytest
 import yaml
 
 from armscan.errors import ResumeError, UntrustedError
-from armscan.experiment.job import GRID_TAG
 from armscan.experiment.resume import resume
 from armscan.policies.build import SUM_TAG
 from armscan.policies.model import CODE, model_sha256
 from armscan.tracking import open_store
-from armscan.tracking.lookup import DOMAIN_TAG, VERSION_TAG
+from armscan.tracking.tags import DOMAIN_TAG, GRID_TAG, VERSION_TAG
 from armscan.utils.files import CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
 from tests.cli.test_policy import registered
 from tests.support.tracked_runs import GUESSER, store_of, tracked

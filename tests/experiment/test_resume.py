@@ -16,9 +16,9 @@ import torch
 from mlflow import MlflowClient
 
 import armscan
-from armscan.experiment.job import GRID_TAG
 from armscan.tracking import open_store
 from armscan.tracking.outbox import Address, Outbox
+from armscan.tracking.tags import GRID_TAG
 from armscan.training import load_checkpoint
 from armscan.utils.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, folder_lock, sha256
 from tests.support.killed_at import Moment, commands

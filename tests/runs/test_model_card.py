@@ -7,7 +7,8 @@ import pytest
 from armscan.errors import TrackingError
 from armscan.evaluation import EvaluationReport
 from armscan.runs.model_card import Card
-from armscan.tracking import EVALUATED_TAG, TrackedRun, load_run, open_store
+from armscan.tracking import TrackedRun, load_run, open_store
+from armscan.tracking.tags import EVALUATED_TAG
 from tests.training.test_train import evaluation_of
 
 OWN = {"test volumes": evaluation_of(2, 4).to_dict()}

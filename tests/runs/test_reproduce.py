@@ -12,8 +12,8 @@ import pytest
 
 import armscan
 from armscan.cli.main import main
-from armscan.tracking import EVALUATED_TAG
 from armscan.tracking.environment import environment, source
+from armscan.tracking.tags import EVALUATED_TAG
 from tests.test_run import SMALL, armscan_run, runs_in
 
 # They repeat a training.

@@ -10,7 +10,8 @@ from omegaconf import OmegaConf
 
 from armscan.config.compose import compose
 from armscan.experiment.build import build_experiment
-from armscan.tracking import DOMAIN_TAG, TrackedRun, open_store
+from armscan.tracking import TrackedRun, open_store
+from armscan.tracking.tags import DOMAIN_TAG
 from armscan.training import TrainingDomain, save_checkpoint
 from armscan.utils.files import SHA256_TAGS, sha256
 

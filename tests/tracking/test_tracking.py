@@ -14,7 +14,6 @@ from armscan.errors import InvalidValueError, TrackingError, UntrustedError
 from armscan.experiment.results import RunResult
 from armscan.experiment.runner import keep_results
 from armscan.tracking import (
-    VERSION_TAG,
     TrackedRun,
     draw_learning_curve,
     find_run,
@@ -27,6 +26,7 @@ from armscan.tracking.notes import notes
 from armscan.tracking.outbox import Address, Outbox, file_of
 from armscan.tracking.sanitize import flattened
 from armscan.tracking.sync import _deliver_pending, sync
+from armscan.tracking.tags import VERSION_TAG
 from armscan.tracking.uploader import deliver
 from armscan.training import EpochReport, TrainingResult
 from tests.support.waiting import wait_until

@@ -31,9 +31,9 @@ from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import make_study, name_objectives
 from armscan.sweeps.study.warm_start import values_of
-from armscan.sweeps.tasks.attempt import STORAGE_TAG, STUDY_TAG, TRIAL_TAG, Attempt, Task, trial_folder
+from armscan.sweeps.tasks.attempt import Attempt, Task, trial_folder
 from armscan.tracking import TrackingStore, abandon, open_store, run_of_study, source
-from armscan.tracking.run import FAILURE_TAG
+from armscan.tracking.tags import FAILURE_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.files import LAST_CHECKPOINT
 from armscan.utils.retry import RETRY_S
 
@@ -108,7 +108,7 @@ class Phase:
 
     def close_orphaned_runs(self) -> None:
         """Close runs whose workers ended before the trial, or the run's folder, knew the run's ID."""
-        running = self.client.search_runs(
+        running = self.client.runs(
             [self.experiment_id], f"tags.{STUDY_TAG} = '{self.name}' AND attributes.status = 'RUNNING'"
         )
         state = self.scheduler.state()

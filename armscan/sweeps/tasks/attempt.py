@@ -25,8 +25,6 @@ from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
 from armscan.utils.validation import check_float
 
-# Tags of tracked runs: the study, its storage, and the trial.
-STUDY_TAG, STORAGE_TAG, TRIAL_TAG = "study", "study.storage", "trial"
 TRIAL_DIGITS = 4
 
 

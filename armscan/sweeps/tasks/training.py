@@ -22,11 +22,11 @@ from armscan.experiment.results import RunResult
 from armscan.experiment.runner import VIDEO_SEED, log_result, train_agent
 from armscan.stats.bootstrap import interquartile_mean
 from armscan.sweeps.scheduling.state import TEST_PREFIX
-from armscan.sweeps.tasks.attempt import STUDY_TAG, Attempt, volumes_of
+from armscan.sweeps.tasks.attempt import Attempt, volumes_of
 from armscan.sweeps.tasks.generation import begin_generation
 from armscan.sweeps.tasks.reporter import TRAINING_METRICS, Reporter
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, run_of_study, take_over
-from armscan.tracking.run import PARENT_TAG
+from armscan.tracking.tags import PARENT_TAG, STUDY_TAG
 from armscan.training import (
     TEST,
     VALIDATION,

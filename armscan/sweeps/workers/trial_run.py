@@ -13,9 +13,10 @@ from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import RETRY_OF, RUN
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.open import Phase
-from armscan.sweeps.tasks.attempt import STUDY_TAG, TRIAL_TAG, trial_folder
+from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.tracking import TrackedRun, run_of_study
-from armscan.tracking.run import PARENT_TAG, SHORT_WAIT_S
+from armscan.tracking.run import SHORT_WAIT_S
+from armscan.tracking.tags import FOLDER_TAG, PARENT_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.files import CONFIG_FILE, SHA256_TAGS
 
 
@@ -38,7 +39,7 @@ def open_run(
     tags = {
         **phase.tags_of(trial),
         SHA256_TAGS[CONFIG_FILE]: config_sha256,
-        "folder": str(folder.resolve()),
+        FOLDER_TAG: str(folder.resolve()),
         "overrides": " ".join(overrides_of(values)),
     }
     if RETRY_OF in attributes:
