@@ -17,7 +17,7 @@ N_CONVOLUTIONS = 3
 
 @dataclass(frozen=True, kw_only=True)
 class FinderParameters:
-    """Parameters of `PlaneFinder`: looks, network, loss and doubt.
+    """Parameters of `PlaneFinder`: looks, network, loss and expected error.
 
     Raises:
         InvalidValueError: If a value is impossible.

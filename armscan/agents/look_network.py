@@ -18,7 +18,7 @@ UNITS = (0.1, 0.05, 3.0, 8.0)
 # What the places of earlier looks are divided by, and how large they may become.
 PLACES, MOST_PLACE = (0.2, 0.2, 10.0, 20.0), 6.0
 # No error is expected to be less, in mm and degrees: far below what is reached, and its logarithm is a number.
-LEAST_DOUBT = 0.01
+LEAST_EXPECTED = 0.01
 # Kernel of each convolution; all have stride 2.
 KERNELS = (5, 3, 3)
 
@@ -108,6 +108,7 @@ class LookNetwork(nn.Module):
         sizes = pairwise([n_features, *hidden_sizes])
         self.linear = nn.Sequential(*chain.from_iterable((nn.Linear(*each), nn.ReLU()) for each in sizes))
         self.place = nn.Linear(hidden_sizes[-1], 4)
+        # Checkpoints have this name.
         self.doubt = nn.Sequential(nn.Linear(hidden_sizes[-1], 32), nn.ReLU(), nn.Linear(32, 2))
         self.register_buffer("units", torch.tensor(UNITS))
         self.register_buffer("places", torch.tensor(PLACES))
@@ -134,8 +135,8 @@ class LookNetwork(nn.Module):
             places = geometry.seen_from(latest.flatten(0, 1), earlier.flatten(0, 1)) / self.places
             features.append(places.clamp(-MOST_PLACE, MOST_PLACE).reshape(-1, 4 * n_earlier))
         hidden = self.linear(torch.cat(features, dim=1))
-        doubt = nn.functional.softplus(self.doubt(hidden.detach())) + LEAST_DOUBT
-        return self.place(hidden) * self.units, doubt, hidden
+        expected = nn.functional.softplus(self.doubt(hidden.detach())) + LEAST_EXPECTED
+        return self.place(hidden) * self.units, expected, hidden
 
 
 class FinderModule(nn.Module):

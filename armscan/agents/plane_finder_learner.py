@@ -30,8 +30,8 @@ PHANTOM = "phantom-"
 ASTRAY_MM, ASTRAY_DEG = (0.5, 6.0), (1.0, 8.0)
 # How much larger the scales of the loss are for the first look: normal, normal, along it, across.
 FIRST_LOOK = (2.0, 2.0, 5.0, 1.0)
-# Of the second head, beside the first's.
-DOUBT_WEIGHT = 0.1
+# Weight of the second head's loss, beside the first's.
+EXPECTED_ERROR_WEIGHT = 0.1
 # Episodes that the expected errors are calibrated on.
 N_CALIBRATION = 96
 
@@ -116,10 +116,10 @@ class PlaneFinderLearner(SupervisedLearner):
         off = (place - wanted).detach()
         errors = torch.stack([off[:, 2].abs(), torch.rad2deg(off[:, :2].norm(dim=1))], dim=1)
         # The likelihood of errors that are distributed exponentially about their mean.
-        doubt = (expected.log() + errors / expected).mean()
+        expected_error_loss = (expected.log() + errors / expected).mean()
         self._set_lr(finder.lr_after(self._n_env_steps, self._total_env_steps))
         self._optimiser.zero_grad()
-        torch.autograd.backward(loss + DOUBT_WEIGHT * doubt)
+        torch.autograd.backward(loss + EXPECTED_ERROR_WEIGHT * expected_error_loss)
         self._optimiser.step()
         return loss.detach()
 

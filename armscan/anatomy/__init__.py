@@ -4,6 +4,7 @@ from armscan.anatomy.landmarks import Clusters, Landmarks, TissueClusters, nerve
 from armscan.anatomy.plane_search import FoundPlane, PlaneScorer, find_optimal_plane
 from armscan.anatomy.rewards import (
     PUBLISHED_TARGETS,
+    SUCCESS_THRESHOLD,
     AgreementReward,
     LandmarkReward,
     Reward,
@@ -27,6 +28,7 @@ __all__ = [
     "METRIC_TISSUES",
     "PIXEL_TISSUES",
     "PUBLISHED_TARGETS",
+    "SUCCESS_THRESHOLD",
     "USUAL_PIXEL_MM",
     "AgreementReward",
     "Clusters",

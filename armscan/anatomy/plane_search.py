@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.anatomy.rewards import PUBLISHED_TARGETS, LandmarkReward, Reward
+from armscan.anatomy.rewards import PUBLISHED_TARGETS, SUCCESS_THRESHOLD, LandmarkReward, Reward
 from armscan.anatomy.scanner import Scanner
 from armscan.anatomy.tissues import Tissues, check_tissues
 from armscan.errors import InvalidValueError, OptimalPlaneError
@@ -120,7 +120,7 @@ def find_optimal_plane(
     rx_deg: float = 20.0,
     step_deg: float = 5.0,
     step_mm: float = 3.0,
-    success_threshold: float = 0.05,
+    success_threshold: float = SUCCESS_THRESHOLD,
     targets: Sequence[int] = PUBLISHED_TARGETS,
     clustering: str | Tissues = "pixels",
 ) -> FoundPlane:

@@ -11,8 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.widgets import Button, Slider
 from numpy.typing import NDArray
 
-from armscan.anatomy import Tissues, check_tissues
-from armscan.annotation.labelling import SUCCESS_THRESHOLD
+from armscan.anatomy import SUCCESS_THRESHOLD, Tissues, check_tissues
 from armscan.envs.actions import COMPONENTS
 from armscan.envs.observations import View
 from armscan.envs.panels import BACKGROUND, INK, LINE_INK, OPTIMUM_INK, PLANE_INK, Ink

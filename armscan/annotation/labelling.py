@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from armscan.anatomy import FoundPlane, LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
+from armscan.anatomy import SUCCESS_THRESHOLD, FoundPlane, LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
 from armscan.envs.rendering import Beside, draw_plane, view_of
 from armscan.errors import InvalidValueError, OptimalPlaneError, listed
 from armscan.utils.files import atomic_write
@@ -21,9 +21,6 @@ from armscan.volumes import (
     write_markup,
 )
 from armscan.volumes.markups import MARKUP_SUFFIX
-
-# Default of an environment, whose episodes end above -success_threshold.
-SUCCESS_THRESHOLD = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -184,7 +184,7 @@ def _grid(shape: Sequence[int], spacing: Sequence[float]) -> str:
 
 def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolume, FoundPlane]]) -> None:
     """Print a table of the planes, and the next steps to check them."""
-    from armscan.annotation.labelling import SUCCESS_THRESHOLD
+    from armscan.anatomy import SUCCESS_THRESHOLD
     from armscan.config.command_hints import armscan_command
     from armscan.volumes.markups import MARKUP_SUFFIX
 

@@ -21,6 +21,7 @@ from armscan.errors import InvalidValueError
 from armscan.utils.validation import LARGEST_SEED, check_int
 
 if TYPE_CHECKING:
+    from armscan.evaluation.runner import PreparedAgent
     from armscan.evaluation.volumes import Volumes
 
 N_EPISODES, N_VIDEO_EPISODES = 200, 3
@@ -113,57 +114,76 @@ def evaluate(
     """
     changes = {name: value for name, value in rules.items() if value is not None}
     _check_words(run, agent, data, changes)
-    if is_given("phantoms") and data != "phantom":
-        raise click.UsageError(f"--phantoms is {phantoms}, but it is for --data phantom")
-    if tracking_experiment is not None and (agent is None or video):
-        raise click.UsageError(
-            "--tracking-experiment is for --agent without --video: the evaluation of a run is tracked in the run's "
-            "own experiment, a video not at all"
-        )
+    _check_options(agent, data, tracking_experiment, video=video)
     folder = None if data == "phantom" else data
-    if folder is not None and not Path(folder).is_dir():
-        raise InvalidValueError(
-            f"--data is {folder!r}, but there is no such folder: it must be a folder of volumes, or phantom"
-        )
-    overrides = [] if agent is None else [f"agent={agent}", *run, *(["data=nifti"] if folder else [])]
     print(f"preparing {f'run {run[0]}' if agent is None else f'agent={agent}'}", flush=True)
     # Deferred: a mistake on the command line is answered before these are loaded.
     from armscan import evaluation
     from armscan.config.defaults import default_tracking
     from armscan.evaluation.runner import apply
 
-    n_episodes = episodes or (N_VIDEO_EPISODES if video else N_EPISODES)
-    store = default_tracking() | {"uri": tracking}
-    if tracking_experiment is not None:
-        store["experiment"] = tracking_experiment
     if agent is None:
         source = evaluation.agent_of_run(tracking, run[0], changes, trust=trust)
     else:
         import_from_here()
+        overrides = [f"agent={agent}", *run, *(["data=nifti"] if folder else [])]
         source = evaluation.agent_of_overrides(overrides, folder, changes)
+    n_episodes = episodes or (N_VIDEO_EPISODES if video else N_EPISODES)
     if video:
-        applied = apply(source, data, phantoms, render_mode="rgb_array")
+        _record(apply(source, data, phantoms, render_mode="rgb_array"), n_episodes, seed, out)
     else:
-        applied = apply(source, data, phantoms, check=lambda groups: _check_episodes(n_episodes, groups))
-    if video:
-        from armscan.evaluation.video import record_video
-        from armscan.experiment.console import from_here
+        prepared = apply(source, data, phantoms, check=lambda groups: _check_episodes(n_episodes, groups))
+        experiment = {} if tracking_experiment is None else {"experiment": tracking_experiment}
+        _evaluate(prepared, default_tracking() | {"uri": tracking} | experiment, n_episodes, seed, changes, out)
 
-        for file in record_video(applied, n_episodes=n_episodes, seed=seed, out=out):
-            print(f"look at   {from_here(file)}")
-        return
+
+def _record(prepared: PreparedAgent, n_episodes: int, seed: int, out: Path | None) -> None:
+    """Record a video, and print where it is."""
+    from armscan.evaluation.video import record_video
+    from armscan.experiment.console import from_here
+
+    for file in record_video(prepared, n_episodes=n_episodes, seed=seed, out=out):
+        print(f"look at   {from_here(file)}")
+
+
+def _evaluate(
+    prepared: PreparedAgent,
+    store: Mapping[str, Any],
+    n_episodes: int,
+    seed: int,
+    changes: Mapping[str, Any],
+    out: Path | None,
+) -> None:
+    """Evaluate an agent, track its metrics, and print them."""
+    from armscan.evaluation import report_tables
     from armscan.evaluation.track import evaluate_and_track
     from armscan.experiment.console import print_table, print_where_to_look
     from armscan.utils.console import wide_console
 
-    report, file = evaluate_and_track(applied, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
+    report, file = evaluate_and_track(prepared, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
     console = wide_console()
-    for part in evaluation.report_tables(report, console.width):
+    for part in report_tables(report, console.width):
         console.print(part)
     tables = report.tables()
     for label, table in tables.items():
         print_table(label, table, how=label == [*tables][-1])
-    print_where_to_look(Path.cwd(), tracking, files=(str(file),))
+    print_where_to_look(Path.cwd(), store["uri"], files=(str(file),))
+
+
+def _check_options(agent: str | None, data: str | None, tracking_experiment: str | None, *, video: bool) -> None:
+    """Raise an error if options do not go together, or there is no such folder."""
+    if is_given("phantoms") and data != "phantom":
+        number = click.get_current_context().params["phantoms"]
+        raise click.UsageError(f"--phantoms is {number}, but it is for --data phantom")
+    if tracking_experiment is not None and (agent is None or video):
+        raise click.UsageError(
+            "--tracking-experiment is for --agent without --video: the evaluation of a run is tracked in the run's "
+            "own experiment, a video not at all"
+        )
+    if data not in (None, "phantom") and not Path(str(data)).is_dir():
+        raise InvalidValueError(
+            f"--data is {data!r}, but there is no such folder: it must be a folder of volumes, or phantom"
+        )
 
 
 def _check_words(run: Sequence[str], agent: str | None, data: str | None, changes: Mapping[str, Any]) -> None:

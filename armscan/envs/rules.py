@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from armscan.anatomy import (
     PUBLISHED_TARGETS,
+    SUCCESS_THRESHOLD,
     Landmarks,
     Reward,
     Scanner,
@@ -20,8 +21,8 @@ from armscan.anatomy import (
     check_tissues,
 )
 from armscan.envs.actions import COMPONENTS, STOP, ActionBounds, free_components
-from armscan.envs.observation_registry import with_action_reward
-from armscan.envs.observations import Observation, SliceGeometry, View, observe_all, smallest_shape
+from armscan.envs.observation_registry import ObservationLike, with_action_reward
+from armscan.envs.observations import SliceGeometry, View, observe_all, smallest_shape
 from armscan.envs.scene import RandomTransform, Scene, SceneSampler, shows_labelled
 from armscan.envs.spaces import MultiBoxSpace, Parts, flat_space, flatten, in_order
 from armscan.errors import InvalidValueError, OptimalPlaneError, listed
@@ -36,7 +37,6 @@ MAX_DRAWS = 1000
 NO_ACTION = np.zeros(0)
 
 Volumes = Mapping[str, LabelVolume] | Sequence[LabelVolume] | str | Path | None
-ObservationLike = str | Observation | Sequence[str | Observation]
 Observed = NDArray[Any] | Parts
 
 
@@ -53,7 +53,7 @@ class Rules:
         reward: Reward | None = None,
         targets: Sequence[int] = PUBLISHED_TARGETS,
         clustering: str | Tissues = "pixels",
-        success_threshold: float = 0.05,
+        success_threshold: float = SUCCESS_THRESHOLD,
         ends: str = ON_REWARD,
         max_steps: int = 50,
         start: str = "middle",

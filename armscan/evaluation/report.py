@@ -33,7 +33,7 @@ FURTHER_ROWS = (
     ("time per plane (ms), mean", "mean_seconds_per_plane", "{:.2f}"),
 )
 # Of agents that say how far off they expect to be.
-BY_DOUBT = tuple(
+BY_EXPECTED_ERROR = tuple(
     (f"{title} of the {which} quarter, median", f"median_distance_{unit}{suffix}", "{:.2f}")
     for unit, title in (("mm", "distance mm"), ("deg", "angle °"))
     for which, suffix in (("surest", SUREST), ("least sure", LEAST_SURE))
@@ -158,9 +158,9 @@ def _further(metrics: Mapping[str, MetricEstimates]) -> Table:
     apart = "\n" if len(metrics) > 1 else "  "
     for text, key, form in FURTHER_ROWS:
         table.add_row(text, *(_cell(_shown(each, key), form, apart=apart) for each in metrics.values()))
-    if any(key in each.estimates for _, key, _ in BY_DOUBT for each in metrics.values()):
+    if any(key in each.estimates for _, key, _ in BY_EXPECTED_ERROR for each in metrics.values()):
         table.add_section()
-        for text, key, form in BY_DOUBT:
+        for text, key, form in BY_EXPECTED_ERROR:
             table.add_row(text, *(_cell(each.estimate(key), form, apart=apart) for each in metrics.values()))
     table.add_section()
     table.add_row("those not started solved:")

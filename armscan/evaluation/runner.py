@@ -157,10 +157,10 @@ def _env(env_factory: EnvFactory, volumes: Volumes, clustering: object, render_m
         )
         if clustering != "pixels" or is_usual:
             raise
-        shown = listed(f"{across:.3g} x {depth:.3g}" for across, depth in sorted(sizes))
+        usual, *shown = (f"{across:.3g} x {depth:.3g}" for across, depth in (USUAL_PIXEL_MM, *sorted(sizes)))
         raise InvalidValueError(
-            f"{error}; clusters are found by pixels, as suits about 0.27 x 0.55 mm, and here a pixel has {shown} mm: "
-            "unless the plane is wrong, --clustering metric may see them"
+            f"{error}; clusters are found by pixels, as suits about {usual} mm, and here a pixel has {listed(shown)} "
+            "mm: unless the plane is wrong, --clustering metric may see them"
         ) from error
 
 

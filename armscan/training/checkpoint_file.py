@@ -16,7 +16,7 @@ from armscan.utils.files import atomic_write
 
 FORMAT = 1
 MAGIC = b"armscan checkpoint "
-HEADER = re.compile(rb"armscan checkpoint ([0-9]{1,9}) ([0-9a-f]{64})\n")
+HEADER = re.compile(MAGIC + rb"([0-9]{1,9}) ([0-9a-f]{64})\n")
 
 
 def save_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) -> None:

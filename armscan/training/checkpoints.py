@@ -53,10 +53,9 @@ def save_checkpoints(
     learner: Learner, reports: Sequence[EpochReport], folder: Path, provenance: CheckpointProvenance | None
 ) -> None:
     """Write the last checkpoint, and the best one where the last epoch is better than all before."""
-    facts = _facts(reports[-1], provenance)
-    save_checkpoint(folder / LAST_CHECKPOINT, learner.state(), facts | {"reports": _written(reports)})
+    _save_last(learner, reports, folder, provenance)
     if reports[-1].is_best:
-        save_checkpoint(folder / BEST_CHECKPOINT, learner.weights(), facts)
+        save_checkpoint(folder / BEST_CHECKPOINT, learner.weights(), _facts(reports[-1], provenance))
 
 
 def resume_from_checkpoint(learner: Learner, folder: Path, provenance: CheckpointProvenance) -> list[EpochReport]:
@@ -118,10 +117,15 @@ def take_over_checkpoints(
     best_report = best_of(reports)
     save_checkpoint(folder / BEST_CHECKPOINT, weights, _facts(best_report, own))
     # Last: from then on this training can be resumed.
-    save_checkpoint(
-        folder / LAST_CHECKPOINT, learner.state(), _facts(reports[-1], own) | {"reports": _written(reports)}
-    )
+    _save_last(learner, reports, folder, own)
     return reports
+
+
+def _save_last(
+    learner: Learner, reports: Sequence[EpochReport], folder: Path, provenance: CheckpointProvenance | None
+) -> None:
+    facts = _facts(reports[-1], provenance) | {"reports": _written(reports)}
+    save_checkpoint(folder / LAST_CHECKPOINT, learner.state(), facts)
 
 
 def _restore(learner: Learner, last: Path, provenance: CheckpointProvenance) -> list[EpochReport]:

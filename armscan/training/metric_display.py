@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.on_plane import limits_among
+from armscan.volumes.labelmap import LANDMARKS
 
 
 class Quantity(NamedTuple):
@@ -41,7 +42,7 @@ QUANTITIES = (
     Quantity("success_rate", "success, by reward", "{:.1%}"),
     Quantity("mean_steps", "steps, mean", "{:.2f}"),
     Quantity("iqm_steps", "steps, IQM", "{:.2f}"),
-    *(Quantity(f"mean_dice_{name}", f"Dice {name}, mean", "{:.2f}") for name in ("bones", "tendons", "artery")),
+    *(Quantity(f"mean_dice_{name}", f"Dice {name}, mean", "{:.2f}") for name in LANDMARKS),
 )
 # Of runs by older versions, which have kept nothing better.
 OLDER = {

@@ -82,7 +82,7 @@ class MetricEstimates:
             # What was never measured is no figure.
             if any(each is not None for each in measured) or not measured:
                 columns[name] = statistic, [math.nan if each is None else float(each) for each in measured]
-        columns |= _by_doubt(episodes)
+        columns |= _by_expected_error(episodes)
         for name, (statistic, values) in list(columns.items()):
             columns[name + NOT_STARTED_SOLVED] = statistic, np.where(is_other, values, math.nan).tolist()
         wilsons = {}
@@ -149,8 +149,8 @@ class MetricEstimates:
         return metrics
 
 
-def _by_doubt(episodes: Sequence[EpisodeResult]) -> dict[str, tuple[Statistic, list[float]]]:
-    """Return errors of the quarters of the episodes that the agent was surest and least sure of; none without doubt."""
+def _by_expected_error(episodes: Sequence[EpisodeResult]) -> dict[str, tuple[Statistic, list[float]]]:
+    """Return errors of the quarters of the episodes that the agent was surest and least sure of, if it expects some."""
     columns: dict[str, tuple[Statistic, list[float]]] = {}
     for unit in ("mm", "deg"):
         expected = [getattr(episode, f"expected_{unit}") for episode in episodes]

@@ -17,7 +17,7 @@ from armscan.volumes.summary import VolumeReport
 from armscan.volumes.volume import LabelVolume
 
 if TYPE_CHECKING:
-    from armscan.volumes.manifest_schema import Splits
+    from armscan.volumes.manifest_schema import Manifest, Splits
 
 SPLITS = ("train", "validation", "test")
 # What an entry and the whole manifest can say.
@@ -70,14 +70,7 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
         VolumeError: If the folder or a file cannot be used.
         ManifestError: If the manifest is missing or damaged, or does not name the folder's volumes.
     """
-    from armscan.volumes.manifest_schema import Manifest
-
-    folder = check_path("the folder of volumes", path)
-    files = volume_files(folder)
-    found = find_manifest(folder)
-    if found is None and require_manifest:
-        raise _without_manifest(folder)
-    manifest = read_manifest(found) if found else Manifest()
+    found, manifest, files = _manifest_of(path, require_manifest=require_manifest)
     entries = volume_entries(manifest, files, found)
     used = {name: entry for name, entry in entries.items() if not entry.exclude}
     if not used:
@@ -114,12 +107,8 @@ def subjects_in(path: str | Path, n_volumes: int | None = None) -> list[str]:
         VolumeError: If the folder cannot be read.
         ManifestError: If it has no manifest, or a damaged one.
     """
-    folder = check_path("the folder of volumes", path)
-    found = find_manifest(folder)
-    files = volume_files(folder)
-    if found is None:
-        raise _without_manifest(folder)
-    entries = volume_entries(read_manifest(found), files, found)
+    found, manifest, files = _manifest_of(path, require_manifest=True)
+    entries = volume_entries(manifest, files, found)
     used = {name: entry.subject or name for name, entry in entries.items() if not entry.exclude}
     return [used[name] for name in sorted(used)[:n_volumes]]
 
@@ -139,6 +128,16 @@ def _split_of(splits: Splits, subjects: Mapping[str, str], used: Mapping[str, ob
     return {name: split_of[subjects[name]] for name in used}
 
 
-def _without_manifest(folder: Path) -> ManifestError:
-    names = listed(MANIFEST_NAMES)
-    return ManifestError(f"{folder}: the folder has no manifest ({names}); armscan data label {folder} writes one")
+def _manifest_of(path: str | Path, *, require_manifest: bool) -> tuple[Path | None, Manifest, dict[str, Path]]:
+    """Return the path and contents of a folder's manifest (None and an empty one if there is none), and its volumes."""
+    from armscan.volumes.manifest_schema import Manifest
+
+    folder = check_path("the folder of volumes", path)
+    files = volume_files(folder)
+    found = find_manifest(folder)
+    if found is not None:
+        return found, read_manifest(found), files
+    if require_manifest:
+        names = listed(MANIFEST_NAMES)
+        raise ManifestError(f"{folder}: the folder has no manifest ({names}); armscan data label {folder} writes one")
+    return None, Manifest(), files

@@ -19,6 +19,8 @@ LANDMARK_LABELS = (1, 2, 3)
 ALLOWED_LABELS = "a labelmap holds " + ", ".join(f"{label} {tissue}" for label, tissue in LABEL_NAMES.items())
 TISSUE_LABELS = {name: label for label, name in LABEL_NAMES.items()}
 BACKGROUND = TISSUE_LABELS["background"]
+# Tissues that every labelmap must have.
+LANDMARKS = ("bones", "tendons", "artery")
 # Values this close together are looked up in one table; others are searched for.
 LARGEST_TABLE = 65536
 LARGEST_INT64 = 2**63 - 1
@@ -60,7 +62,7 @@ class LabelMap:
     def __post_init__(self) -> None:
         for tissue in TISSUE_LABELS:
             object.__setattr__(self, tissue, _checked_sources(tissue, getattr(self, tissue)))
-        for tissue in ("bones", "tendons", "artery"):
+        for tissue in LANDMARKS:
             if not getattr(self, tissue):
                 raise InvalidValueError(f"labels: {tissue} is empty, but every landmark must be there")
         check_choice("labels: others", self.others, (None, "background"))
@@ -172,7 +174,7 @@ def replaced(values: NDArray[np.integer[Any]], table: Mapping[int, int]) -> NDAr
 
 def check_landmarks(found: tuple[Found, ...], labels: LabelMap, where: str) -> None:
     """Raise `VolumeError` unless the file has voxels of every landmark."""
-    for tissue in ("bones", "tendons", "artery"):
+    for tissue in LANDMARKS:
         if not any(each.n_voxels for each in found if each.label == TISSUE_LABELS[tissue]):
             raise VolumeError(
                 f"{where}: no voxel is {tissue}, which is {shown(getattr(labels, tissue))} by the label map, but every "
