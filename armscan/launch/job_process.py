@@ -9,12 +9,15 @@ import subprocess
 import sys
 import traceback
 from functools import partial
+from typing import Any
 
 from omegaconf import DictConfig
 
 from armscan.config.error_messages import one_line_message
 from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, Invocation, Job, remove_if_untracked
 from armscan.utils.processes import child_command, on_parent_exit
+
+ENDINGS = (signal.SIGINT, signal.SIGTERM)
 
 
 def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
@@ -29,9 +32,13 @@ def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
         job.write_outcome(failure=f"killed by {signal.Signals(-ended.returncode).name}: out of memory?")
 
 
-def run_job() -> None:
-    """Run one job of a multirun, passed on standard input; a failure is noted and does not stop the others."""
-    on_parent_exit(partial(os.kill, os.getpid(), signal.SIGTERM))
+def run_job(launcher_pid: int) -> None:
+    """Run one job of a multirun, passed on standard input; a failure is noted and does not stop the others.
+
+    Args:
+        launcher_pid: Process ID of its launcher.
+    """
+    on_parent_exit(launcher_pid, partial(os.kill, os.getpid(), signal.SIGTERM))
     config, invocation = pickle.load(sys.stdin.buffer)
     job: Job = invocation.job
 
@@ -40,7 +47,13 @@ def run_job() -> None:
         job.write_outcome(failure=INTERRUPTED)
         os._exit(130)
 
-    for ending in (signal.SIGINT, signal.SIGTERM):
+    def end(**outcome: Any) -> None:
+        """Write the outcome; an interrupt that comes later changes nothing."""
+        for ending in ENDINGS:
+            signal.signal(ending, signal.SIG_IGN)
+        job.write_outcome(**outcome)
+
+    for ending in ENDINGS:
         signal.signal(ending, leave)
     try:
         if job.is_repeated:
@@ -57,6 +70,6 @@ def run_job() -> None:
             traceback.print_exc()
         remove_if_untracked(invocation.folder, error)
         print(f"[{job.label}] failed: {line or repr(error)}", file=sys.stderr, flush=True)
-        job.write_outcome(failure=line or repr(error))
+        end(failure=line or repr(error))
     else:
-        job.write_outcome(metrics=metrics)
+        end(metrics=metrics)

@@ -50,7 +50,12 @@ def interrupt(run: Run) -> str:
     run_id, note = run.info.run_id, Note.of(run.info.run_id)
     if run.info.status != "RUNNING":
         raise TrackingError(f"run {run_id} has ended already ({run.info.status})")
+    unknown = TrackingError(f"run {run_id} belongs to no study, and this machine knows no process of it")
     if note is None or not note.process.is_here or not note.process.is_alive:
-        raise TrackingError(f"run {run_id} belongs to no study, and this machine knows no process of it")
-    os.kill(note.process.pid, signal.SIGINT)
+        raise unknown
+    try:
+        os.kill(note.process.pid, signal.SIGINT)
+    # It has ended since.
+    except ProcessLookupError as error:
+        raise unknown from error
     return f"run {run_id}: its process {note.process.pid} was interrupted, and ends as with Ctrl-C"

@@ -121,15 +121,19 @@ def mlflow_server(uri: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
             process.wait()
 
 
-def serve_mlflow() -> None:
-    """Run MLflow's program with the arguments of this process, which ends with its parent."""
+def serve_mlflow(parent_pid: int) -> None:
+    """Run MLflow's program with the arguments of this process, which ends with its parent.
+
+    Args:
+        parent_pid: Process ID of the parent.
+    """
 
     def end_group() -> None:
         os.killpg(0, signal.SIGTERM)
         time.sleep(END_S)
         os.killpg(0, signal.SIGKILL)
 
-    on_parent_exit(end_group)
+    on_parent_exit(parent_pid, end_group)
     from mlflow.cli import cli
 
     cli()

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from filelock import FileLock
 from numba.core.event import Event, Listener, install_listener
 
 from armscan.utils.log import log
 
 PACKAGE = Path(__file__).parents[1]
+LOCK_FILE = ".lock"
 Function = TypeVar("Function", bound=Callable[..., Any])
 # A module whose attributes no type checker sees.
 CONFIG: Any = numba.config
@@ -35,11 +37,31 @@ def cached_njit(**options: Any) -> Callable[[Function], Function]:
         before = CONFIG.CACHE_DIR
         CONFIG.CACHE_DIR = str(Path(before or PACKAGE / "__pycache__") / f"armscan-{_sources_sha256()}")
         try:
-            return cast(Function, numba.njit(cache=True, **options)(function))
+            dispatcher = numba.njit(cache=True, **options)(function)
         finally:
             CONFIG.CACHE_DIR = before
+        _lock_cache(dispatcher)
+        return cast(Function, dispatcher)
 
     return compiled
+
+
+def _lock_cache(dispatcher: Any) -> None:
+    """Let one process at a time write the cache of a function.
+
+    Two that compile it for different types would otherwise give both results the same file.
+    """
+    # Without compilation (NUMBA_DISABLE_JIT) there is no cache.
+    if (kept := getattr(dispatcher, "_cache", None)) is None:
+        return
+    folder, save = Path(kept.cache_path), kept.save_overload
+
+    def save_alone(*args: Any) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder / LOCK_FILE):
+            save(*args)
+
+    kept.save_overload = save_alone
 
 
 @cache

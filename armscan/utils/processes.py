@@ -56,9 +56,19 @@ def no_garbage_collection() -> Iterator[None]:
 
 
 def child_command(module: str, function: str) -> list[str]:
-    """Return the command of a child process that runs a function, and may be interrupted while it still imports."""
+    """Return the command of a child process, which may be interrupted while it still imports.
+
+    Args:
+        module: Name of the module of the function.
+        function: Name of the function to call, with the ID of this process.
+    """
     first = collect_garbage_rarely.__name__
-    steps = (f"from {__name__} import {first}", f"{first}()", f"from {module} import {function}", f"{function}()")
+    steps = (
+        f"from {__name__} import {first}",
+        f"{first}()",
+        f"from {module} import {function}",
+        f"{function}({os.getpid()})",
+    )
     program = "\n    ".join(("try:", *steps))
     return [sys.executable, "-c", f"{program}\nexcept KeyboardInterrupt:\n    raise SystemExit(130)"]
 
@@ -151,12 +161,16 @@ class ProcessInfo:
         return self.is_here and self.pid == os.getpid()
 
 
-def on_parent_exit(action: Callable[[], object]) -> None:
-    """Call `action` in a thread once the process that started this one has ended."""
-    parent = os.getppid()
+def on_parent_exit(parent_pid: int, action: Callable[[], object]) -> None:
+    """Call `action` in a thread once the process that started this one has ended.
+
+    Args:
+        parent_pid: ID of that process, as `child_command` passes it: it may have ended while this one still imported.
+        action: Function to call.
+    """
 
     def watch() -> None:
-        while os.getppid() == parent:
+        while os.getppid() == parent_pid:
             time.sleep(POLL_S)
         action()
 

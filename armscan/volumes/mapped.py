@@ -75,7 +75,9 @@ def open_mapped(path: Path) -> Made | None:
     try:
         with path.open("rb") as file:
             contents = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            os.utime(file.fileno())
+            # Another user's cache may only be read.
+            with contextlib.suppress(OSError):
+                os.utime(file.fileno())
         start = len(MAGIC) + SHA256_CHARACTERS + 1
         digest = hashlib.sha256(memoryview(contents)[start:]).hexdigest()
         if contents[:start] != MAGIC + digest.encode() + b"\n":

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from armscan.errors import VolumeError
 from armscan.utils.files import cache_folder
 from armscan.volumes import (
     header_checks,
@@ -54,6 +55,9 @@ def read_kept(
         path: File of the volume.
         options: Reading options, such as crop and orientation; the cache's key holds them.
         optimal_action: Labelled plane, in the volume's frame.
+
+    Raises:
+        VolumeError: If the file cannot be used, or changes while it is read.
     """
     from pydantic import TypeAdapter
 
@@ -63,6 +67,8 @@ def read_kept(
 
     def make() -> Made:
         made, stored = reading.read_stored(path, options, optimal_action=optimal_action)
+        if _digest(path) != digest:
+            raise VolumeError(f"{path}: has changed while it was read")
         return made, details.dump_python(stored, mode="json")
 
     found, stored = kept_if_possible(_place("labelmap", path.name, digest, options, optimal_action), make)

@@ -2,11 +2,14 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numba
 import pytest
+from filelock import FileLock, Timeout
+from numba.core.caching import IndexDataCacheFile
 
-from armscan.utils.compilation import PACKAGE, cached_njit
+from armscan.utils.compilation import LOCK_FILE, PACKAGE, cached_njit
 
 CALLER = """
 from armscan.utils.compilation import cached_njit
@@ -64,3 +67,23 @@ def test_the_cache_of_other_compiled_functions_stays_where_it_was():
     assert three() == 3
     assert vars(numba.config)["CACHE_DIR"] == before
     assert "armscan-" in three.stats.cache_path
+
+
+def test_the_cache_of_a_compiled_function_is_written_by_one_process_at_a_time(monkeypatch, tmp_path):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    saved = []
+
+    def save(self, key, data):
+        # As another process would.
+        with pytest.raises(Timeout):
+            FileLock(Path(self._index_path).with_name(LOCK_FILE), timeout=0).acquire()
+        saved.append(key)
+
+    monkeypatch.setattr(IndexDataCacheFile, "save", save)
+
+    @cached_njit()
+    def four():
+        return 4
+
+    assert four() == 4
+    assert len(saved) == 1

@@ -1,22 +1,31 @@
 """Processes that armscan starts."""
 
 import gc
+import os
 import subprocess
+import threading
 from pathlib import Path
 
-from armscan.utils.processes import child_command, no_garbage_collection
+from armscan.utils.processes import child_command, no_garbage_collection, on_parent_exit
 
 ROOT = Path(__file__).parents[2]
 
 
-def print_threshold():
-    print("threshold", gc.get_threshold()[0])
+def print_threshold(parent_pid):
+    print("threshold", gc.get_threshold()[0], "parent", parent_pid)
 
 
 def test_child_runs_its_function_and_collects_garbage_rarely():
     command = child_command("tests.utils.test_processes", print_threshold.__name__)
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert ended.stdout == "threshold 50000\n"
+    assert ended.stdout == f"threshold 50000 parent {os.getpid()}\n"
+
+
+def test_child_whose_parent_ended_while_it_imported_is_told_so():
+    told = threading.Event()
+    # Nobody's parent any more: the first process of the machine may have adopted this one.
+    on_parent_exit(os.getppid() + 1, told.set)
+    assert told.wait(10.0)
 
 
 def test_child_that_is_interrupted_while_it_imports_ends_as_interrupted(tmp_path):

@@ -1,5 +1,6 @@
 """Volumes in files that processes map: found again as they were, or not at all."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -162,3 +163,13 @@ def test_volume_that_cannot_be_kept_is_used_all_the_same(volume, caplog, capfd):
     assert found is volume
     assert about == ABOUT
     assert "/dev/null: volumes cannot be kept there" in caplog.text + "".join(capfd.readouterr())
+
+
+def test_volume_in_a_cache_that_may_only_be_read_is_found(path, volume, monkeypatch):
+    mapped_volume(path, lambda: (volume, ABOUT))
+
+    def refused(*_):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "utime", refused)
+    assert open_mapped(path)[1] == ABOUT

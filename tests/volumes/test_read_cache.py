@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from armscan.errors import VolumeError
 from armscan.volumes import open_dataset, reading
 
 PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
@@ -126,3 +127,23 @@ def test_resampled_volumes_are_kept(write_labelmap, n_read, monkeypatch, tmp_pat
     assert read.volumes["a.nii.gz"].shape == (30, 20, 23)
     monkeypatch.setattr(read_cache, "resample", None)
     assert_same(open_dataset(tmp_path), read)
+
+
+def test_file_that_changes_while_it_is_read_is_refused_and_not_kept(
+    write_labelmap, write_manifest, n_read, monkeypatch
+):
+    path, read = write_labelmap("a.nii"), reading.read_stored
+    folder, before = write_manifest({"a.nii": PLANE}), path.read_bytes()
+
+    def changed(file, *arguments, **options):
+        made = read(file, *arguments, **options)
+        file.write_bytes(before + b"\0")
+        return made
+
+    with monkeypatch.context() as patched:
+        patched.setattr(reading, "read_stored", changed)
+        with pytest.raises(VolumeError, match=r"a.nii: has changed while it was read"):
+            open_dataset(folder)
+    path.write_bytes(before)
+    open_dataset(folder)
+    assert n_read() == 2

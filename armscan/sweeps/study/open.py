@@ -79,16 +79,18 @@ class Phase:
     run_id: str
     population: Population | None = None
 
-    def remove_checkpoints(self) -> None:
-        """Remove the last checkpoints of a population's trials from which no member can continue any more."""
-        if self.population is None:
-            return
-        trials = self.scheduler.study.get_trials(deepcopy=False)
-        kept = self.population.checkpoints_to_keep(trials)
-        for trial in trials:
-            if trial.number not in kept:
-                for file in trial_folder(self.folder, trial.number).glob(f"seed_*/{LAST_CHECKPOINT}"):
-                    file.unlink(missing_ok=True)
+    def remove_checkpoints(self, finished: Trial) -> None:
+        """Remove the last checkpoints of a trial that has finished; the best ones stay.
+
+        Of a population's trials those from which no member can continue any more.
+        """
+        numbers = {finished.number}
+        if self.population is not None:
+            trials = self.scheduler.study.get_trials(deepcopy=False)
+            numbers = {trial.number for trial in trials} - self.population.checkpoints_to_keep(trials)
+        for number in numbers:
+            for file in trial_folder(self.folder, number).glob(f"seed_*/{LAST_CHECKPOINT}"):
+                file.unlink(missing_ok=True)
 
     def tags_of(self, trial: FrozenTrial | Trial) -> dict[str, str]:
         """Return the tags by which tracked runs of a trial are known."""

@@ -152,9 +152,6 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
                 concluded = conclude(setup, result, tracked, folder) if conclude else {}
             draw_learning_curve(reporter.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
             attempt.show_picture(folder / LEARNING_CURVE_FILE)
-            if attempt.interval is None:
-                # A finished training is not resumed; the best checkpoint stays.
-                (folder / LAST_CHECKPOINT).unlink(missing_ok=True)
             tracked.log_results(folder)
             tracked.log_files(folder / RUN_FILE)
         attempt.opened(None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -163,7 +163,11 @@ class Heartbeat:
 
     def _watch(self) -> None:
         while not self._stopped.wait(POLL_S):
-            if self._is_told_to_leave():
+            is_told = False
+            # A shared folder may be away for a moment.
+            with suppress(OSError):
+                is_told = self._is_told_to_leave()
+            if is_told:
                 late = threading.Timer(REQUEUE_TIMEOUT_S, self._leave)
                 late.daemon = True
                 late.start()

@@ -197,7 +197,7 @@ def _end_workers(folder: Path) -> None:
     """Wait for the workers on this machine to leave, kill those that do not, and wait for their end."""
     if alive := _alive_after(LEAVE_S, folder):
         for worker in alive:
-            if worker.is_alive:
+            with contextlib.suppress(ProcessLookupError):
                 os.kill(worker.pid, signal.SIGKILL)
         _alive_after(LEAVE_S, folder)
 

@@ -104,10 +104,14 @@ def _environment() -> dict[str, str]:
     return environment
 
 
-def worker_main() -> None:
-    """Run the process of a worker, which reads its study from standard input."""
+def worker_main(supervisor_pid: int) -> None:
+    """Run the process of a worker, which reads its study from standard input.
+
+    Args:
+        supervisor_pid: Process ID of its supervisor.
+    """
     request = LeaveRequest()
-    on_parent_exit(request.ask_now)
+    on_parent_exit(supervisor_pid, request.ask_now)
     words, number, folder = pickle.load(sys.stdin.buffer)
     ProcessInfo.current().write(folder / f"worker-{number}.json")
     launcher = ProcessInfo.read(folder / LAUNCHER_FILE)

@@ -17,7 +17,7 @@ from armscan.config.command_hints import kept_command
 from armscan.config.compose import compose_run
 from armscan.config.defaults import MULTIRUN, to_plain
 from armscan.config.error_messages import one_line_message
-from armscan.errors import StorageAwayError, TrackingAwayError
+from armscan.errors import FolderInUseError, StorageAwayError, TrackingAwayError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import ClaimStatus, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
@@ -66,7 +66,6 @@ class Worker:
             # One round trip for the trial before and the next: with many workers these add up.
             trial = self._heartbeat.claim(outcome, conclude)
             self._heartbeat.clean_up()
-            self._phase.remove_checkpoints()
             outcome, conclude = None, None
             if trial is not None:
                 outcome = self._run(trial)
@@ -108,6 +107,11 @@ class Worker:
         except LimitReachedError as limit:
             log(f"trial {trial.number} is requeued: {limit}")
             self._heartbeat.requeue()
+        except FolderInUseError as error:
+            # Another process still delivers what an attempt before has left.
+            log(f"trial {trial.number}: {error}")
+            self._heartbeat.requeue()
+            time.sleep(WAIT_S)
         except TrackingAwayError:
             self._heartbeat.requeue()
             raise
@@ -180,6 +184,9 @@ class Worker:
         shown = ", ".join(f"{name} {metrics[name]:.4g}" for name in self._phase.objectives if name in metrics)
         reason = outcome.attributes.get(FAILURE)
         log(f"trial {trial.number} " + (f"failed: {reason}" if reason else f"{state.name.lower()} {shown}".rstrip()))
+        if not reason:
+            # Not before: until the storage has its outcome, a trial may have to be resumed.
+            self._phase.remove_checkpoints(trial)
         if tracked is None:
             return
         tracked.log_metrics(metrics | named_as_of_runs(metrics), n_env_steps=0)

@@ -1,7 +1,9 @@
 """A worker and its trials, which train nothing here: what they draw, what becomes of those that fail."""
 
+import errno
 import os
 import shutil
+import threading
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +13,7 @@ import numpy as np
 import optuna
 import pytest
 
-from armscan.errors import InvalidValueError
+from armscan.errors import FolderInUseError, InvalidValueError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import CONTROL, Limits, PlannedTrial
 from armscan.sweeps.space.space import Space
@@ -22,10 +24,12 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.open import Phase
 from armscan.sweeps.study.pruners import ParetoPruner
 from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.sweeps.workers import heartbeat, worker
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
 from armscan.tracking import open_store
+from armscan.utils.files import LAST_CHECKPOINT
 from armscan.utils.processes import ProcessInfo
 from tests.support.waiting import HANG_S
 
@@ -146,6 +150,62 @@ def test_worker_goes_on_after_a_trial_that_raised_and_says_what_it_raised(work):
     assert [trial.state.name for trial in study.trials] == ["COMPLETE", "FAIL", "COMPLETE", "COMPLETE"]
     assert "the second one" in study.trials[1].user_attrs["failure"]
     assert Path(study.trials[1].user_attrs["folder"]).name == "0001"
+
+
+def test_last_checkpoint_stays_until_the_storage_has_the_outcome_of_its_trial(work, monkeypatch):
+    def trained(attempt):
+        checkpoint = attempt.folder / "seed_0" / LAST_CHECKPOINT
+        checkpoint.parent.mkdir(parents=True)
+        checkpoint.touch()
+        if attempt.trial.number == 1:
+            raise RuntimeError("the second one")
+        return far_from_a_thousandth(attempt)
+
+    told, there = TrialScheduler._tell, []
+
+    def tell(self, outcome, *, is_repeated):
+        there.append((trial_folder(folder, outcome.trial.number) / "seed_0" / LAST_CHECKPOINT).exists())
+        told(self, outcome, is_repeated=is_repeated)
+
+    monkeypatch.setattr(TrialScheduler, "_tell", tell)
+    folder = work.storage("a").lock_file.parent
+    study = work("a", trained, n_trials=2)
+    assert there == [True, True, True]
+    # Only a trial that failed may still be looked into.
+    states = {Path(trial.user_attrs["folder"]).name: trial.state.name for trial in study.trials}
+    assert states == {"0000": "COMPLETE", "0001": "FAIL", "0002": "COMPLETE"}
+    assert [file.parts[-3] for file in folder.rglob(LAST_CHECKPOINT)] == ["0001"]
+
+
+def test_trial_whose_folder_another_process_still_uses_is_requeued(work, monkeypatch):
+    monkeypatch.setattr(worker, "WAIT_S", 0.0)
+    seen = []
+
+    def in_use_at_first(attempt):
+        seen.append(attempt.trial.number)
+        if len(seen) == 1:
+            raise FolderInUseError("another process tracks this run")
+        return far_from_a_thousandth(attempt)
+
+    study = work("a", in_use_at_first, n_trials=1)
+    assert seen == [0, 0]
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE"]
+
+
+def test_worker_that_cannot_read_whether_it_is_told_to_leave_asks_again(monkeypatch, make_phase):
+    left = threading.Event()
+    answers = iter([OSError(errno.ESTALE, "Stale file handle"), False, True])
+
+    def is_told_to_leave():
+        if isinstance(answer := next(answers, True), OSError):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(heartbeat, "POLL_S", 0.01)
+    scheduler = make_phase("a").scheduler
+    beating = Heartbeat(scheduler, "0", is_told_to_leave=is_told_to_leave, leave=left.set, on_death=lambda _: None)
+    with beating.running():
+        assert left.wait(HANG_S)
 
 
 def test_worker_ends_a_study_whose_configuration_fails_at_once_and_one_with_too_many_failures(work):

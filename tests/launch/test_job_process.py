@@ -1,0 +1,37 @@
+"""Jobs of a multirun, each in a process of its own."""
+
+import io
+import json
+import os
+import pickle
+import signal
+from types import SimpleNamespace
+
+import pytest
+
+from armscan.experiment import runner
+from armscan.experiment.job import Invocation, Job
+from armscan.launch import job_process
+
+
+@pytest.fixture
+def handlers():
+    """Put the handlers of signals back that a job sets in its process."""
+    before = {each: signal.getsignal(each) for each in job_process.ENDINGS}
+    yield
+    for each, handler in before.items():
+        signal.signal(each, handler)
+
+
+def test_interrupt_after_the_end_of_a_job_leaves_its_outcome_as_it_is(tmp_path, monkeypatch, handlers):
+    (tmp_path / "outcomes").mkdir()
+    job = Job(0, "a=1", "a=1", "b", tmp_path)
+    invocation = Invocation(tmp_path, [], "", {}, job)
+    metrics = {"test": {"mean_steps": 1.0}}
+    monkeypatch.setattr(runner, "run_experiment", lambda *_: metrics)
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO(pickle.dumps((None, invocation)))))
+    job_process.run_job(os.getppid())
+    # As the interpreter ends.
+    os.kill(os.getpid(), signal.SIGINT)
+    (outcome,) = tmp_path.glob("outcomes/*")
+    assert json.loads(outcome.read_text())["metrics"] == metrics
