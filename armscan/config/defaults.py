@@ -30,6 +30,8 @@ MULTIRUN = ("-m", "--multirun")
 NOT_COMPARED = ("tracking", "device", "compute.device", "seed", "evaluation.on_plane")
 # Keys that earlier versions did not have; null is what these did.
 ADDED = ("training.schedule",)
+# Of a cross-validation: the number of folds, and the fold that a run is tested on.
+FOLDS, FOLD = "data.folds", "data.fold"
 # Prefixes of keys that a study does not search.
 NOT_SEARCHED = ("study", "sweep", "tracking", "hydra", "seed")
 # The phantoms, where a command asks for volumes.

@@ -172,7 +172,7 @@ def _further(metrics: Mapping[str, MetricEstimates]) -> Table:
 
 def _shown(metrics: MetricEstimates, key: str) -> Estimate:
     """Return a metric in the unit that it is shown in."""
-    estimate = metrics.estimates[key]
+    estimate = metrics.estimate(key)
     return Estimate(*(1000.0 * seconds for seconds in estimate)) if key == "mean_seconds_per_plane" else estimate
 
 

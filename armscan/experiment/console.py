@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.text import Text
 
 from armscan.config.command_hints import armscan_command
+from armscan.config.defaults import FOLD
 from armscan.experiment.job import INTERRUPTED, JobOutcome
 from armscan.experiment.results import TITLES, RunResult
 from armscan.training import TEST, MetricEstimates, ResultTable
@@ -78,10 +79,12 @@ def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -
     n_baselines = len(results) - len(outcomes)
     names = {number: f"{number} ({outcome.varied})" for number, outcome in outcomes.items()}
     randoms = {names[number]: each[RANDOM] for number, each in baselines.items() if RANDOM in each}
+    # Folds have different volumes: the best of them is the easiest.
+    has_folds = any(f"{FOLD}=" in outcome.varied for outcome in outcomes.values())
     return ResultTable(
         results,
         {heading: [*values, *[""] * n_baselines] for heading, values in facts.items()},
-        headline({names[number]: each for number, each in tested.items()}, randoms),
+        "" if has_folds else headline({names[number]: each for number, each in tested.items()}, randoms),
     )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from mlflow.entities import Metric, Run, RunTag
 
+from armscan.config.defaults import FOLD
 from armscan.stats.on_plane import ON_PLANE, PREFIX
 from armscan.tracking import TrackingStore
 from armscan.tracking.outbox import now_ms
@@ -28,8 +29,11 @@ def best_of(runs: Sequence[Run]) -> Run | None:
 
 
 def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:
-    """Log the leading figures of the best job and its random agent to the run of a grid, in the columns of its jobs."""
-    if (best := best_of(jobs)) is None:
+    """Log the leading figures of the best job and its random agent to the run of a grid, in the columns of its jobs.
+
+    Jobs of different folds have different volumes, and none is the best.
+    """
+    if (best := best_of(jobs)) is None or len({job.data.params.get(FOLD) for job in jobs}) > 1:
         return
     now, metrics = now_ms(), []
     for group in (TESTED, f"{RANDOM}/"):

@@ -9,9 +9,8 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from armscan.config.compose import compose
-from armscan.config.defaults import MULTIRUN
+from armscan.config.defaults import FOLD, FOLDS, MULTIRUN
 
-FOLDS, FOLD = "data.folds", "data.fold"
 # What may set `data.folds`.
 MAY_SET_FOLDS = (f"{FOLDS}=", f"+{FOLDS}=", "experiment=", "+experiment=")
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from armscan.launch.folds_grid import FOLD
+from armscan.config.defaults import FOLD
 from armscan.reports.html import page
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
@@ -33,18 +34,21 @@ def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
     Args:
         runs: Folder of each run, and its overrides that differ from those of the others.
     """
-    tested: dict[str, dict[str, list[Evaluation]]] = {}
+    # By title, training and fold.
+    tested: dict[str, dict[str, dict[str, Evaluation]]] = {}
     for folder, varied in runs:
         words = dict(word.partition("=")[::2] for word in varied.split())
-        if words.pop(FOLD, None) is None:
+        if (fold := words.pop(FOLD, None)) is None:
             return None
         training = words.pop(SEED, "")
         others = " ".join(f"{key}={value}" for key, value in words.items())
         for name, evaluation in _evaluations(folder).items():
             title = ", ".join(filter(None, (name, others)))
-            tested.setdefault(title, {}).setdefault(training, []).append(evaluation)
+            # A baseline plays the same episodes whatever the seed of a training: they count once.
+            training_of = training if name == AGENT else ""
+            tested.setdefault(title, {}).setdefault(training_of, {})[fold] = evaluation
     joined = {
-        title: {training: Evaluation.pooled(each) for training, each in by_training.items()}
+        title: {training: Evaluation.pooled([*each.values()]) for training, each in by_training.items()}
         for title, by_training in tested.items()
     }
     figures = {title: MetricEstimates.of_trainings(each) for title, each in joined.items()}
@@ -65,8 +69,15 @@ def _evaluations(folder: Path) -> dict[str, Evaluation]:
     return {AGENT: agent, **{f"{name}{ALL_FOLDS}": Evaluation.of_dict(each) for name, each in baselines.items()}}
 
 
-def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: str) -> None:
+def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: str, notes: Sequence[str]) -> None:
     """Keep the table of all folds in the grid's folder, and with its figures in the grid's run.
+
+    Args:
+        table: Table to keep.
+        folder: Folder of the grid.
+        store: Store of the grid's run.
+        run_id: MLflow run ID of the grid.
+        notes: Notes on the table, such as missing folds.
 
     Raises:
         TrackingError: If the store is away.
@@ -74,9 +85,10 @@ def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: s
     from mlflow.entities import Metric
 
     from armscan.tracking.outbox import now_ms
+    from armscan.tracking.uploader import leave_note
 
     file = folder / RESULTS_PAGE
-    text = page("all folds (test)", table.html())
+    text = page("all folds (test)", "".join(f"<p>{html.escape(note)}</p>" for note in notes) + table.html())
     atomic_write(file, methodcaller("write", text.encode()))
     time_ms = now_ms()
     groups = {title: TEST_GROUP if title == AGENT else title.removesuffix(ALL_FOLDS) for title in table.results}
@@ -90,3 +102,4 @@ def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: s
     ]
     store.log_batch(run_id, metrics=metrics)
     store.log_artifact(run_id, str(file))
+    leave_note(store, run_id, "\n\n".join([*notes, table.markdown()]))

@@ -176,8 +176,9 @@ def _pool_folds(
     table = folds_table((Path(run.data.tags[FOLDER_TAG]), outcomes[run.data.tags[JOB_TAG]].varied) for run in finished)
     if table is not None:
         left_out = len(outcomes) - len(finished)
-        print_table("all folds (test)", table, [f"{left_out} of {len(outcomes)} jobs are missing"] if left_out else [])
-        keep_table(table, folder, store, word["run_id"])
+        notes = [f"{left_out} of {len(outcomes)} jobs are missing"] if left_out else []
+        print_table("all folds (test)", table, notes)
+        keep_table(table, folder, store, word["run_id"], notes)
 
 
 def _close_parent(

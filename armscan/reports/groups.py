@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from armscan.config.defaults import ADDED, NOT_COMPARED
-from armscan.reports.load import FOLD, TrackedTraining
+from armscan.config.defaults import ADDED, FOLD, NOT_COMPARED
+from armscan.reports.load import TrackedTraining
 
 LEFT_OUT = (*NOT_COMPARED, "data.cache_dir", FOLD)
 SEED_IN_NAME = re.compile(r"-seed\d+$")
@@ -60,6 +60,7 @@ def group_trainings(trainings: Sequence[TrackedTraining]) -> tuple[list[Group], 
     that has run to its end if there is any, and of these the last.
     """
     of_key: dict[tuple[tuple[str, str], ...], list[TrackedTraining]] = {}
+    trainings = _with_same_limits(trainings)
     for training in trainings:
         of_key.setdefault(tuple(sorted(_compared(training.params).items())), []).append(training)
     kept = [_one_for_each_seed(each) for each in of_key.values()]
@@ -68,6 +69,19 @@ def group_trainings(trainings: Sequence[TrackedTraining]) -> tuple[list[Group], 
         groups.append(Group(number, name, f"{number}. {_shortened(name)}", tuple(each)))
     counted = {training.run_id for group in groups for training in group.trainings}
     return groups, [training for training in trainings if training.run_id not in counted]
+
+
+def _with_same_limits(trainings: Sequence[TrackedTraining]) -> list[TrackedTraining]:
+    """Return trainings whose on-plane rates all have the limits of the first evaluation."""
+    limits = next((each.evaluation.on_plane for each in trainings if each.evaluation is not None), ())
+    return [
+        replace(
+            each,
+            evaluation=each.evaluation and replace(each.evaluation, on_plane=limits),
+            baselines={name: replace(played, on_plane=limits) for name, played in each.baselines.items()},
+        )
+        for each in trainings
+    ]
 
 
 def differing_rules(groups: Sequence[Group]) -> list[str]:

@@ -12,6 +12,7 @@ import numpy as np
 from mlflow.entities import Run
 from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
 
+from armscan.config.defaults import FOLD, FOLDS
 from armscan.config.legacy import migrate
 from armscan.errors import TrackingError
 from armscan.reports.select import SelectedRuns
@@ -35,8 +36,8 @@ OF_VALIDATION = "validation/"
 # The beginnings of what else is drawn.
 OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
 BUDGET = "training.env_steps"
-# Of a cross-validation, and MLflow's parameter of what is not set.
-FOLDS, FOLD, UNSET = "data.folds", "data.fold", "None"
+# MLflow's parameter of what is not set.
+UNSET = "None"
 T = TypeVar("T")
 
 

@@ -60,7 +60,8 @@ class Card:
             # Where there is no room for both, the run's own evaluation stays.
             if len(text + section) <= MAX_CHARS:
                 text += section
-            tags |= _tags(report)
+            # The run's own evaluation is first, by its own rules.
+            tags = _tags(report) | tags
         return cls(text, tags)
 
 

@@ -134,6 +134,18 @@ def wilson(n_successes: int, n_trials: int) -> Estimate:
     )
 
 
+def difference_of_rates(ours: Estimate, theirs: Estimate) -> Estimate:
+    """Return the difference of two independent rates, with the interval that follows from theirs (Newcombe 1998).
+
+    The interval is method 10 of doi:10.1002/(SICI)1097-0258(19980430)17:8<873::AID-SIM779>3.0.CO;2-I if theirs are
+    Wilson's.
+    """
+    value = ours.value - theirs.value
+    below = math.hypot(ours.value - ours.low, theirs.high - theirs.value)
+    above = math.hypot(ours.high - ours.value, theirs.value - theirs.low)
+    return Estimate(value, value - below, value + above)
+
+
 def _estimate(value: float, resampled: FloatArray) -> Estimate:
     known = resampled[~np.isnan(resampled)]
     if not len(known):

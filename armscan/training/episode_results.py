@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from operator import attrgetter
@@ -129,8 +130,18 @@ class Evaluation:
 
     @classmethod
     def pooled(cls, evaluations: Sequence[Evaluation]) -> Self:
-        """Return the episodes of evaluations together, one at least, with the limits of the first."""
-        return cls(tuple(episode for each in evaluations for episode in each.episodes), evaluations[0].on_plane)
+        """Return the episodes of evaluations together, one at least, with the limits of the first.
+
+        Every volume counts alike: of one on which more episodes were played than on another, the first ones are kept.
+        """
+        n_played = Counter(episode.volume for each in evaluations for episode in each.episodes)
+        n_kept, n_seen = min(n_played.values(), default=0), Counter[str]()
+        episodes = []
+        for episode in (episode for each in evaluations for episode in each.episodes):
+            n_seen[episode.volume] += 1
+            if n_seen[episode.volume] <= n_kept:
+                episodes.append(episode)
+        return cls(tuple(episodes), evaluations[0].on_plane)
 
     @classmethod
     def of_dict(cls, contents: Mapping[str, Any]) -> Self:

@@ -2,6 +2,7 @@
 
 The difference from the random agent is paired: the rates of each volume are compared, so that a volume that is easy
 for both does not hide what the agent adds. Its interval is for other volumes and, with several trainings, other seeds.
+If all volumes differ alike, it is Newcombe's, which takes episodes as independent.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.stats.bootstrap import Estimate
+from armscan.stats.bootstrap import Estimate, difference_of_rates, wilson
 from armscan.stats.paired import crossed_mean
 from armscan.training.episode_results import Evaluation
 from armscan.training.metric_display import interval_text
@@ -20,6 +21,8 @@ from armscan.training.metrics import MetricEstimates
 
 # Difference of the leading on-plane rates, among the figures of an agent.
 ABOVE_RANDOM = "on_plane_above_random"
+# Rates that differ alike on all volumes have no interval but for rounding.
+NO_WIDTH = 1e-9
 DISTANCES = (("median_distance_mm", "{:.1f} mm"), ("median_distance_deg", "{:.1f}°"))
 
 
@@ -43,6 +46,9 @@ def beside_random(
     scores = np.array([[each[name] for name in theirs] for each in ours])
     mean, half = crossed_mean(scores - np.array([*theirs.values()]))
     above = Estimate(float(mean), float(mean - half), float(mean + half)).clipped(-1.0, 1.0)
+    if half < NO_WIDTH:
+        assert random is not None
+        above = difference_of_rates(_wilson_of(trainings), _wilson_of([random]))
     return replace(figures, estimates={**figures.estimates, ABOVE_RANDOM: above})
 
 
@@ -73,6 +79,12 @@ def headline(results: Mapping[str, MetricEstimates], randoms: Mapping[str, Metri
         f"Median distance {far}." if far else "",
     )
     return " ".join(filter(None, sentences))
+
+
+def _wilson_of(evaluations: Sequence[Evaluation]) -> Estimate:
+    """Return the leading on-plane rate of all episodes, with Wilson's interval."""
+    n_episodes = sum(len(each.episodes) for each in evaluations)
+    return wilson(round(sum(each.on_plane_rate * len(each.episodes) for each in evaluations)), n_episodes)
 
 
 def _rates(evaluation: Evaluation) -> dict[str, float]:

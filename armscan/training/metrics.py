@@ -89,7 +89,7 @@ class MetricEstimates:
         for name, values in rates.items():
             of_others = list(compress(values, is_other))
             wilsons[name + WILSON] = wilson(int(sum(values)), len(values))
-            wilsons[name + WILSON + NOT_STARTED_SOLVED] = wilson(int(sum(of_others)), len(of_others))
+            wilsons[name + NOT_STARTED_SOLVED + WILSON] = wilson(int(sum(of_others)), len(of_others))
         return cls(
             n_seeds=1 if trainings is None else len(set(trainings)),
             n_volumes=len(set(volumes)),

@@ -8,10 +8,15 @@ from hydra.errors import HydraException
 
 from armscan.config.error_messages import one_line_message
 from armscan.errors import InvalidValueError, VolumeError
+from armscan.experiment.console import jobs_table
+from armscan.experiment.job import JobOutcome
 from armscan.launch.folds_grid import with_folds
-from armscan.launch.folds_table import AGENT, folds_table
+from armscan.launch.folds_table import AGENT, folds_table, keep_table
 from armscan.launch.grid_plan import print_grid_plan
+from armscan.tracking import open_store
+from armscan.tracking.tags import NOTE_TAG
 from armscan.training import TEST, Evaluation, MetricEstimates
+from armscan.utils.files import RESULTS_PAGE
 from tests.training.test_train import evaluation_of
 
 
@@ -106,13 +111,52 @@ def test_table_puts_the_wrists_of_all_folds_together(tmp_path):
     figures = table.results[AGENT]
     assert (figures.n_seeds, figures.n_volumes, figures.n_episodes) == (2, 2, 8)
     assert figures.estimate("median_distance_mm").value == 4.5
-    assert table.results["random, all folds"].n_episodes == 4
+    # Whatever the seed of a training, random planes are the same: they count once.
+    assert (table.results["random, all folds"].n_seeds, table.results["random, all folds"].n_episodes) == (1, 2)
     # The interval draws wrists: it is that of the same episodes in one evaluation.
     first = [json.loads((folder / "evaluation.json").read_text())[TEST] for folder, _ in runs[:2]]
     alone = Evaluation(tuple(each for one in first for each in Evaluation.of_dict(one).episodes))
     expected = MetricEstimates.of(alone).estimate("median_distance_mm")
     found = folds_table([(path, varied.split()[0]) for path, varied in runs[:2]]).results[AGENT]
     assert found.estimate("median_distance_mm") == pytest.approx(expected)
+
+
+def test_random_planes_count_once_where_a_run_of_the_first_seed_is_missing(tmp_path):
+    runs = [
+        (left_by_a_run(tmp_path / f"{fold}-{seed}", f"wrist{fold}", [1.0]), f"data.fold={fold} seed={seed}")
+        for fold, seed in ((0, 0), (0, 1), (1, 1))
+    ]
+    random = folds_table(runs).results["random, all folds"]
+    assert (random.n_volumes, random.n_episodes) == (2, 2)
+
+
+def test_every_wrist_counts_alike_however_many_a_fold_has(tmp_path):
+    near, far = [1.0] * 6, [9.0] * 2
+    runs = [
+        (left_by_a_run(tmp_path / name, name, each), f"data.fold={name}") for name, each in (("a", near), ("b", far))
+    ]
+    figures = folds_table(runs).results[AGENT]
+    assert (figures.n_volumes, figures.n_episodes) == (2, 4)
+    assert figures.estimate("on_plane_5mm_10deg").value == 0.5
+
+
+def test_page_and_description_of_all_folds_say_what_is_missing(tmp_path, database):
+    store, experiment_id = open_store(database, experiment="a", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
+    run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
+    table = folds_table([(left_by_a_run(tmp_path / "a", "wrist", [1.0]), "data.fold=0")])
+    keep_table(table, tmp_path, store, run_id, ["1 of 2 jobs are missing"])
+    assert "<p>1 of 2 jobs are missing</p>" in (tmp_path / RESULTS_PAGE).read_text()
+    assert store.get_run(run_id).data.tags[NOTE_TAG].startswith("1 of 2 jobs are missing\n\n")
+
+
+def test_no_job_is_the_best_of_those_that_are_tested_on_other_wrists():
+    outcomes = {
+        str(fold): JobOutcome("", f"data.fold={fold}", metrics={TEST: {"on_plane_5mm_10deg": rate}})
+        for fold, rate in enumerate((0.3, 0.9))
+    }
+    assert jobs_table(outcomes, {}).headline == ""
+    others = {number: replace(each, varied=f"agent={number}") for number, each in outcomes.items()}
+    assert "best of 2 on these very volumes, 1 (agent=1), 90.0%" in jobs_table(others, {}).headline
 
 
 def test_table_keeps_kinds_of_runs_apart_and_a_grid_without_folds_has_none(tmp_path):

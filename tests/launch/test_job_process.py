@@ -30,6 +30,7 @@ def test_interrupt_after_the_end_of_a_job_leaves_its_outcome_as_it_is(tmp_path, 
     metrics = {"test": {"mean_steps": 1.0}}
     monkeypatch.setattr(runner, "run_experiment", lambda *_: metrics)
     monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO(pickle.dumps((None, invocation)))))
+    monkeypatch.setattr(job_process, "on_parent_exit", lambda *_: None)
     job_process.run_job(os.getppid())
     # As the interpreter ends.
     os.kill(os.getpid(), signal.SIGINT)

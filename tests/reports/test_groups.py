@@ -1,8 +1,11 @@
 """Groups of trainings, and their names."""
 
+import dataclasses
+
 import pytest
 
 from armscan.reports.groups import differing_rules, group_trainings
+from armscan.stats.on_plane import OnPlane
 
 
 def names(*trainings):
@@ -74,3 +77,16 @@ def test_of_several_runs_with_the_same_seed_one_counts(make_training):
 def test_rules_that_differ_are_known(make_training, key, is_rule):
     groups, _ = group_trainings([make_training(params={key: value}) for value in "12"])
     assert differing_rules(groups) == ([key] if is_rule else [])
+
+
+def test_on_plane_rates_of_all_groups_have_the_limits_of_the_first(make_training):
+    limits = ((5.0, 10.0), (2.0, 5.0))
+    trainings = [
+        dataclasses.replace(training, evaluation=dataclasses.replace(training.evaluation, on_plane=tuple(on_plane)))
+        for training, on_plane in (
+            (make_training(params={"a": "1"}), (OnPlane(*each) for each in limits)),
+            (make_training(params={"a": "2"}), (OnPlane(*each) for each in reversed(limits))),
+        )
+    ]
+    groups, _ = group_trainings(trainings)
+    assert {group.trainings[0].evaluation.on_plane for group in groups} == {limits}

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from mlflow.entities import Metric
+from mlflow.entities import Metric, Param
 
 from armscan.launch.best_job import BEST_TAG, show_best
 from armscan.tracking import TrackedRun, open_store
@@ -67,6 +67,15 @@ def test_run_of_a_grid_shows_the_figures_of_its_best_job(store):
     run = client.get_run(parent)
     assert run.data.metrics == {RATE: 0.75, STEPS: 3.0, RANDOM_RATE: 0.2}
     assert run.data.tags[BEST_TAG] == jobs[1]
+
+
+def test_run_of_a_cross_validation_shows_no_best_fold(store):
+    client, experiment_id = store()
+    parent, *jobs = (client.create_run(experiment_id, name=name, tags={}).info.run_id for name in ("parent", "a", "b"))
+    for fold, job in enumerate(jobs):
+        client.log_batch(job, metrics=[Metric(RATE, 0.5, 1, 5)], params=[Param("data.fold", str(fold))])
+    show_best(client, parent, [client.get_run(job) for job in jobs])
+    assert client.get_run(parent).data.metrics == {}
 
 
 def test_run_of_a_grid_without_evaluated_jobs_shows_nothing(store):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from armscan.stats.bootstrap import difference_of_rates, wilson
 from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from tests.training.test_train import evaluation_of
@@ -48,6 +49,16 @@ def test_difference_is_that_of_a_paired_t_test_over_the_volumes():
 )
 def test_verdict_follows_the_interval_of_the_difference(rates, random_rates, verdict):
     assert verdict in said_of(rates, random_rates)
+
+
+def test_difference_that_is_the_same_on_all_volumes_has_an_interval_for_other_episodes():
+    # Newcombe (1998) has it of 56 of 70 and 48 of 80: 0.0524 to 0.3339.
+    found = difference_of_rates(wilson(56, 70), wilson(48, 80))
+    assert found == pytest.approx((0.2, 0.0524, 0.3339), abs=1e-4)
+    ours, random = evaluation([0.9, 0.9]), evaluation([0.8, 0.8])
+    above = beside_random(MetricEstimates.of(ours), [ours], random).estimates[ABOVE_RANDOM]
+    assert above == pytest.approx(difference_of_rates(wilson(36, 40), wilson(32, 40)))
+    assert "Not shown to be better than random: +10.0 points (" in said_of([0.9, 0.9], [0.8, 0.8])
 
 
 def test_interval_of_a_difference_of_rates_ends_at_100_points():

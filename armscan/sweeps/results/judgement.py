@@ -58,9 +58,16 @@ class Difference(NamedTuple):
     probability: Estimate
 
     @property
+    def is_alike(self) -> bool:
+        """Whether all differences are alike, but for rounding: then there is no interval."""
+        return math.isclose(self.paired.low, self.paired.high, rel_tol=1e-9, abs_tol=1e-12)
+
+    @property
     def verdict(self) -> str:
         """Return `better` or `worse`, as the interval says; empty if it includes 0, or there is none."""
         above, below = ("better", "worse") if self.is_higher_better else ("worse", "better")
+        if self.is_alike:
+            return ""
         return above if self.paired.low > 0 else below if self.paired.high < 0 else ""
 
     def row(self) -> dict[str, str]:
@@ -69,7 +76,7 @@ class Difference(NamedTuple):
         sizes = (value_text(self.metric, abs(each)).removesuffix("%") for each in self.paired)
         value, low, high = (f"{'-' if each < 0 else '+'}{size}" for each, size in zip(self.paired, sizes, strict=True))
         interval = f"{low} to {high}" if math.isfinite(self.paired.low) else ""
-        if self.paired.low == self.paired.high:
+        if self.is_alike:
             interval = "none: all differences are alike"
         better = "higher" if self.is_higher_better else "lower"
         return {

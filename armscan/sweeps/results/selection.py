@@ -53,7 +53,7 @@ class Candidate(NamedTuple):
         is_known = math.isfinite(self.estimate.value)
         return {
             "candidate": self.name,
-            "seeds": str(len(self.scores)),
+            "seeds": str(self.n_seeds),
             title_of(objective): value if is_known else "",
             "95 % interval": f"{low} to {high}" if math.isfinite(self.estimate.low) else "",
             "outcome": self.outcome,

@@ -20,7 +20,7 @@ from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
 from armscan.experiment.results import RunResult
 from armscan.experiment.runner import VIDEO_SEED, log_result, train_agent
-from armscan.stats.bootstrap import interquartile_mean
+from armscan.stats.bootstrap import interquartile_mean, mean
 from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.tasks.attempt import Attempt, volumes_of
 from armscan.sweeps.tasks.generation import begin_generation
@@ -68,13 +68,17 @@ class TrainingTask:
             )
 
     def run(self, attempt: Attempt) -> dict[str, float]:
-        """Train with each seed; return the interquartile means of the metrics over the seeds. See `Task.run`."""
+        """Train with each seed; return the interquartile means of the metrics over the seeds. See `Task.run`.
+
+        Of `solved`, which is a share of the seeds, it is the mean.
+        """
         for seed in attempt.seeds:
             if seed not in attempt.seeds_done:
                 attempt.keep_seed(seed, _trained(attempt, seed))
         of_seeds = [attempt.seeds_done[seed] for seed in attempt.seeds]
         scores = {name: np.array([metrics[name] for metrics in of_seeds]) for name in of_seeds[0]}
-        return {name: float(interquartile_mean(of_name)) for name, of_name in scores.items()}
+        figures = {name: mean if name == "solved" else interquartile_mean for name in scores}
+        return {name: float(figures[name](of_name)) for name, of_name in scores.items()}
 
     def validate(self, attempt: Attempt) -> dict[str, float]:
         """Train, and play episodes on the validation volumes that chose no weights; return their metrics."""
