@@ -17,7 +17,7 @@ from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
 from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import beside_random, headline
-from armscan.training.metric_display import interval_text
+from armscan.training.metric_display import formatted, interval_text
 from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
 
 TOTAL = "all volumes"
@@ -179,7 +179,7 @@ def _shown(metrics: MetricEstimates, key: str) -> Estimate:
 def _cell(estimate: Estimate, form: str, *, apart: str) -> str:
     if math.isnan(estimate.value):
         return "-"
-    return f"{form.format(estimate.value)}{apart}{interval_text(estimate, form)}"
+    return f"{formatted(form, estimate.value)}{apart}{interval_text(estimate, form)}"
 
 
 def _plain(metrics: MetricEstimates) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from armscan.training import (
 )
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
+from armscan.training.metric_display import PERCENT, formatted
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE, atomic_write
 
 # First seeds of the final evaluations' episodes; those of the baselines do not depend on the seed of the run.
@@ -170,8 +171,9 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
         leading = test.on_plane[0]
         here, there = (each.estimate(leading.metric) for each in (test, validation))
         if here.low > there.high or there.low > here.high:
+            known, new = (formatted(PERCENT, each.value) for each in (there, here))
             return [
-                f"{leading.title}: {there.value:.0%} on the validation and {here.value:.0%} on the test volumes, and "
+                f"{leading.title}: {known} on the validation and {new} on the test volumes, and "
                 "the intervals do not overlap: volumes differ more than episodes do, and other wrists may lie anywhere "
                 f"between or outside; {WHAT_HELPS}"
             ]

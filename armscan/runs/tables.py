@@ -18,6 +18,7 @@ from armscan.runs.prune import PruneItem
 from armscan.runs.rows import RunRow
 from armscan.stats.on_plane import ON_PLANE
 from armscan.tracking.tags import AGENT_TAG, FOLDER_TAG, HOST_TAG, OBS_TAG, PARENT_TAG
+from armscan.training.metric_display import PERCENT, formatted
 from armscan.utils.console import print_table, wide_console
 from armscan.utils.csv_file import write_csv
 from armscan.utils.files import ID_CHARS
@@ -74,8 +75,8 @@ def _print_table(rows: Sequence[RunRow]) -> None:
                 row.run.info.status.lower(),
                 format_start(row.run),
                 format_duration(row.duration_s),
-                MISSING if on_plane is None else f"{on_plane:.0%}{within}",
-                MISSING if success is None else f"{success:.0%}",
+                MISSING if on_plane is None else f"{formatted(PERCENT, on_plane)}{within}",
+                MISSING if success is None else formatted(PERCENT, success),
                 MISSING if steps is None else f"{steps:.1f}",
                 size,
                 str(len(row.below) or ""),

@@ -16,7 +16,7 @@ import numpy as np
 from armscan.stats.bootstrap import Estimate, difference_of_rates, wilson
 from armscan.stats.paired import crossed_mean
 from armscan.training.episode_results import Evaluation
-from armscan.training.metric_display import interval_text
+from armscan.training.metric_display import formatted, interval_text
 from armscan.training.metrics import MetricEstimates
 
 # Difference of the leading on-plane rates, among the figures of an agent.
@@ -108,6 +108,6 @@ def _verdict(above: Estimate | None) -> str:
 def _text(estimate: Estimate, form: str) -> str:
     """Return a figure and its interval, such as `2.7 mm (2.0–3.4)`."""
     number = form.replace(" mm", "").replace("°", "")
-    low, high = map(number.format, estimate[1:])
+    low, high = (formatted(number, end) for end in estimate[1:])
     interval = interval_text(estimate, number) if low != high else ""
-    return form.format(estimate.value) + (f" ({interval})" if interval else "")
+    return formatted(form, estimate.value) + (f" ({interval})" if interval else "")

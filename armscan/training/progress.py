@@ -14,6 +14,7 @@ from rich.table import Column
 from rich.text import Text
 
 from armscan.training.callbacks import Callback, EpochReport
+from armscan.training.metric_display import PERCENT, formatted
 from armscan.utils.console import print_sentence
 
 
@@ -99,7 +100,5 @@ class ProgressLines:
 def _summary(report: EpochReport) -> str:
     """Return the figures of an epoch's validation, the leading rate first."""
     evaluation = report.evaluation
-    return (
-        f"{evaluation.on_plane[0].title} {evaluation.on_plane_rate:4.0%}  success {evaluation.success_rate:4.0%}  "
-        f"steps {evaluation.mean_steps:5.2f}"
-    )
+    on_plane, success = (formatted(PERCENT, rate) for rate in (evaluation.on_plane_rate, evaluation.success_rate))
+    return f"{evaluation.on_plane[0].title} {on_plane:>4}  success {success:>4}  steps {evaluation.mean_steps:5.2f}"

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.stats.bootstrap import Estimate
-from armscan.training.metric_display import LEADING, OLDER, QUANTITIES, Quantity, interval_text
+from armscan.training.metric_display import LEADING, OLDER, QUANTITIES, Quantity, formatted, interval_text
 from armscan.training.metrics import MetricEstimates
 from armscan.utils.markdown import markdown_table
 
@@ -183,7 +183,7 @@ def _cell(result: MetricEstimates, column: Quantity, around: str = "{}") -> tupl
     if not is_known(estimate):
         return MISSING, ""
     interval = interval_text(estimate, column.form)
-    return column.form.format(estimate.value), interval and around.format(interval)
+    return formatted(column.form, estimate.value), interval and around.format(interval)
 
 
 def _count(result: MetricEstimates, name: str) -> str:

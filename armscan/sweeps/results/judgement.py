@@ -30,7 +30,7 @@ from armscan.sweeps.study.final_eval import (
 from armscan.sweeps.study.study import best_trials
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
-from armscan.training.metric_display import is_rate, leading_among, title_of, value_text
+from armscan.training.metric_display import PERCENT, formatted, is_rate, leading_among, title_of, value_text
 from armscan.training.metrics import ENDS
 from armscan.utils.markdown import markdown_table
 
@@ -83,9 +83,9 @@ class Difference(NamedTuple):
             "on the test volumes": f"{title_of(self.metric)} ({better} is better)",
             "chosen less control": f"{value}{unit}",
             "95 % interval": interval,
-            "probability of improvement": f"{self.probability.value:.0%}",
+            "probability of improvement": formatted(PERCENT, self.probability.value),
             "its 95 % interval": (
-                f"{self.probability.low:.0%} to {self.probability.high:.0%}"
+                f"{formatted(PERCENT, self.probability.low)} to {formatted(PERCENT, self.probability.high)}"
                 if math.isfinite(self.probability.low)
                 else ""
             ),
