@@ -38,6 +38,7 @@ class PreparedAgent:
         envs: Environments by the name of their volumes.
         notes: Differences from its training, one sentence each.
         data: Folder of the volumes, `phantom`, or None for the volumes of the agent's own configuration.
+        is_new: Whether the agent's run has used none of the volumes. Default: False.
     """
 
     source: TrainedAgent
@@ -45,6 +46,7 @@ class PreparedAgent:
     envs: dict[str, Env]
     notes: tuple[str, ...]
     data: str | None = None
+    is_new: bool = False
 
     def evaluate(
         self, n_episodes: int, seed: int, tell: Callable[[str], None] = lambda _: None
@@ -98,13 +100,13 @@ def apply(
     check(groups)
     prepared = prepare(source, groups, own, render_mode=render_mode)
     notes = list(prepared.notes)
-    if data and source.run:
-        notes += known_volumes(source, groups)
+    known = known_volumes(source, groups) if data and source.run else []
+    notes += known
     if source.run and source.volumes is None and own.cache_info().currsize:
         notes.append("the run has no fingerprints of its volumes, so these may have changed since")
     for note in notes:
         print_sentence(printable(f"note: {note}"))
-    return replace(prepared, notes=tuple(notes), data=data)
+    return replace(prepared, notes=tuple(notes), data=data, is_new=data is not None and not known)
 
 
 def prepare(

@@ -80,7 +80,7 @@ def evaluate_and_track(
         # An agent's own training and test volumes are never merged into one total.
         report = EvaluationReport(
             evaluations,
-            has_total=applied.data is not None,
+            has_total=applied.is_new,
             facts={**facts, "tracked_as": tracked.run_id},
             baselines=baselines,
         )
@@ -92,9 +92,10 @@ def evaluate_and_track(
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, lambda opened: opened.write(text.encode()), follow_link=True)
         tracked.log_files(file)
+        notes = "".join(f"<p>{html.escape(note)}</p>" for note in applied.notes)
         tables = "".join(f"<h2>{html.escape(label)}</h2>{table.html()}" for label, table in report.tables().items())
         shown = own.with_suffix(".html")
-        atomic_write(shown, lambda opened: opened.write(page(tracked.name, tables).encode()))
+        atomic_write(shown, lambda opened: opened.write(page(tracked.name, notes + tables).encode()))
         tracked.log_files(shown)
     return report, file
 

@@ -6,7 +6,7 @@ import shutil
 import pytest
 import yaml
 
-from tests.support.tracked_runs import GUESSER, ON_FILES, tracked
+from tests.support.tracked_runs import GUESSER, ON_FILES, tracked, written
 
 
 def swapped(manifest):
@@ -54,6 +54,10 @@ def test_own_volumes_that_have_changed_are_refused_where_they_matter(answer, tmp
         assert (code, errors) == (0, "")
         known = ", ".join(manifest["splits"]["train"])
         assert f"note: the agent was trained on these volumes: {known}\n" in printed
+        # They are never pooled with others, and the page says so, too.
+        assert "all volumes" not in written(tmp_path)["splits"]
+        (page,) = (tmp_path / "evaluations").glob("*.html")
+        assert f"<p>the agent was trained on these volumes: {known}</p>" in page.read_text()
 
 
 def test_volumes_of_the_training_are_known_under_other_names_and_others_under_theirs(answer, tmp_path, wrists):
