@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -29,7 +30,7 @@ class Curve:
         places: Positions on the axis, ascending.
         band: Mean and interval over the seeds at these positions.
         n_seeds: Number of its seeds.
-        lines: Line of each seed, by its label: positions and values, as measured.
+        lines: Line of each seed and fold, by its label: positions and values, as measured.
     """
 
     places: FloatArray
@@ -54,10 +55,13 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
     if not known:
         return None
     places = _places(known)
-    scores = np.array([np.interp(places, *line) for _, line in known])
-    values, *ends = band_over_seeds(scores)
+    of_seeds: dict[str, list[FloatArray]] = defaultdict(list)
+    for training, line in known:
+        of_seeds[training.seed or training.run_id].append(np.interp(places, *line))
+    # The folds of a seed are no further seeds.
+    values, *ends = band_over_seeds(np.array([np.mean(each, axis=0) for each in of_seeds.values()]))
     band = Band(values, *np.clip(ends, *bounds_of(figure)))
-    return Curve(places, band, len(known), {training.label: line for training, line in known})
+    return Curve(places, band, len(of_seeds), {training.label: line for training, line in known})
 
 
 def _line(series: Series, axis: str) -> tuple[FloatArray, FloatArray]:

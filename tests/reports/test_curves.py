@@ -64,3 +64,16 @@ def test_long_curves_are_drawn_by_fewer_points(make_training):
     ours = curve(make_training(0, steps=steps, values=steps), make_training(1, steps=steps, values=steps))
     assert len(ours.places) == MAX_POINTS
     assert np.allclose(ours.band.values, ours.places)
+
+
+def test_folds_of_a_seed_are_averaged_and_are_no_further_seeds(make_training):
+    trainings = [
+        make_training(seed, steps=(100, 200), values=(value, value), params={"data.folds": "2", "data.fold": str(fold)})
+        for seed, of_folds in enumerate(((1.0, 3.0), (5.0, 7.0)))
+        for fold, value in enumerate(of_folds)
+    ]
+    ours = curve(*trainings)
+    assert (ours.n_seeds, len(ours.lines)) == (2, 4)
+    assert ours.band.values.tolist() == [4.0, 4.0]
+    # As of any two seeds.
+    assert np.isnan(ours.band.lows).all()
