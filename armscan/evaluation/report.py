@@ -17,8 +17,9 @@ from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
 from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import beside_random, headline
-from armscan.training.metric_display import formatted, interval_text
+from armscan.training.metric_display import interval_text
 from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
+from armscan.utils.rate_text import formatted
 
 TOTAL = "all volumes"
 # What MLflow takes in the name of a metric.

@@ -26,8 +26,8 @@ from armscan.training import (
 )
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
-from armscan.training.metric_display import PERCENT, formatted
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE, atomic_write
+from armscan.utils.rate_text import PERCENT, formatted
 
 # First seeds of the final evaluations' episodes; those of the baselines do not depend on the seed of the run.
 TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED = 2 * 10**6, 3 * 10**6

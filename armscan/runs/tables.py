@@ -18,10 +18,10 @@ from armscan.runs.prune import PruneItem
 from armscan.runs.rows import RunRow
 from armscan.stats.on_plane import ON_PLANE
 from armscan.tracking.tags import AGENT_TAG, FOLDER_TAG, HOST_TAG, OBS_TAG, PARENT_TAG
-from armscan.training.metric_display import PERCENT, formatted
 from armscan.utils.console import print_table, wide_console
 from armscan.utils.csv_file import write_csv
 from armscan.utils.files import ID_CHARS
+from armscan.utils.rate_text import PERCENT, formatted
 
 MISSING = "-"
 # Of a name, which a multirun's words may be.

@@ -16,8 +16,9 @@ import numpy as np
 from armscan.stats.bootstrap import Estimate, difference_of_rates, wilson
 from armscan.stats.paired import crossed_mean
 from armscan.training.episode_results import Evaluation
-from armscan.training.metric_display import formatted, interval_text
+from armscan.training.metric_display import interval_text
 from armscan.training.metrics import MetricEstimates
+from armscan.utils.rate_text import formatted
 
 # Difference of the leading on-plane rates, among the figures of an agent.
 ABOVE_RANDOM = "on_plane_above_random"

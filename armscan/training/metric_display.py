@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.on_plane import limits_among
+from armscan.utils.rate_text import formatted
 from armscan.volumes.labelmap import LANDMARKS
 
 
@@ -59,8 +60,6 @@ TITLES = {
     "training_s": "training, s",
     "solved": "solved, share of seeds",
 }
-# Form of a rate where space is short.
-PERCENT = "{:.0%}"
 # Shown where space is short, after the on-plane rates.
 LEADING = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
 COSTS = ("env_steps", "training_s")
@@ -99,17 +98,6 @@ def value_text(metric: str, value: float) -> str:
     """Return a value of a metric as tables show it: a share in percent, distances with one digit after the point."""
     form = "{:.1%}" if is_rate(metric) else "{:,.0f}" if abs(value) >= 1000 else FORMS.get(metric, "{:.4g}")
     return formatted(form, value)
-
-
-def formatted(form: str, value: float) -> str:
-    """Return a value in a form such as `{:.1%}`; a rate is never rounded to 0 or 100 %, but `<0.1%` or `>99.9%`."""
-    text = form.format(value)
-    if form.endswith("%}") and 0.0 < value < 1.0:
-        smallest = 10.0 ** -(len(text.partition(".")[2].rstrip("%")) + 2)
-        for bound, sign, nearest in ((0.0, "<", smallest), (1.0, ">", 1.0 - smallest)):
-            if text == form.format(bound):
-                return sign + form.format(nearest)
-    return text
 
 
 def interval_text(estimate: Estimate, form: str) -> str:

@@ -14,8 +14,8 @@ from rich.table import Column
 from rich.text import Text
 
 from armscan.training.callbacks import Callback, EpochReport
-from armscan.training.metric_display import PERCENT, formatted
 from armscan.utils.console import print_sentence
+from armscan.utils.rate_text import PERCENT, formatted
 
 
 def progress_reporter(label: str | None = None, measured: str = "validation") -> Callback:

@@ -16,9 +16,10 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.stats.bootstrap import Estimate
-from armscan.training.metric_display import LEADING, OLDER, QUANTITIES, Quantity, formatted, interval_text
+from armscan.training.metric_display import LEADING, OLDER, QUANTITIES, Quantity, interval_text
 from armscan.training.metrics import MetricEstimates
 from armscan.utils.markdown import markdown_table
+from armscan.utils.rate_text import formatted
 
 # The most results that stand side by side; more of them are lines of their own.
 MOST_ABREAST = 6

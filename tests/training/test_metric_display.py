@@ -5,7 +5,7 @@ import math
 import pytest
 
 from armscan.stats.bootstrap import Estimate
-from armscan.training.metric_display import bounds_of, formatted, interval_text
+from armscan.training.metric_display import bounds_of, interval_text
 
 
 @pytest.mark.parametrize(
@@ -22,24 +22,6 @@ from armscan.training.metric_display import bounds_of, formatted, interval_text
 )
 def test_bounds_of_a_metric_are_those_that_it_can_reach(metric, bounds):
     assert bounds_of(metric) == bounds
-
-
-@pytest.mark.parametrize(
-    ("form", "value", "text"),
-    [
-        ("{:.1%}", 0.9996, ">99.9%"),
-        ("{:.1%}", 0.0004, "<0.1%"),
-        ("{:.0%}", 0.995, ">99%"),
-        ("{:.0%}", 0.004, "<1%"),
-        ("{:.1%}", 1.0, "100.0%"),
-        ("{:.1%}", 0.0, "0.0%"),
-        ("{:.1%}", 0.735, "73.5%"),
-        ("{:.1%}", math.nan, "nan%"),
-        ("{:.2f}", 0.0004, "0.00"),
-    ],
-)
-def test_rate_is_not_rounded_to_none_or_all(form, value, text):
-    assert formatted(form, value) == text
 
 
 def test_interval_of_a_rate_that_is_not_quite_100_percent_is_shown():

@@ -30,9 +30,10 @@ from armscan.sweeps.study.final_eval import (
 from armscan.sweeps.study.study import best_trials
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
-from armscan.training.metric_display import PERCENT, formatted, is_rate, leading_among, title_of, value_text
+from armscan.training.metric_display import is_rate, leading_among, title_of, value_text
 from armscan.training.metrics import ENDS
 from armscan.utils.markdown import markdown_table
+from armscan.utils.rate_text import PERCENT, formatted
 
 MAXIMIZE = "maximize"
 HOW = (

@@ -1,0 +1,25 @@
+"""Rates as strings."""
+
+import math
+
+import pytest
+
+from armscan.utils.rate_text import formatted
+
+
+@pytest.mark.parametrize(
+    ("form", "value", "text"),
+    [
+        ("{:.1%}", 0.9996, ">99.9%"),
+        ("{:.1%}", 0.0004, "<0.1%"),
+        ("{:.0%}", 0.995, ">99%"),
+        ("{:.0%}", 0.004, "<1%"),
+        ("{:.1%}", 1.0, "100.0%"),
+        ("{:.1%}", 0.0, "0.0%"),
+        ("{:.1%}", 0.735, "73.5%"),
+        ("{:.1%}", math.nan, "nan%"),
+        ("{:.2f}", 0.0004, "0.00"),
+    ],
+)
+def test_rate_is_not_rounded_to_none_or_all(form, value, text):
+    assert formatted(form, value) == text
