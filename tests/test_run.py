@@ -425,5 +425,5 @@ def job_process_ids(launcher_pid):
     # Of a program in several lines, ps makes one.
     processes = [line.split(maxsplit=2) for line in listing.splitlines()]
     parents = {int(pid): int(parent) for pid, parent, *_ in processes}
-    jobs = [int(pid) for pid, _, *program in processes if "run_job()" in " ".join(program)]
+    jobs = [int(pid) for pid, _, *program in processes if "run_job(" in " ".join(program)]
     return [pid for pid in jobs if launcher_pid in (parents[pid], parents.get(parents[pid]))]
