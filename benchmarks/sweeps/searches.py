@@ -30,6 +30,7 @@ from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval import settings_of
 from armscan.sweeps.study.open import OpenedStudy, Phase, open_for_work
+from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.study.warm_start import initial_trials
 from armscan.sweeps.tasks.attempt import Attempt
@@ -117,23 +118,24 @@ def search_by_armscan(words: Sequence[str], budget_s: float, _: Path) -> SearchR
     _work(opened.search, words, meter, lambda: meter.is_used(first_round_s()))
     _work(opened.finals[0], words, meter, meter.is_used, final.missing_of_selection)
     searched = final.search.get_trials()
-    chosen = chosen_of(final.scores(), final.selection_seeds, final.settings.min_seeds)
+    chosen = chosen_of(final.scores(), final.selection_seeds, final.settings)
     number = best_trials(final.search, 1)[0].number if chosen is None else chosen
     n_pruned = sum(trial.state == TrialState.PRUNED for trial in searched)
     n_raced = len(final.selection.get_trials(states=(TrialState.COMPLETE,)))
     return SearchResult(settings_of(searched, number), meter.used_s, len(searched), n_pruned, n_raced)
 
 
-def chosen_of(scores: Scores, seeds: Sequence[int], min_seeds: int) -> int | None:
-    """Return what a race chooses after its last complete seed; None if no seed is complete.
+def chosen_of(scores: Scores, seeds: Sequence[int], settings: FinalEvalSettings) -> int | None:
+    """Return what a race chooses after the most seeds on average that are complete; None if not even one is.
 
     Args:
         scores: See `race`.
         seeds: All seeds of the race.
-        min_seeds: Seeds of the first round; if it is not complete, as many as are.
+        settings: The most seeds on average, and those of the first round; if it is not complete, as many as are.
     """
-    of_rounds = (race(scores, seeds[:n], min_seeds=min(n, min_seeds)) for n in range(len(seeds), 0, -1))
-    return next((each.chosen for each in of_rounds if each.chosen is not None), None)
+    means = range(settings.mean_seeds, 0, -1)
+    shorter = (race(scores, seeds, min_seeds=min(n, settings.min_seeds), mean_seeds=n) for n in means)
+    return next((each.chosen for each in shorter if each.chosen is not None), None)
 
 
 def search_by_hydra(words: Sequence[str], budget_s: float, folder: Path) -> SearchResult:

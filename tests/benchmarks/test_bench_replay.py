@@ -74,7 +74,7 @@ def test_a_trial_with_two_seeds_takes_two_trainings(surrogate):
 @pytest.mark.filterwarnings("ignore::FutureWarning")
 def test_a_sampler_that_learns_beats_chance_on_a_smooth_function(curves, surrogate):
     rules, control = (Rule("random", "none"), Rule("tpe", "none")), surrogate.config(curves.configs[0])
-    ranks = ranked(studies_of(surrogate, control, "sac_y", rules, n_studies=15, n_trainings=30))
+    ranks = ranked(studies_of(surrogate, control, "sac_y", rules, n_studies=15, n_trainings=30), by="search")
     assert list(ranks.sampler) == ["tpe", "random"]
     assert (ranks.low <= ranks.regret).all()
     assert (ranks.regret <= ranks.high).all()
@@ -82,13 +82,13 @@ def test_a_sampler_that_learns_beats_chance_on_a_smooth_function(curves, surroga
     assert of_reference.better == pytest.approx(0.5)
 
 
-def test_a_choice_with_equal_seeds_drops_nobody_and_a_race_does():
+def test_a_choice_with_equal_seeds_has_all_of_them_and_a_race_ends_early():
     scores = np.array([[-9.0], [-1.0], [-8.0]]) + np.random.default_rng(0).normal(0.0, 0.1, (3, 10))
-    all_alike = choose(scores, min_seeds=5, max_seeds=5)
-    race = choose(scores, min_seeds=2, max_seeds=10)
+    all_alike = choose(scores, min_seeds=5, mean_seeds=5)
+    race = choose(scores, min_seeds=2, mean_seeds=10)
     assert all_alike.place == race.place == 1
     assert all_alike.n_trainings == 15
-    assert race.n_trainings == 6
+    assert race.n_trainings < 10
 
 
 def test_trainings_that_a_regret_needs_are_interpolated():

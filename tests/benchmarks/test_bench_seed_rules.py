@@ -13,14 +13,21 @@ def scores_of(means, n_choices=50, spread=1.0):
     return np.array(means)[:, np.newaxis] + spread * noise
 
 
-@pytest.mark.parametrize(("min_seeds", "max_seeds"), [(1, 5), (2, 6), (5, 5), (3, 8)])
-def test_race_by_t_tests_is_that_of_armscan(min_seeds, max_seeds):
-    scores = scores_of([0.0, 0.3, 0.6, -2.0])
-    found = t_race(min_seeds, max_seeds)(scores)
+@pytest.mark.parametrize(("min_seeds", "mean_seeds"), [(2, 6), (5, 5), (3, 8)])
+def test_allocation_is_the_race_of_armscan(min_seeds, mean_seeds):
+    scores = scores_of([0.0, 0.3, 0.6, -2.0, 0.5])
+    found = allocation(min_seeds, mean_seeds)(scores)
     assert list(zip(found.place, found.n_trainings, strict=True)) == [
         (each.place, each.n_trainings)
-        for each in (choose(one, min_seeds=min_seeds, max_seeds=max_seeds) for one in scores)
+        for each in (choose(one, min_seeds=min_seeds, mean_seeds=mean_seeds) for one in scores)
     ]
+
+
+def test_t_test_drops_what_is_far_behind():
+    apart, alike = (t_race(3, 8, 0.9)(scores_of(means)) for means in ([0.0, 9.0, 0.0], [0.0, 0.0, 0.0]))
+    assert set(apart.place) == {1}
+    assert set(apart.n_trainings) == {9}
+    assert np.median(alike.n_trainings) > 12
 
 
 def test_same_number_of_seeds_drops_nobody():
@@ -49,7 +56,7 @@ def test_ranks_of_equal_scores_drop_nobody():
 
 def test_budget_is_allocated_to_those_close_to_the_best():
     scores = scores_of([0.0, 0.2, -9.0])
-    found = allocation(2, 6)(scores)
+    found = allocation(2, 6, may_end=False)(scores)
     assert set(found.n_trainings) == {18}
     close = (found.place < 2).mean()
     assert close == 1.0

@@ -10,6 +10,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 
+from armscan.sweeps.study.settings import FinalEvalSettings
 from benchmarks.sweeps import same_budget, searches
 from benchmarks.sweeps.same_budget import scores_of, table
 from benchmarks.sweeps.searches import Meter, SearchResult, chosen_of, swept
@@ -50,20 +51,24 @@ def test_time_between_trials_is_not_charged(clock):
     assert not meter.is_used()
 
 
-def test_a_race_that_is_cut_off_is_decided_by_its_complete_rounds():
-    # After two seeds 5 leads; the third round, in which it is bad, was not complete.
+def settings(min_seeds, mean_seeds):
+    return FinalEvalSettings(top_k=2, min_seeds=min_seeds, mean_seeds=mean_seeds, judge_seeds=1)
+
+
+def test_a_race_that_is_cut_off_is_decided_by_the_seeds_that_are_complete():
+    # After two seeds 5 leads; the third seed of all, with which it is bad, was not complete.
     scores = {-1: {0: -3.0, 1: -3.1, 2: -3.0}, 5: {0: -1.0, 1: -1.1, 2: -9.0}, 7: {0: -4.0, 1: -4.2}}
-    assert chosen_of(scores, range(8), min_seeds=3) == 5
+    assert chosen_of(scores, range(8), settings(3, 6)) == 5
     scores[7][2] = -4.1
-    assert chosen_of(scores, range(3), min_seeds=3) == -1
+    assert chosen_of(scores, range(3), settings(3, 6)) == -1
 
 
 def test_a_race_without_a_complete_round_chooses_nothing():
-    assert chosen_of({-1: {0: -3.0}, 5: {}}, range(8), min_seeds=3) is None
+    assert chosen_of({-1: {0: -3.0}, 5: {}}, range(8), settings(3, 6)) is None
 
 
 def test_a_training_of_a_race_that_failed_drops_its_configuration():
-    assert chosen_of({-1: {0: -3.0}, 5: {0: math.nan}}, range(1), min_seeds=1) == -1
+    assert chosen_of({-1: {0: -3.0}, 5: {0: math.nan}}, range(1), settings(1, 1)) == -1
 
 
 @pytest.mark.parametrize(

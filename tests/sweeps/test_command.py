@@ -38,7 +38,7 @@ TINY = [
     *(
         "study.final_eval.top_k=1",
         "study.final_eval.min_seeds=1",
-        "study.final_eval.max_seeds=1",
+        "study.final_eval.mean_seeds=1",
         "study.final_eval.judge_seeds=1",
     ),
 ]
@@ -320,8 +320,8 @@ def test_interrupted_study_kills_a_worker_that_does_not_leave_and_enqueues_its_t
             "and not end in -selection or -judged, as final",
         ),
         (
-            ["-m", "sweep=sac_y", "study.final_eval.max_seeds=1"],
-            "study.final_eval.min_seeds is 3, but it must be at most study.final_eval.max_seeds, which is 1",
+            ["-m", "sweep=sac_y", "study.final_eval.mean_seeds=1"],
+            "study.final_eval.min_seeds is 2, but it must be at most study.final_eval.mean_seeds, which is 1",
         ),
         (
             ["-m", "sweep=sac_y", "study.final_eval.judge_seeds=0"],

@@ -120,10 +120,10 @@ def _final_summary(final: FinalEvaluation, n_done: Sequence[int]) -> str:
     """Return the state of the final evaluation in one line."""
     _, most = n_trainings(final.settings)
     race, (n_selected, n_judged) = final.race(), n_done
-    n_left = sum(standing.is_in for standing in race.standings.values())
-    now = f"{n_left} candidates left" if race.chosen is None else f"{name_of(race.chosen)} chosen"
+    number, now = (race.leader, "leads") if race.chosen is None else (race.chosen, "chosen")
+    stands = "" if number is None else f"; {name_of(number)} {now}"
     done = f"{n_selected} selection and {n_judged} judgement trainings done"
-    return f"final evaluation: {done}, at most {most} in all; {now}"
+    return f"final evaluation: {done}, at most {most} in all{stands}"
 
 
 def status_line(opened: OpenedStudy, state: StudyState) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from plotly.graph_objects import Figure
@@ -13,7 +13,7 @@ from armscan.reports.chart_style import BLUE, GREY, ORANGE, RATE_AXIS
 from armscan.reports.html import chart, table
 from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.results.judgement import Judgement
-from armscan.sweeps.scheduling.race import DROP_LEVEL, Race
+from armscan.sweeps.scheduling.race import END_LEVEL, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import OBJECTIVES
@@ -31,7 +31,7 @@ class Candidate(NamedTuple):
         scores: The objective on the validation volumes by seed, NaN for a training that failed.
         estimate: Its mean with the 95 % interval by which candidates are compared.
         n_seeds: Number of seeds that the estimate is over.
-        outcome: Outcome of the race: `chosen`, `dropped`, `failed`, `not chosen`, or `in the race`.
+        outcome: Outcome of the race: `chosen`, `failed`, `not chosen`, or `in the race`.
         settings: Its values as overrides.
     """
 
@@ -80,18 +80,18 @@ def candidates_of(final: FinalEvaluation) -> list[Candidate]:
                 {seed: sign * score for seed, score in sorted(scores.items())},
                 estimate.clipped(*bounds_of(objective_of(final))),
                 standing.n_seeds,
-                _outcome(race, number, scores),
+                _outcome(race, number),
                 " ".join(overrides_of(settings_of(searched, number))),
             )
         )
     return sorted(found, key=lambda each: (each.number != race.chosen, -each.n_seeds, -sign * each.estimate.value))
 
 
-def _outcome(race: Race, number: int, scores: Mapping[int, float]) -> str:
+def _outcome(race: Race, number: int) -> str:
     if number == race.chosen:
         return "chosen"
     if not race.standings[number].is_in:
-        return "failed" if any(map(math.isnan, scores.values())) else "dropped"
+        return "failed"
     return "not chosen" if race.is_over else "in the race"
 
 
@@ -142,15 +142,18 @@ def decided(
     better = "higher" if final.sign > 0 else "lower"
     n_selected = sum(len(each.scores) for each in candidates)
     n_candidates = max(0, len(candidates) - 1)
-    n_seeds = " to ".join(dict.fromkeys(map(str, (settings.min_seeds, settings.max_seeds))))
+    more = settings.min_seeds < settings.mean_seeds
+    n_seeds = f"{settings.min_seeds} of each at first" if more else f"{settings.min_seeds} of each"
+    further = (
+        f", then more where they best tell which is the best, {settings.mean_seeds} of each on average, or until the "
+        f"leader is ahead of all others with {END_LEVEL:.0%} confidence"
+    )
     steps = [
         f"<b>Search</b>: {len(searched.finished)} trials, {searched.n_pruned} of them pruned. Candidates are its best "
         f"different configurations ({n_candidates}), and the control: {NOTHING_SEARCHED}.",
         f"<b>Selection</b>, on the validation volumes: {n_selected} trainings with seeds that the search has not used "
-        f"({n_seeds} of each candidate), compared by "
-        f"{html.escape(title_of(objective))} ({better} is better). Those that were behind the "
-        f"leader with {DROP_LEVEL:.0%} confidence got no further seed. Of the others, the one whose "
-        "interval has the best worst-case end is chosen.",
+        f"({n_seeds}{further if more else ''}), compared by {html.escape(title_of(objective))} ({better} is better). "
+        "The one whose interval has the best worst-case end is chosen.",
     ]
     if judgement is not None:
         judged = "the control alone" if judgement.chosen == CONTROL else f"{name_of(judgement.chosen)} and the control"

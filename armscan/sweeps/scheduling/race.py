@@ -1,8 +1,8 @@
 """Race of configurations over seeds: which trainings come next, and which configuration is chosen.
 
-A few seeds first, for all; then one seed more at a time, for those that may still be the best, as irace
-(López-Ibáñez et al. 2016) and SMAC's intensification do. Everything here is a function of the scores alone: workers
-that see the same storage decide the same, and a race that was interrupted continues where it was.
+A few seeds first, for all; then more, in rounds, where they best tell which configuration is the best: the optimal
+computing budget allocation of Chen et al. (2000, doi:10.1023/A:1008349927281). Everything here is a function of the
+scores alone: workers that see the same storage decide the same, and a race that was interrupted continues where it was.
 """
 
 from __future__ import annotations
@@ -13,20 +13,27 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from armscan.stats.bootstrap import LEVEL, Estimate
 from armscan.utils.arrays import FloatArray
 
-# Confidence, one-sided, at which a configuration that is behind the leader is dropped.
-DROP_LEVEL = 0.9
+# Confidence, one-sided, at which the leader must be ahead of each other configuration for an early end of the race, and
+# the seeds that the leader must have then: fewer say little of chance.
+END_LEVEL, LEADER_SEEDS = 0.95, 4
+# The most seeds of a configuration, as a multiple of the seeds on average.
+MOST_FACTOR = 4
 # Prior degrees of freedom: the weight of the pooled variance in that of each configuration, of which two or three seeds
 # say little.
 PRIOR_DF = 4.0
+# Of means and of variances, so that equal ones can be divided by.
+LEAST_GAP, LEAST_VARIANCE = 1e-6, 1e-12
 
 UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 
 Scores = Mapping[int, Mapping[int, float]]
+Counts = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,7 @@ class Standing:
     Args:
         estimate: Mean score with its 95 % interval; NaN before the first round is complete.
         n_seeds: Number of seeds that the estimate is over.
-        is_in: Whether it can still be the best.
+        is_in: Whether none of its trainings has failed.
     """
 
     estimate: Estimate = UNKNOWN
@@ -70,47 +77,77 @@ class Race:
         """Return whether no training is missing."""
         return not self.missing
 
+    @property
+    def leader(self) -> int | None:
+        """Configuration with the best mean of those without a failure; None before the first round is complete."""
+        means = {number: each.estimate.value for number, each in self.standings.items() if each.is_in and each.n_seeds}
+        return max(means, key=means.__getitem__, default=None)
 
-def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, drop_level: float = DROP_LEVEL) -> Race:
+
+def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: int) -> Race:
     """Return the state of a race.
 
-    All configurations are trained with the first `min_seeds` seeds. Then those are dropped whose mean is below the
-    leader's by more than chance explains (a one-sided t test), and the others are trained with the next seed, until one
-    is left or the seeds are used up. Of those that are left, the one with the highest lower end of its interval is
-    chosen; the first of equal ones.
+    All configurations are trained with the first `min_seeds` seeds. Each further round has a third as many trainings as
+    there are configurations, two at least, given to those where they best tell which one is the best. The race is over
+    when each configuration has `mean_seeds` seeds on average, when the leader is ahead of all others by more than
+    chance explains (a one-sided t test), or when one configuration is left. The one with the highest lower end of its
+    interval is chosen; the first of equal ones.
 
     Args:
         scores: Score of each finished training by configuration and seed, the higher the better. NaN for a failed
             training, which drops its configuration at the end of the round. A configuration without any score is a key
             too.
-        seeds: All seeds of the race, in the order in which they are used.
-        min_seeds: Number of seeds that all configurations get, from 1 to the number of seeds.
-        drop_level: Confidence at which a configuration is dropped, from 0.5 to below 1. Default: 0.9.
+        seeds: All seeds of the race, in the order in which they are used: `min_seeds` or more, the most that a
+            configuration may get.
+        min_seeds: Number of seeds that all configurations get, 1 or more.
+        mean_seeds: Number of seeds of a configuration on average, at most; `min_seeds` or more.
     """
     left, standings = list(scores), {configuration: Standing() for configuration in scores}
-    for n_seeds in range(min_seeds, len(seeds) + 1):
-        now = seeds[:n_seeds]
-        if missing := [(each, seed) for seed in now for each in left if seed not in scores[each]]:
-            return Race(tuple(missing), None, standings)
-        rows = {each: [scores[each][seed] for seed in now] for each in left}
-        # Not before the round is complete: what is run must not depend on which training ends first.
+    n_seeds, most = dict.fromkeys(scores, min_seeds), mean_seeds * len(scores)
+    while True:
+        due = [(each, seed) for n, seed in enumerate(seeds) for each in left if n < n_seeds[each]]
+        if missing := tuple((each, seed) for each, seed in due if seed not in scores[each]):
+            # Not before the round is complete: what is run must not depend on which training ends first.
+            return Race(missing, None, standings)
+        rows = {each: np.array([scores[each][seed] for seed in seeds[: n_seeds[each]]]) for each in left}
         whole = [each for each in left if not np.isnan(rows[each]).any()]
-        standings |= {each: replace(standings[each], is_in=False) for each in left if each not in whole}
         if not whole:
             # Of the round before, which had no failure; none in the first.
-            left = left if n_seeds > min_seeds else []
+            left = [each for each in left if standings[each].n_seeds]
+            standings |= {each: replace(standings[each], is_in=False) for each in standings}
             break
-        standings |= _standings(whole, np.array([rows[each] for each in whole]), drop_level)
-        left = [each for each in whole if standings[each].is_in]
-        if len(left) == 1:
+        standings |= {each: replace(standings[each], is_in=False) for each in left if each not in whole}
+        left, counts = whole, np.array([n_seeds[each] for each in whole])
+        means, variances = moments([rows[each] for each in left])
+        standings |= zip(left, _standings(means, variances, counts), strict=True)
+        n_more = min(round_size(len(left)), most - sum(n_seeds.values()), int((len(seeds) - counts).sum()))
+        if n_more <= 0 or len(left) == 1 or is_decided(means, variances, counts):
             break
+        n_seeds |= zip(left, allotted(means, variances, counts, n_more, most=len(seeds)).tolist(), strict=True)
     chosen = max(left, key=lambda each: standings[each].lower_end, default=None)
     return Race((), chosen, standings)
 
 
-def budget(n_configurations: int, *, min_seeds: int, max_seeds: int) -> tuple[int, int]:
+def budget(n_configurations: int, *, min_seeds: int, mean_seeds: int) -> tuple[int, int]:
     """Return the fewest and the most trainings of a race in which none fails."""
-    return n_configurations * min_seeds, n_configurations * max_seeds
+    least, most, size = n_configurations * min_seeds, n_configurations * mean_seeds, round_size(n_configurations)
+    return min(most, least + math.ceil(max(0, LEADER_SEEDS - min_seeds) / size) * size), most
+
+
+def round_size(n_configurations: int) -> int:
+    """Return the trainings of a round after the first: few, because each round knows the scores of those before."""
+    return max(2, n_configurations // 3)
+
+
+def moments(scores: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance of the scores of each configuration, shape (configurations,).
+
+    Args:
+        scores: Scores of each configuration, one or more.
+    """
+    own = np.array([each.var(ddof=1) if len(each) > 1 else math.nan for each in scores])
+    n_seeds, pooled = np.array(list(map(len, scores))), np.nanmean(own) if np.isfinite(own).any() else 0.0
+    return np.array([each.mean() for each in scores]), moderated_variances(np.nan_to_num(own), pooled, n_seeds)
 
 
 def moderated_variances(own: FloatArray, pooled: Any, n_seeds: Any) -> FloatArray:
@@ -126,22 +163,48 @@ def moderated_variances(own: FloatArray, pooled: Any, n_seeds: Any) -> FloatArra
     return np.asarray((PRIOR_DF * pooled + (n_seeds - 1) * own) / (PRIOR_DF + n_seeds - 1))
 
 
-def _standings(
-    configurations: Sequence[int], scores: np.ndarray[tuple[int, int], np.dtype[np.float64]], drop_level: float
-) -> Iterator[tuple[int, Standing]]:
-    """Yield the standings after a round; `scores` has shape (configurations, seeds)."""
-    n_seeds = scores.shape[1]
-    means, variances = scores.mean(axis=1), np.zeros(len(scores))
-    df = PRIOR_DF + n_seeds - 1
-    if n_seeds > 1:
-        own = scores.var(axis=1, ddof=1)
-        variances = moderated_variances(own, own.mean(), n_seeds) / n_seeds
-    leader = int(means.argmax())
-    half = stdtrit(df, (1 + LEVEL) / 2) * np.sqrt(variances)
-    allowed = stdtrit(df, drop_level) * np.sqrt(variances[leader] + variances)
-    behind = means[leader] - means
-    for number, configuration in enumerate(configurations):
-        mean, width = float(means[number]), float(half[number]) if n_seeds > 1 else math.nan
-        # With one seed nothing is known of chance.
-        is_in = n_seeds == 1 or bool(behind[number] <= allowed[number])
-        yield configuration, Standing(Estimate(mean, mean - width, mean + width), n_seeds, is_in)
+def is_decided(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> NDArray[np.bool_]:
+    """Return whether the leader has enough seeds and is ahead of all others by more than chance explains, shape (...).
+
+    Args:
+        means: Mean score of each configuration, shape (..., configurations).
+        variances: Variance of the scores of each, likewise.
+        n_seeds: Seeds of each, likewise.
+    """
+    leader = means.argmax(axis=-1)[..., np.newaxis]
+    mean, of_mean, n_leader = (np.take_along_axis(each, leader, -1) for each in (means, variances / n_seeds, n_seeds))
+    df = PRIOR_DF + np.minimum(n_seeds, n_leader) - 1
+    is_behind = mean - means > stdtrit(df, END_LEVEL) * np.sqrt(of_mean + variances / n_seeds)
+    return np.asarray((n_leader[..., 0] >= LEADER_SEEDS) & (is_behind.sum(axis=-1) == means.shape[-1] - 1))
+
+
+def allotted(means: FloatArray, variances: FloatArray, n_seeds: Counts, n_more: int, *, most: int) -> Counts:
+    """Return the seeds of each configuration after more of them are given out, shape (..., configurations).
+
+    Args:
+        means: Mean score of each configuration, shape (..., configurations), two or more.
+        variances: Variance of the scores of each, likewise.
+        n_seeds: Seeds of each, likewise.
+        n_more: Seeds to give out.
+        most: Most seeds of a configuration.
+    """
+    places, leader = np.arange(means.shape[-1]), means.argmax(axis=-1)[..., np.newaxis]
+    variances = variances + LEAST_VARIANCE
+    gaps = np.maximum(np.take_along_axis(means, leader, -1) - means, LEAST_GAP)
+    shares = np.where(places == leader, 0.0, variances / gaps**2)
+    of_leader = np.take_along_axis(variances, leader, -1) * (shares**2 / variances).sum(axis=-1, keepdims=True)
+    shares = np.where(places == leader, np.sqrt(of_leader), shares)
+    shares /= shares.sum(axis=-1, keepdims=True)
+    for _ in range(n_more):
+        due = shares * (n_seeds.sum(axis=-1, keepdims=True) + 1) - n_seeds
+        n_seeds = n_seeds + (places == np.where(n_seeds < most, due, -np.inf).argmax(axis=-1)[..., np.newaxis])
+    return n_seeds
+
+
+def _standings(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> Iterator[Standing]:
+    """Yield the standings after a round."""
+    half = stdtrit(PRIOR_DF + n_seeds - 1, (1 + LEVEL) / 2) * np.sqrt(variances / n_seeds)
+    # With one seed each, nothing is known of chance.
+    half = half if n_seeds.max() > 1 else np.full_like(half, math.nan)
+    for mean, width, n in zip(means.tolist(), half.tolist(), n_seeds.tolist(), strict=True):
+        yield Standing(Estimate(mean, mean - width, mean + width), n)

@@ -19,7 +19,7 @@ from pydantic import Field
 from armscan.config.legacy import renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.race import Race, budget, race
+from armscan.sweeps.scheduling.race import MOST_FACTOR, Race, budget, race
 from armscan.sweeps.scheduling.state import CONTROL, PlannedTrial
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, RETRIED, SCHEDULE
@@ -45,7 +45,7 @@ ENDED_WITHOUT_SCORE = (TrialState.FAIL, TrialState.PRUNED)
 class _Stored(Section):
     """Settings of a final evaluation, as the study of the selection keeps them; see `FinalEvaluation`."""
 
-    settings: FinalEvalSettings = Field(description="a section with top_k, min_seeds, max_seeds and judge_seeds")
+    settings: FinalEvalSettings = Field(description="a section with top_k, min_seeds, mean_seeds and judge_seeds")
     search_seed: int = Field(ge=0, le=LARGEST_SEARCH_SEED, description="the largest seed of the search")
     control: dict[str, Value] | None = Field(default=None, description="the values of the control by their keys")
 
@@ -122,9 +122,9 @@ class FinalEvaluation:
 
     @property
     def selection_seeds(self) -> range:
-        """The seeds of the selection; no search trial was run with one."""
+        """The seeds of the selection, as many as one configuration may get; no search trial was run with one."""
         first = self.search_seed + SELECTION_SEEDS_ABOVE
-        return range(first, first + self.settings.max_seeds)
+        return range(first, first + MOST_FACTOR * self.settings.mean_seeds)
 
     @property
     def judge_seeds(self) -> range:
@@ -160,7 +160,8 @@ class FinalEvaluation:
 
     def race(self) -> Race:
         """Return the state of the selection's race."""
-        return race(self.scores(), self.selection_seeds, min_seeds=self.settings.min_seeds)
+        settings = self.settings
+        return race(self.scores(), self.selection_seeds, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
 
     def missing_of_selection(self) -> list[PlannedTrial]:
         """Return the trainings that the selection needs next and no worker has begun."""
@@ -228,9 +229,9 @@ def _attributes(searched: Sequence[FrozenTrial], number: int, seed: int) -> dict
 def n_trainings(settings: FinalEvalSettings) -> tuple[int, int]:
     """Return the fewest and the most trainings of a final evaluation in which none fails.
 
-    The fewest: all but one are dropped after the first round, and the control is the one that is left.
+    The fewest: the control leads far ahead as soon as it has enough seeds.
     """
     if not settings.top_k:
         return 0, 0
-    fewest, most = budget(settings.top_k + 1, min_seeds=settings.min_seeds, max_seeds=settings.max_seeds)
+    fewest, most = budget(settings.top_k + 1, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
     return fewest + settings.judge_seeds, most + 2 * settings.judge_seeds

@@ -123,10 +123,11 @@ def _final(settings: FinalEvalSettings) -> str:
     if not most:
         return "no final evaluation"
     candidates = f"{settings.top_k} candidate{'s' if settings.top_k > 1 else ''}"
-    least, seeds = settings.min_seeds, settings.max_seeds
+    least, seeds = settings.min_seeds, settings.mean_seeds
     return (
         f"at least {fewest} and at most {most} final trainings: {candidates} and the control with "
-        f"{f'{least} to ' if least < seeds else ''}{seeds} seed{'s' if seeds > 1 else ''} each to select one, then "
+        f"{f'{least} seeds each at first and at most ' if least < seeds else ''}{seeds} "
+        f"seed{'s' if seeds > 1 else ''} each{' on average' if least < seeds else ''} to select one, then "
         f"that one and the control with {settings.judge_seeds} more each on the test volumes"
     )
 

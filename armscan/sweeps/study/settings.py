@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from armscan.errors import InvalidValueError, listed
+from armscan.sweeps.scheduling.race import MOST_FACTOR
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES
@@ -77,6 +78,8 @@ Seed = Annotated[int, Field(strict=True, ge=0, le=LARGEST_SEARCH_SEED)]
 
 
 SeedCount = Annotated[int, Field(ge=1, le=MAX_FINAL_SEEDS, description=f"a whole number from 1 to {MAX_FINAL_SEEDS}")]
+MAX_MEAN_SEEDS = MAX_FINAL_SEEDS // MOST_FACTOR
+MeanSeeds = Annotated[int, Field(ge=1, le=MAX_MEAN_SEEDS, description=f"a whole number from 1 to {MAX_MEAN_SEEDS}")]
 
 
 class FinalEvalSettings(Section):
@@ -89,14 +92,15 @@ class FinalEvalSettings(Section):
         top_k: Number of candidates, the best different configurations of the search, 0 or more; 0 for no final
             evaluation.
         min_seeds: Seeds of each candidate, and of the control, in the first round of the selection, from 1 to
-            `max_seeds`.
-        max_seeds: Most seeds of each in the selection, from 1 to 1000.
+            `mean_seeds`.
+        mean_seeds: Seeds of each on average in the whole selection, at most, from 1 to 250; those that may be the best
+            get more than others, and none more than four times as many.
         judge_seeds: Seeds of the chosen configuration, and of the control, on the test volumes, from 1 to 1000.
     """
 
     top_k: int = Field(ge=0, description="a whole number of at least 0")
-    min_seeds: SeedCount
-    max_seeds: SeedCount
+    min_seeds: MeanSeeds
+    mean_seeds: MeanSeeds
     judge_seeds: SeedCount
 
     @model_validator(mode="before")
@@ -110,10 +114,10 @@ class FinalEvalSettings(Section):
 
     @model_validator(mode="after")
     def _fewest_first(self) -> Self:
-        if self.min_seeds > self.max_seeds:
+        if self.min_seeds > self.mean_seeds:
             raise InvalidValueError(
-                f"study.final_eval.min_seeds is {self.min_seeds}, but it must be at most study.final_eval.max_seeds, "
-                f"which is {self.max_seeds}"
+                f"study.final_eval.min_seeds is {self.min_seeds}, but it must be at most study.final_eval.mean_seeds, "
+                f"which is {self.mean_seeds}"
             )
         return self
 
@@ -172,7 +176,7 @@ class StudySettings(Limits):
         min_length=1,
         description=f"a list of at least one seed, such as [0, 1], none twice and none above {LARGEST_SEARCH_SEED}",
     )
-    final_eval: FinalEvalSettings = Field(description="a section with top_k, min_seeds, max_seeds and judge_seeds")
+    final_eval: FinalEvalSettings = Field(description="a section with top_k, min_seeds, mean_seeds and judge_seeds")
     allow_config_changes: bool = Field(description="true or false")
 
     @model_validator(mode="after")

@@ -146,16 +146,18 @@ class Choice:
     n_trainings: int
 
 
-def choose(scores: FloatArray, *, min_seeds: int, max_seeds: int) -> Choice:
-    """Let candidates race over fresh seeds; with as many seeds at first as at most, nobody is dropped.
+def choose(scores: FloatArray, *, min_seeds: int, mean_seeds: int) -> Choice:
+    """Let candidates race over fresh seeds; with as many seeds on average as at first, all get the same.
 
     Args:
-        scores: Scores that the trainings would have, shape (candidates, at least `max_seeds`), greater is better.
+        scores: Scores that the trainings would have, shape (candidates, seeds), greater is better; no candidate gets
+            more seeds than these.
         min_seeds: Seeds of all candidates.
-        max_seeds: Seeds of those that are never dropped.
+        mean_seeds: Seeds of a candidate on average, at most.
     """
     known: dict[int, dict[int, float]] = {place: {} for place in range(len(scores))}
-    while not (stands := race(known, range(max_seeds), min_seeds=min_seeds)).is_over:
+    seeds = range(scores.shape[1])
+    while not (stands := race(known, seeds, min_seeds=min_seeds, mean_seeds=mean_seeds)).is_over:
         for place, seed in stands.missing:
             known[place][seed] = float(scores[place, seed])
     assert stands.chosen is not None

@@ -12,7 +12,7 @@ from scipy.special import chdtri, stdtrit
 from scipy.stats import rankdata
 
 from armscan.stats.bootstrap import LEVEL
-from armscan.sweeps.scheduling.race import DROP_LEVEL, PRIOR_DF, moderated_variances
+from armscan.sweeps.scheduling.race import PRIOR_DF, allotted, is_decided, moderated_variances, round_size
 from armscan.utils.arrays import FloatArray
 
 # Seeds that are simulated for each configuration: no rule takes more.
@@ -45,8 +45,14 @@ def fixed(n_seeds: int) -> SeedRule:
     return partial(_raced, rounds=[n_seeds], drop=lambda _, is_in: is_in)
 
 
-def t_race(min_seeds: int, max_seeds: int, level: float = DROP_LEVEL) -> SeedRule:
-    """Return the race of armscan, see `armscan.sweeps.scheduling.race.race`; the arguments are its own."""
+def t_race(min_seeds: int, max_seeds: int, level: float) -> SeedRule:
+    """Return the rule that drops after each seed those behind the leader by a one-sided t test.
+
+    Args:
+        min_seeds: Seeds of all configurations.
+        max_seeds: Seeds of those that are never dropped.
+        level: Confidence at which a configuration is dropped, from 0.5 to below 1.
+    """
     return partial(_raced, rounds=range(min_seeds, max_seeds + 1), drop=partial(_behind_by_t, level=level))
 
 
@@ -65,28 +71,30 @@ def halving(min_seeds: int) -> SeedRule:
     return partial(_raced, rounds=[*rounds, MOST_SEEDS], drop=_worse_half)
 
 
-def allocation(min_seeds: int, mean_seeds: float) -> SeedRule:
-    """Return the optimal allocation of a computing budget (Chen et al. 2000): most seeds to those close to the best.
+def allocation(min_seeds: int, mean_seeds: int, *, n_at_once: int | None = None, may_end: bool = True) -> SeedRule:
+    """Return the race of armscan, see `armscan.sweeps.scheduling.race.race`.
 
     Args:
-        min_seeds: Seeds of all configurations.
-        mean_seeds: Seeds of a configuration on average, which are the budget.
+        min_seeds: Seeds of all configurations, 2 or more.
+        mean_seeds: Seeds of a configuration on average, at most.
+        n_at_once: Trainings of a round after the first. Default: None, as many as in armscan.
+        may_end: Whether it ends when the leader is ahead. Default: True, as in armscan.
     """
 
     def choose(scores: FloatArray) -> Chosen:
         n_choices, n_configs, n_most = scores.shape
-        n_seeds, every = np.full((n_choices, n_configs), min_seeds), np.arange(n_choices)
-        for _ in range(round(mean_seeds * n_configs) - min_seeds * n_configs):
-            means, own = _moments(scores, n_seeds)
-            variances = moderated_variances(own, own.mean(axis=1, keepdims=True), n_seeds) + 1e-12
-            best = means.argmax(axis=1)
-            shares = variances / np.maximum(means[every, best][:, np.newaxis] - means, 1e-6) ** 2
-            shares[every, best] = 0.0
-            of_best = variances[every, best] * (shares**2 / variances).sum(axis=1)
-            shares[every, best] = np.sqrt(of_best)
-            wanted = shares / shares.sum(axis=1, keepdims=True) * (n_seeds.sum(axis=1, keepdims=True) + 1) - n_seeds
-            n_seeds[every, np.where(n_seeds < n_most, wanted, -np.inf).argmax(axis=1)] += 1
-        return Chosen(_moments(scores, n_seeds)[0].argmax(axis=1), n_seeds.sum(axis=1))
+        n_seeds, is_over = np.full((n_choices, n_configs), min_seeds), np.zeros(n_choices, bool)
+        left = (mean_seeds - min_seeds) * n_configs
+        while left > 0 and not is_over.all():
+            means, variances = _moments(scores, n_seeds)
+            if may_end:
+                is_over |= is_decided(means, variances, n_seeds)
+            n_more = min(n_at_once or round_size(n_configs), left)
+            more = allotted(means, variances, n_seeds, n_more, most=n_most)
+            n_seeds, left = np.where(is_over[:, np.newaxis], n_seeds, more), left - n_more
+        means, variances = _moments(scores, n_seeds)
+        lower = means - stdtrit(PRIOR_DF + n_seeds - 1, (1 + LEVEL) / 2) * np.sqrt(variances / n_seeds)
+        return Chosen(lower.argmax(axis=1), n_seeds.sum(axis=1))
 
     return choose
 
@@ -109,7 +117,7 @@ def _raced(scores: FloatArray, *, rounds: Sequence[int], drop: Drop) -> Chosen:
 
 
 def _standing(seen: FloatArray, is_in: Mask) -> tuple[FloatArray, FloatArray]:
-    """Return the means of configurations and the variances of these, shrunk as in a race of armscan."""
+    """Return the means of configurations with equally many seeds, and the shrunk variances of these means."""
     n_seeds = seen.shape[-1]
     means = seen.mean(axis=-1)
     if n_seeds == 1:
@@ -151,8 +159,9 @@ def _worse_half(seen: FloatArray, is_in: Mask) -> Mask:
 
 
 def _moments(scores: FloatArray, n_seeds: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-    """Return means and variances of configurations with other numbers of seeds each."""
+    """Return means and shrunk variances of configurations with two seeds or more, as in a race of armscan."""
     is_seen = np.arange(scores.shape[-1]) < n_seeds[..., np.newaxis]
     means = np.where(is_seen, scores, 0.0).sum(axis=-1) / n_seeds
     squares = np.where(is_seen, (scores - means[..., np.newaxis]) ** 2, 0.0).sum(axis=-1)
-    return means, squares / np.maximum(1, n_seeds - 1)
+    own = squares / (n_seeds - 1)
+    return means, moderated_variances(own, own.mean(axis=1, keepdims=True), n_seeds)

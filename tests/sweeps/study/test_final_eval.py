@@ -22,7 +22,7 @@ from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import make_study
 from tests.sweeps.study.test_study import settings
 
-FINAL_EVAL = {"top_k": 2, "min_seeds": 2, "max_seeds": 5, "judge_seeds": 3}
+FINAL_EVAL = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, "judge_seeds": 3}
 # Mean steps of each configuration on all volumes: the luckiest trial of the search is not the best.
 TRUE = {CONTROL: 6.0, 0: 5.0, 1: 3.0, 2: 9.0}
 LUCK = {0: 1.0, 1: 2.0, 2: 9.0}
@@ -56,7 +56,8 @@ def searched(uri, objectives=("mean_steps",), **changes):
 def opened(uri, **changes):
     storage, asked, search = searched(uri, **changes)
     final = FinalEvaluation.opened(storage, asked, search, None)
-    limits = Limits(n_trials=10**9)
+    # A training may lose its worker several times.
+    limits = Limits(n_trials=10**9, max_retries=10)
     plans = {final.selection: final.missing_of_selection, final.judgement: final.missing_of_judgement}
     return final, [TrialScheduler(study, storage, limits, plan) for study, plan in plans.items()]
 

@@ -35,7 +35,7 @@ def settings(**changes):
         "workers": 1,
         "seed": 0,
         "seeds": (0,),
-        "final_eval": FinalEvalSettings(top_k=0, min_seeds=1, max_seeds=1, judge_seeds=1),
+        "final_eval": FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1),
         "allow_config_changes": False,
     }
     return StudySettings(**values | changes)
@@ -98,7 +98,7 @@ def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_
     ratio = trial.suggest_float("agent.updates_per_env_step", **lr)
     study.tell(trial, 1.0)
     fixed = {"env": {"_target_": "armscan.envs.EnvFactory"}, "agent": {"learning_starts": 2000}}
-    final_eval = FinalEvalSettings(top_k=1, min_seeds=1, max_seeds=1, judge_seeds=1)
+    final_eval = FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, judge_seeds=1)
     now = settings(space=Space.read({"agent.utd_ratio": lr}), final_eval=final_eval)
     search = make_study(storage, now, fixed)
     control, best = FinalEvaluation.opened(storage, now, search, None).missing_of_selection()

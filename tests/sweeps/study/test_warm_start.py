@@ -153,7 +153,7 @@ def test_taken_trial_with_the_values_of_the_control_is_no_candidate_beside_it(st
     control, misfit = values_of(Space.read(space), words)
     assert (control, misfit) == ({"agent.lr": 2e-3, "stack": 1}, None)
     study_in("before", space, rows=[(control, 1.0), (control | {"stack": 4}, 2.0)])
-    final_eval = FinalEvalSettings(top_k=2, min_seeds=1, max_seeds=1, judge_seeds=1)
+    final_eval = FinalEvalSettings(top_k=2, min_seeds=1, mean_seeds=1, judge_seeds=1)
     asked, storage, study = made = study_in("now", space, warm_start=["before"], final_eval=final_eval)
     begin(made)
     assert FinalEvaluation.opened(storage, asked, study, None).candidates() == [CONTROL, 0, 1]
