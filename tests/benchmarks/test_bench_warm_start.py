@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from benchmarks.sweeps.bench.replay import Rule, search
-from benchmarks.sweeps.bench.warm_start import SimulatedSweep, best_that_fit, replays, share_of_trials
+from benchmarks.sweeps.bench.warm_start import SimulatedSweep, best_that_fit, replays, share_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
 RULE = Rule("tpe", "none")
@@ -12,24 +12,27 @@ RULE = Rule("tpe", "none")
 def test_the_best_settings_that_fit_are_tried_first(surrogate):
     found = search(surrogate, "sac_y", RULE, n_trainings=20, seed=0)
     space = surrogate.space
-    fitting = best_that_fit(found, space)
-    assert list(fitting) == [each.values for each in found.candidates[:5]]
+    # A third of the trials.
+    fitting = best_that_fit(found, space, 18)
+    assert list(fitting) == [each.values for each in found.candidates[:6]]
     begun = search(surrogate, "sac_y", RULE, n_trainings=20, seed=1, enqueued=fitting)
-    first = sorted(begun.candidates, key=lambda each: each.number)[:5]
+    first = sorted(begun.candidates, key=lambda each: each.number)[:6]
     assert [each.values for each in first] == list(fitting)
 
 
 def test_values_outside_of_the_space_are_left_out(surrogate):
     found = search(surrogate, "sac_y", RULE, n_trainings=20, seed=0)
     outside = tuple(replace(each, values=each.values | {"agent.lr": 1.0}) for each in found.candidates)
-    assert best_that_fit(replace(found, candidates=outside), surrogate.space) == ()
+    assert best_that_fit(replace(found, candidates=outside), surrogate.space, 18) == ()
 
 
 def test_a_warm_start_from_the_same_space_saves_trials(surrogate):
     target = SimulatedSweep("sac_y", surrogate, RULE, 40)
     studies = replays(target, target, 8)
-    share = share_of_trials(studies)
+    share = share_of(studies["trials"])
     assert share.low <= share.value <= share.high
     assert share.value < 1.0
-    assert studies.cold.between(1, 40).all()
-    assert share.value == pytest.approx(studies.warm.median() / studies.cold.median())
+    assert studies["trials"].cold.between(1, 40).all()
+    assert share.value == pytest.approx(studies["trials"].warm.median() / studies["trials"].cold.median())
+    # Without pruning, each trial is a training.
+    assert (studies["trainings"] == studies["trials"]).all(axis=None)

@@ -19,8 +19,9 @@ from pathlib import Path
 import optuna
 
 from benchmarks.sweeps.bench.collect import collect
+from benchmarks.sweeps.bench.replay import DEFAULT
 from benchmarks.sweeps.bench.report import report, with_interval
-from benchmarks.sweeps.bench.warm_start import SimulatedSweep, replays, share_of_trials
+from benchmarks.sweeps.bench.warm_start import SimulatedSweep, replays, share_of
 
 
 def main() -> None:
@@ -43,6 +44,7 @@ def main() -> None:
     starting.add_argument("source", help="name of the sweep that the settings are from, such as sac_y")
     starting.add_argument("target", help="name of the sweep that begins with them, such as sac_zy")
     starting.add_argument("--studies", type=int, default=20, help="studies (default: 20)")
+    starting.add_argument("--pruner", default=DEFAULT.pruner, help=f"of the target (default: {DEFAULT.pruner})")
     given = parser.parse_args()
     if given.command == "collect":
         collect(given.sweep, given.configs, given.seeds, given.workers, allow_changes=given.allow_changes)
@@ -50,9 +52,11 @@ def main() -> None:
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.simplefilter("ignore")
     if given.command == "warm-start":
-        studies = replays(SimulatedSweep.of(given.source), SimulatedSweep.of(given.target), given.studies)
+        target = SimulatedSweep.of(given.target, given.pruner)
+        studies = replays(SimulatedSweep.of(given.source), target, given.studies)
         print(studies.to_string())
-        print(f"trials with a warm start, of those without: {with_interval(share_of_trials(studies), '.2f')}")
+        for unit in studies.columns.levels[0]:
+            print(f"{unit} with a warm start, of those without: {with_interval(share_of(studies[unit]), '.2f')}")
     else:
         report(
             given.sweep,

@@ -51,12 +51,14 @@ class Candidate:
         value: Interquartile mean over its seeds of the mean steps in the best validation.
         config: Its configuration.
         number: Number of the trial in its search, from 0.
+        n_trainings: Environment steps of the search until its end, in whole trainings.
         values: Values of its configuration by name.
     """
 
     value: float
     config: SimulatedConfig
     number: int
+    n_trainings: float
     values: dict[str, Value]
 
 
@@ -112,7 +114,7 @@ def search(
             study.tell(trial, state=TrialState.PRUNED)
         else:
             study.tell(trial, value)
-            candidates.append(Candidate(value, config, trial.number, values))
+            candidates.append(Candidate(value, config, trial.number, float(spent / total), values))
     # The first of equal ones, as armscan sorts them.
     candidates.sort(key=lambda each: each.value)
     return Search(tuple(candidates), n_trials, float(spent / total))

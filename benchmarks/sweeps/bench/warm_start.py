@@ -1,4 +1,4 @@
-"""Trials that a warm start saves: those until a study finds the best of a study without one."""
+"""Trials and trainings that a warm start saves: those until a study finds the best of a study without one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from armscan.config.compose import compose
 from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.space.space import Space
-from armscan.sweeps.study.warm_start import first_different
+from armscan.sweeps.study.warm_start import first_different, n_enqueued
 from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.replay import DEFAULT, Rule, Search, search
 from benchmarks.sweeps.bench.surrogate import Surrogate
@@ -28,21 +28,25 @@ class SimulatedSweep(NamedTuple):
         sweep: Name of the sweep.
         surrogate: Simulates its trainings.
         rule: Sampler, pruner and seeds of its trials.
-        n_trainings: Budget of each search, in whole trainings.
+        n_trials: Whole trials that each search has the budget of.
     """
 
     sweep: str
     surrogate: Surrogate
     rule: Rule
-    n_trainings: int
+    n_trials: int
 
     @classmethod
-    def of(cls, sweep: str) -> SimulatedSweep:
-        """Return a sweep with the table of its trainings, and with the seeds and the number of trials that it has."""
+    def of(cls, sweep: str, pruner: str = DEFAULT.pruner) -> SimulatedSweep:
+        """Return a sweep with the table of its trainings, and with the seeds and the number of trials that it has.
+
+        Args:
+            sweep: Name of the sweep.
+            pruner: Name of a group `study/pruner`. Default: `median`.
+        """
         study = compose([f"sweep={sweep}"]).study
-        n_seeds = len(study.seeds)
-        rule = replace(DEFAULT, n_seeds=n_seeds)
-        return cls(sweep, Surrogate.of(Curves.read(sweep)), rule, study.n_trials * n_seeds)
+        rule = replace(DEFAULT, pruner=pruner, n_seeds=len(study.seeds))
+        return cls(sweep, Surrogate.of(Curves.read(sweep)), rule, study.n_trials)
 
 
 def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> pd.DataFrame:
@@ -54,27 +58,39 @@ def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> p
         n_studies: Number of studies of each kind.
 
     Returns:
-        A row of each study: the numbers of trials, `cold` and `warm`, until the truly best settings of the cold study,
-        or truly better ones, are tried; one more than all trials where the warm study tries none.
+        A row of each study, the columns `trials` and `trainings` of it `cold` and `warm`: how many it takes until the
+        truly best settings of the cold study, or truly better ones, have run to their end; one more than all where they
+        never do.
     """
     rows = []
     for seed in range(n_studies):
         known = _search(source, seed)
         cold = _search(target, seed)
-        warm = _search(target, seed, best_that_fit(known, target.surrogate.space))
+        warm = _search(target, seed, best_that_fit(known, target.surrogate.space, target.n_trials))
         goal = min(each.config.truth for each in cold.candidates)
-        rows.append({"cold": _trials_until(cold, goal), "warm": _trials_until(warm, goal)})
+        found = {"cold": _until(cold, goal), "warm": _until(warm, goal)}
+        rows.append(pd.DataFrame(found).stack())
     return pd.DataFrame(rows)
 
 
-def best_that_fit(found: Search, space: Space) -> tuple[dict[str, Value], ...]:
-    """Return the different settings of the best trials whose values lie in a space, as a study's warm start does."""
+def best_that_fit(found: Search, space: Space, n_trials: int) -> tuple[dict[str, Value], ...]:
+    """Return the settings that a study of so many trials tries first, as its warm start does.
+
+    Args:
+        found: Search whose best trials have them.
+        space: Space that they must lie in.
+        n_trials: Trials of the study.
+    """
     fits = (space.fit(each.values, partly=True) for each in found.candidates)
-    return first_different(chosen for chosen, misfit in fits if chosen and misfit is None)
+    return first_different((chosen for chosen, misfit in fits if chosen and misfit is None), n_enqueued(n_trials))
 
 
-def share_of_trials(studies: pd.DataFrame) -> Estimate:
-    """Return the median trials with a warm start over the median without; its 95 % interval draws studies."""
+def share_of(studies: pd.DataFrame) -> Estimate:
+    """Return the median with a warm start over the median without; its 95 % interval draws studies.
+
+    Args:
+        studies: Trials or trainings of each study, with the columns `cold` and `warm`.
+    """
 
     def share(warm: FloatArray, cold: FloatArray, axis: int = -1) -> FloatArray:
         return np.asarray(np.median(warm, axis=axis) / np.median(cold, axis=axis))
@@ -85,10 +101,13 @@ def share_of_trials(studies: pd.DataFrame) -> Estimate:
 
 
 def _search(target: SimulatedSweep, seed: int, enqueued: Sequence[Mapping[str, Value]] = ()) -> Search:
-    sweep, surrogate, rule, n_trainings = target
-    return search(surrogate, sweep, rule, n_trainings=n_trainings, seed=seed, enqueued=enqueued)
+    sweep, surrogate, rule, n_trials = target
+    return search(surrogate, sweep, rule, n_trainings=n_trials * rule.n_seeds, seed=seed, enqueued=enqueued)
 
 
-def _trials_until(found: Search, goal: float) -> float:
-    numbers = [each.number for each in found.candidates if each.config.truth <= goal]
-    return min(numbers, default=found.n_trials) + 1.0
+def _until(found: Search, goal: float) -> dict[str, float]:
+    reached = [each for each in found.candidates if each.config.truth <= goal]
+    first = min(reached, key=lambda each: each.number, default=None)
+    if first is None:
+        return {"trials": found.n_trials + 1.0, "trainings": found.n_trainings + 1.0}
+    return {"trials": first.number + 1.0, "trainings": first.n_trainings}
