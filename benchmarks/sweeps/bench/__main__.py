@@ -13,13 +13,11 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
-import warnings
 from pathlib import Path
 
-import optuna
-
 from benchmarks.sweeps.bench.collect import collect
-from benchmarks.sweeps.bench.replay import DEFAULT
+from benchmarks.sweeps.bench.ranking import SAMPLERS
+from benchmarks.sweeps.bench.replay import DEFAULT, silence
 from benchmarks.sweeps.bench.report import report, with_interval
 from benchmarks.sweeps.bench.warm_start import SimulatedSweep, replays, share_of
 
@@ -39,6 +37,10 @@ def main() -> None:
     replaying.add_argument("--studies", type=int, default=200, help="studies of each rule (default: 200)")
     replaying.add_argument("--trainings", type=int, default=40, help="budget of each search (default: 40)")
     replaying.add_argument("--resamples", type=int, default=50, help="resamples of importances (default: 50)")
+    replaying.add_argument(
+        "--samplers", nargs="+", default=SAMPLERS, help="to compare (default: all but gp, which takes hours)"
+    )
+    replaying.add_argument("--workers", type=int, default=1, help="processes that simulate (default: 1)")
     replaying.add_argument("--picture", type=Path, help="a PNG file that is written")
     starting = commands.add_parser("warm-start", help="simulate studies that begin with the best settings of others")
     starting.add_argument("source", help="name of the sweep that the settings are from, such as sac_y")
@@ -49,8 +51,7 @@ def main() -> None:
     if given.command == "collect":
         collect(given.sweep, given.configs, given.seeds, given.workers, allow_changes=given.allow_changes)
         return
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    warnings.simplefilter("ignore")
+    silence()
     if given.command == "warm-start":
         target = SimulatedSweep.of(given.target, given.pruner)
         studies = replays(SimulatedSweep.of(given.source), target, given.studies)
@@ -63,6 +64,8 @@ def main() -> None:
             n_studies=given.studies,
             n_trainings=given.trainings,
             n_resamples=given.resamples,
+            samplers=given.samplers,
+            workers=given.workers,
             picture=given.picture,
         )
 

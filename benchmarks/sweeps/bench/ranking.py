@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import itertools
-import sys
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
+import joblib
 import numpy as np
 import pandas as pd
 
 from armscan.stats.aggregation import band_over_seeds, probability_of_improvement
 from armscan.utils.arrays import FloatArray
-from benchmarks.sweeps.bench.replay import Rule, choose, scores_of, search
+from benchmarks.sweeps.bench.replay import Rule, choose, scores_of, search, silence
 from benchmarks.sweeps.bench.seed_rules import MOST_SEEDS
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "halving")
-# The Gaussian process takes a hundred times longer than others to propose a trial: a tenth of the studies, none of few.
-SLOW, FEWEST_STUDIES = ("gp",), 10
 # What all are compared with.
 REFERENCE = Rule("random", "none")
 # Candidates of the final evaluation; the seeds of each at first and on average, and whether the control races beside
@@ -27,9 +26,14 @@ TOP_K = 3
 FINALS = {"fixed": (5, 5, False), "race": (2, 6, False), "control": (2, 6, True)}
 
 
-def rules() -> Iterator[Rule]:
-    """Yield the rules that are compared: each sampler with each pruner, then two samplers with two seeds a trial."""
-    for sampler, pruner in itertools.product((*SAMPLERS, *SLOW), PRUNERS):
+def rules(samplers: Iterable[str] = SAMPLERS) -> Iterator[Rule]:
+    """Yield the rules that are compared: each sampler with each pruner, then two samplers with two seeds a trial.
+
+    Args:
+        samplers: Names of groups `study/sampler`. Default: all but `gp`, which takes a hundred times longer than others
+            to propose a trial.
+    """
+    for sampler, pruner in itertools.product(samplers, PRUNERS):
         yield Rule(sampler, pruner)
     for sampler in ("random", "tpe"):
         yield Rule(sampler, "median", 2)
@@ -43,6 +47,7 @@ def studies_of(
     *,
     n_studies: int,
     n_trainings: int,
+    workers: int = 1,
 ) -> pd.DataFrame:
     """Simulate studies, each with the same budget of environment steps in its search.
 
@@ -51,29 +56,30 @@ def studies_of(
         control: The default configuration.
         sweep: Name of the sweep.
         compared: Rules of the studies.
-        n_studies: Studies of each rule; a tenth of them with a slow sampler, none where that is fewer than ten.
+        n_studies: Studies of each rule.
         n_trainings: Budget of each search, in whole trainings.
+        workers: Processes that simulate. Default: 1, this one.
 
     Returns:
         A row of each study: how many mean steps what it chose is truly worse than the best of the space, by the best
         value of the search and by each way of the final evaluation, and the trainings of these.
     """
     _, best = surrogate.best()
-    rows = []
-    for rule in compared:
-        n_slow = n_studies // 10 if n_studies // 10 >= FEWEST_STUDIES else 0
-        for number in range(n_slow if rule.sampler in SLOW else n_studies):
-            found = search(surrogate, sweep, rule, n_trainings=n_trainings, seed=number)
-            tops = [candidate.config for candidate in found.candidates[:TOP_K]]
-            row = {**vars(rule), "study": number, "n_trials": found.n_trials, "search": tops[0].truth - best}
-            racing = [*tops, control]
-            scores = scores_of(racing, MOST_SEEDS, np.random.default_rng(number))
-            for name, (low, mean, has_control) in FINALS.items():
-                chosen = choose(scores if has_control else scores[:-1], min_seeds=low, mean_seeds=mean)
-                row |= {name: racing[chosen.place].truth - best, f"{name}_trainings": chosen.n_trainings}
-            rows.append(row)
-        print(f"{rule}: simulated", file=sys.stderr, flush=True)
-    return pd.DataFrame(rows)
+
+    def row_of(rule: Rule, number: int) -> dict[str, Any]:
+        silence()
+        found = search(surrogate, sweep, rule, n_trainings=n_trainings, seed=number)
+        tops = [candidate.config for candidate in found.candidates[:TOP_K]]
+        row = {**vars(rule), "study": number, "n_trials": found.n_trials, "search": tops[0].truth - best}
+        racing = [*tops, control]
+        scores = scores_of(racing, MOST_SEEDS, np.random.default_rng(number))
+        for name, (low, mean, has_control) in FINALS.items():
+            chosen = choose(scores if has_control else scores[:-1], min_seeds=low, mean_seeds=mean)
+            row |= {name: racing[chosen.place].truth - best, f"{name}_trainings": chosen.n_trainings}
+        return row
+
+    studies = itertools.product(compared, range(n_studies))
+    return pd.DataFrame(joblib.Parallel(n_jobs=workers)(joblib.delayed(row_of)(*each) for each in studies))
 
 
 def ranked(studies: pd.DataFrame, by: str = "race") -> pd.DataFrame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -169,6 +170,12 @@ def choose(scores: FloatArray, *, min_seeds: int, mean_seeds: int) -> Choice:
 def scores_of(candidates: Sequence[SimulatedConfig], n_seeds: int, rng: np.random.Generator) -> FloatArray:
     """Return scores of fresh trainings, minus the steps of the selection, shape (candidates, seeds)."""
     return -np.array([each.draw(rng, n_seeds)[:, -2] for each in candidates])
+
+
+def silence() -> None:
+    """Keep Optuna from printing a line for each study and each experimental argument, in this process."""
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    warnings.simplefilter("ignore")
 
 
 @lru_cache

@@ -14,7 +14,7 @@ from benchmarks.sweeps.bench.importance import Key, keys_of
 from benchmarks.sweeps.bench.picture import draw
 from benchmarks.sweeps.bench.power import needed_seeds, power_of, residuals_of_good_configs
 from benchmarks.sweeps.bench.races import FIXED, N_SEEDS, RACES, Choices, Comparison, candidates_of, choices_of, compare
-from benchmarks.sweeps.bench.ranking import ranked, rules, studies_of
+from benchmarks.sweeps.bench.ranking import SAMPLERS, ranked, rules, studies_of
 from benchmarks.sweeps.bench.replay import DEFAULT
 from benchmarks.sweeps.bench.surrogate import Surrogate, fit_of
 from benchmarks.sweeps.bench.table import Curves
@@ -23,7 +23,16 @@ from benchmarks.sweeps.bench.table import Curves
 TOP_KS = (3, 8)
 
 
-def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, picture: Path | None = None) -> None:
+def report(
+    sweep: str,
+    *,
+    n_studies: int,
+    n_trainings: int,
+    n_resamples: int,
+    samplers: Sequence[str] = SAMPLERS,
+    workers: int = 1,
+    picture: Path | None = None,
+) -> None:
     """Print the tables of a sweep, and draw the picture.
 
     Args:
@@ -31,6 +40,8 @@ def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, pi
         n_studies: Simulated studies of each rule.
         n_trainings: Budget of the search of each, in whole trainings.
         n_resamples: Resamples of the importances' intervals.
+        samplers: Samplers that are compared. Default: all but `gp`.
+        workers: Processes that simulate studies. Default: 1, this one.
         picture: File of the picture. Default: None, no picture.
     """
     curves = Curves.read(sweep)
@@ -48,7 +59,8 @@ def report(sweep: str, *, n_studies: int, n_trainings: int, n_resamples: int, pi
         raced = choices_of(candidates, RACES)
         races[top_k] = fixed, raced
         _print_races(top_k, fixed, compare(fixed, raced))
-    studies = studies_of(surrogate, control, sweep, rules(), n_studies=n_studies, n_trainings=n_trainings)
+    compared, size = rules(samplers), {"n_studies": n_studies, "n_trainings": n_trainings}
+    studies = studies_of(surrogate, control, sweep, compared, **size, workers=workers)
     ranks = ranked(studies)
     _print_ranks(ranks)
     if picture is not None:

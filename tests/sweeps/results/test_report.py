@@ -157,7 +157,11 @@ def test_report_shows_how_a_study_decided(answer, tmp_path, browser):
     assert [len(each["x"]) > 1 for each in of_candidates] == [True, False] * 3
     assert of_candidates[0]["y"][0] == "trial 1, chosen"
     scores = rows(folder / "selection.csv")
-    assert {row["candidate"]: row["outcome"] for row in scores} == {"1": "chosen", "control": "dropped", "0": "dropped"}
+    assert {row["candidate"]: row["outcome"] for row in scores} == {
+        "1": "chosen",
+        "control": "not chosen",
+        "0": "not chosen",
+    }
     steps, success = rows(folder / "differences.csv")
     assert (steps["chosen"], steps["figure"], success["difference"]) == ("1", "test/mean_steps", "0.0")
     assert float(steps["low"]) < float(steps["difference"]) < float(steps["high"]) < 0
