@@ -37,9 +37,8 @@ from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import best_trials, described, is_ours
 
 PRESET, SOURCE = "preset {}", "study {}"
-# Of studies with another configuration, the best settings are tried first: in one of so many trials, and so many at
-# least.
-ENQUEUED_OF, FEWEST_ENQUEUED = 3, 5
+# Best settings of a study with another configuration that are tried first.
+N_ENQUEUED = 10
 NO_LIMIT = 10**9
 # In `study.enqueue`: the configuration of the study itself.
 DEFAULT = "default"
@@ -160,8 +159,7 @@ def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], stor
         return InitialTrials(SOURCE.format(name), f"{message}{len(taken)} taken with their values{left}", taken)
     settings_of = {trial.number: chosen for trial, chosen in fitting if chosen}
     best = best_trials(source, NO_LIMIT)
-    fitting_settings = (settings_of[trial.number] for trial in best if trial.number in settings_of)
-    first = first_different(fitting_settings, n_enqueued(settings.n_trials, n_sources=len(settings.warm_start)))
+    first = first_different(settings_of[trial.number] for trial in best if trial.number in settings_of)
     message += f"none taken with its value, because {difference}; the settings of the best {len(first)} are tried first"
     return InitialTrials(SOURCE.format(name), message + left, (), first)
 
@@ -205,21 +203,11 @@ def _plain(flat: Mapping[str, Any]) -> dict[str, Value]:
     return {key: as_kept(json.loads(value) if is_list[key] else value) for key, value in flat.items()}
 
 
-def n_enqueued(n_trials: int, n_sources: int = 1) -> int:
-    """Return how many settings of each study with another configuration are tried first.
-
-    Args:
-        n_trials: Trials of the study that tries them.
-        n_sources: Studies that they come from. Default: 1.
-    """
-    return max(FEWEST_ENQUEUED, n_trials // (ENQUEUED_OF * n_sources))
-
-
-def first_different(settings: Iterable[dict[str, Value]], n_most: int) -> tuple[dict[str, Value], ...]:
-    """Return the first different settings, so many at most."""
+def first_different(settings: Iterable[dict[str, Value]]) -> tuple[dict[str, Value], ...]:
+    """Return the first ten different settings, those that a warm start tries first."""
     first: list[dict[str, Value]] = []
     for each in settings:
-        if len(first) < n_most and each not in first:
+        if len(first) < N_ENQUEUED and each not in first:
             first.append(each)
     return tuple(first)
 

@@ -14,7 +14,7 @@ from armscan.config.compose import compose
 from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.space.space import Space
-from armscan.sweeps.study.warm_start import first_different, n_enqueued
+from armscan.sweeps.study.warm_start import first_different
 from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.replay import DEFAULT, Rule, Search, search
 from benchmarks.sweeps.bench.surrogate import Surrogate
@@ -66,23 +66,17 @@ def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> p
     for seed in range(n_studies):
         known = _search(source, seed)
         cold = _search(target, seed)
-        warm = _search(target, seed, best_that_fit(known, target.surrogate.space, target.n_trials))
+        warm = _search(target, seed, best_that_fit(known, target.surrogate.space))
         goal = min(each.config.truth for each in cold.candidates)
         found = {"cold": _until(cold, goal), "warm": _until(warm, goal)}
         rows.append(pd.DataFrame(found).stack())
     return pd.DataFrame(rows)
 
 
-def best_that_fit(found: Search, space: Space, n_trials: int) -> tuple[dict[str, Value], ...]:
-    """Return the settings that a study of so many trials tries first, as its warm start does.
-
-    Args:
-        found: Search whose best trials have them.
-        space: Space that they must lie in.
-        n_trials: Trials of the study.
-    """
+def best_that_fit(found: Search, space: Space) -> tuple[dict[str, Value], ...]:
+    """Return the different settings of the best trials whose values lie in a space, as a study's warm start does."""
     fits = (space.fit(each.values, partly=True) for each in found.candidates)
-    return first_different((chosen for chosen, misfit in fits if chosen and misfit is None), n_enqueued(n_trials))
+    return first_different(chosen for chosen, misfit in fits if chosen and misfit is None)
 
 
 def share_of(studies: pd.DataFrame) -> Estimate:

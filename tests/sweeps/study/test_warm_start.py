@@ -17,7 +17,7 @@ from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import best_trials, make_study
-from armscan.sweeps.study.warm_start import InitialTrials, initial_trials, n_enqueued, values_of
+from armscan.sweeps.study.warm_start import N_ENQUEUED, InitialTrials, initial_trials, values_of
 from tests.sweeps.study.test_study import settings
 
 LR = {"low": 1e-4, "high": 1e-2, "log": True}
@@ -101,20 +101,15 @@ def test_value_of_a_key_that_is_searched_no_more_must_be_the_fixed_one(study_in)
     ids=["task", "seeds", "objectives"],
 )
 def test_best_settings_of_another_configuration_are_tried_first_without_their_values(study_in, changes, fixed, why):
-    rows = [({"agent.lr": 1e-3 * (10 - each), "stack": 1}, float(each)) for each in range(8)]
+    rows = [({"agent.lr": 5e-4 * (20 - each), "stack": 1}, float(each)) for each in range(N_ENQUEUED + 3)]
     study_in("before", {"agent.lr": LR, "stack": STACK}, rows=rows)
     # Settings that differ only in what this study does not try are one.
     made = study_in("now", {"agent.lr": LR, "agent.gamma": {"choices": [0.5]}}, fixed, warm_start=["before"], **changes)
     (told,) = begin(made, fixed)
-    assert f"none taken with its value, because {why}; the settings of the best 5 are tried first" in told
+    assert f"none taken with its value, because {why}; the settings of the best {N_ENQUEUED} are tried first" in told
     queued = [trial.system_attrs["fixed_params"] for trial in made[2].trials]
-    assert queued == [{"agent.lr": pytest.approx(1e-3 * (10 - each))} for each in range(5)]
+    assert queued == [{"agent.lr": pytest.approx(5e-4 * (20 - each))} for each in range(N_ENQUEUED)]
     assert {trial.state for trial in made[2].trials} == {TrialState.WAITING}
-
-
-@pytest.mark.parametrize(("n_trials", "n_sources", "expected"), [(60, 1, 20), (60, 2, 10), (9, 1, 5)])
-def test_a_third_of_the_trials_tries_settings_of_other_configurations(n_trials, n_sources, expected):
-    assert n_enqueued(n_trials, n_sources) == expected
 
 
 def test_study_begins_once_also_where_a_process_ended_in_between(study_in, monkeypatch):
