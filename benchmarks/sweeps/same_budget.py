@@ -8,7 +8,7 @@ their own. Both sides have the same space, presets, training seeds and objective
 
 - armscan: a study with its default sampler, pruner and choice. The search ends when the rest of the budget is needed
   for the first round of the race: the processor time of each candidate, and the mean of all trials for the default
-  configuration. The race then uses the rest. The last seed with a score for every candidate decides.
+  configuration. The race then uses the rest. The longest race whose rounds are complete decides.
 - Hydra's Optuna sweeper: its default sampler. The trial with the best value is the result.
 
 While budget is left, another trial begins; it always runs to its end. Both results and the default configuration are

@@ -126,12 +126,13 @@ def search_by_armscan(words: Sequence[str], budget_s: float, _: Path) -> SearchR
 
 
 def chosen_of(scores: Scores, seeds: Sequence[int], settings: FinalEvalSettings) -> int | None:
-    """Return what a race chooses after the most seeds on average that are complete; None if not even one is.
+    """Return the choice of the longest race whose rounds are complete; None if not even one seed of each is.
 
     Args:
         scores: See `race`.
         seeds: All seeds of the race.
-        settings: The most seeds on average, and those of the first round; if it is not complete, as many as are.
+        settings: Their `mean_seeds` are those of the longest race; their `min_seeds` are those of the first round, or
+            fewer if it is not complete.
     """
     means = range(settings.mean_seeds, 0, -1)
     shorter = (race(scores, seeds, min_seeds=min(n, settings.min_seeds), mean_seeds=n) for n in means)

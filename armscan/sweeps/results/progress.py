@@ -120,7 +120,7 @@ def _final_summary(final: FinalEvaluation, n_done: Sequence[int]) -> str:
     """Return the state of the final evaluation in one line."""
     _, most = n_trainings(final.settings)
     race, (n_selected, n_judged) = final.race(), n_done
-    number, now = (race.leader, "leads") if race.chosen is None else (race.chosen, "chosen")
+    number, now = (race.leader, "has the best mean so far") if race.chosen is None else (race.chosen, "chosen")
     stands = "" if number is None else f"; {name_of(number)} {now}"
     done = f"{n_selected} selection and {n_judged} judgement trainings done"
     return f"final evaluation: {done}, at most {most} in all{stands}"

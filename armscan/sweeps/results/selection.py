@@ -66,7 +66,7 @@ def objective_of(final: FinalEvaluation) -> str:
 
 
 def candidates_of(final: FinalEvaluation) -> list[Candidate]:
-    """Return the candidates, the chosen one first, then those that were in the race for longest."""
+    """Return the candidates, the chosen one first, then the others, most seeds first."""
     race, sign = final.race(), final.sign
     searched = final.search.get_trials(deepcopy=False)
     found = []
@@ -90,7 +90,7 @@ def candidates_of(final: FinalEvaluation) -> list[Candidate]:
 def _outcome(race: Race, number: int) -> str:
     if number == race.chosen:
         return "chosen"
-    if not race.standings[number].is_in:
+    if race.standings[number].has_failed:
         return "failed"
     return "not chosen" if race.is_over else "in the race"
 
@@ -142,18 +142,19 @@ def decided(
     better = "higher" if final.sign > 0 else "lower"
     n_selected = sum(len(each.scores) for each in candidates)
     n_candidates = max(0, len(candidates) - 1)
-    more = settings.min_seeds < settings.mean_seeds
-    n_seeds = f"{settings.min_seeds} of each at first" if more else f"{settings.min_seeds} of each"
+    n_seeds = f"{settings.min_seeds} seed{'s' if settings.min_seeds > 1 else ''}"
     further = (
-        f", then more where they best tell which is the best, {settings.mean_seeds} of each on average, or until the "
-        f"leader is ahead of all others with {END_LEVEL:.0%} confidence"
+        "Further seeds went, in rounds, to the candidates where they most increase the probability of a correct "
+        f"selection. The race ends at {settings.mean_seeds} seeds of each on average, or as soon as the leader is "
+        f"ahead of all others (one-sided t tests at {100 * END_LEVEL:.0f} %). "
     )
     steps = [
         f"<b>Search</b>: {len(searched.finished)} trials, {searched.n_pruned} of them pruned. Candidates are its best "
         f"different configurations ({n_candidates}), and the control: {NOTHING_SEARCHED}.",
-        f"<b>Selection</b>, on the validation volumes: {n_selected} trainings with seeds that the search has not used "
-        f"({n_seeds}{further if more else ''}), compared by {html.escape(title_of(objective))} ({better} is better). "
-        "The one whose interval has the best worst-case end is chosen.",
+        f"<b>Selection</b>, on the validation volumes: {n_selected} trainings with seeds that the search has not used, "
+        f"compared by {html.escape(title_of(objective))} ({better} is better). Each candidate got {n_seeds}. "
+        f"{further if settings.min_seeds < settings.mean_seeds else ''}"
+        "The candidate whose interval has the best worst-case end is chosen.",
     ]
     if judgement is not None:
         judged = "the control alone" if judgement.chosen == CONTROL else f"{name_of(judgement.chosen)} and the control"

@@ -1,8 +1,9 @@
 """Race of configurations over seeds: which trainings come next, and which configuration is chosen.
 
-A few seeds first, for all; then more, in rounds, where they best tell which configuration is the best: the optimal
-computing budget allocation of Chen et al. (2000, doi:10.1023/A:1008349927281). Everything here is a function of the
-scores alone: workers that see the same storage decide the same, and a race that was interrupted continues where it was.
+A few seeds first, for all; then more, in rounds, for the configurations where they most increase the probability of a
+correct selection: the optimal computing budget allocation (OCBA) of Chen et al. (2000, doi:10.1023/A:1008349927281).
+Everything here is a function of the scores alone: workers that see the same storage decide the same, and a race that
+was interrupted continues where it was.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from scipy.special import stdtrit
 from armscan.stats.bootstrap import LEVEL, Estimate
 from armscan.utils.arrays import FloatArray
 
-# Confidence, one-sided, at which the leader must be ahead of each other configuration for an early end of the race, and
-# the seeds that the leader must have then: fewer say little of chance.
+# Level of the one-sided t tests of the leader against each other configuration, for an early end of the race, and the
+# seeds that the leader must have then: with fewer, it may be lucky.
 END_LEVEL, LEADER_SEEDS = 0.95, 4
 # The most seeds of a configuration, as a multiple of the seeds on average.
 MOST_FACTOR = 4
 # Prior degrees of freedom: the weight of the pooled variance in that of each configuration, of which two or three seeds
 # say little.
 PRIOR_DF = 4.0
-# Of means and of variances, so that equal ones can be divided by.
-LEAST_GAP, LEAST_VARIANCE = 1e-6, 1e-12
+# Least gap between two means, as a share of the largest mean, and its square as the least variance: both are divisors.
+LEAST_GAP = 1e-6
 
 UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 
@@ -43,12 +44,12 @@ class Standing:
     Args:
         estimate: Mean score with its 95 % interval; NaN before the first round is complete.
         n_seeds: Number of seeds that the estimate is over.
-        is_in: Whether none of its trainings has failed.
+        has_failed: Whether one of its trainings has failed.
     """
 
     estimate: Estimate = UNKNOWN
     n_seeds: int = 0
-    is_in: bool = True
+    has_failed: bool = False
 
     @property
     def lower_end(self) -> float:
@@ -61,6 +62,7 @@ class Race:
     """A race as it stands.
 
     Args:
+        n_trained: Trainings of the race that have a score.
         missing: Trainings of this round without a score, the running ones included, as pairs of a configuration and a
             seed. Empty if the race is over.
         chosen: Configuration that was chosen; None while the race continues, or if all configurations have failed in
@@ -68,6 +70,7 @@ class Race:
         standings: Standing of each configuration.
     """
 
+    n_trained: int
     missing: tuple[tuple[int, int], ...]
     chosen: int | None
     standings: Mapping[int, Standing] = field(default_factory=dict)
@@ -79,19 +82,20 @@ class Race:
 
     @property
     def leader(self) -> int | None:
-        """Configuration with the best mean of those without a failure; None before the first round is complete."""
-        means = {number: each.estimate.value for number, each in self.standings.items() if each.is_in and each.n_seeds}
-        return max(means, key=means.__getitem__, default=None)
+        """Configuration with the best mean; None before the first round is complete, or if all have failed."""
+        standings = self.standings
+        left = [each for each in standings if standings[each].n_seeds and not standings[each].has_failed]
+        return max(left, key=lambda each: standings[each].estimate.value, default=None)
 
 
 def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: int) -> Race:
     """Return the state of a race.
 
     All configurations are trained with the first `min_seeds` seeds. Each further round has a third as many trainings as
-    there are configurations, two at least, given to those where they best tell which one is the best. The race is over
-    when each configuration has `mean_seeds` seeds on average, when the leader is ahead of all others by more than
-    chance explains (a one-sided t test), or when one configuration is left. The one with the highest lower end of its
-    interval is chosen; the first of equal ones.
+    configurations are left, two at least, for those where they most increase the probability of a correct selection.
+    The race is over when each configuration has `mean_seeds` seeds on average, when the leader is ahead of all others
+    by more than chance explains (one-sided t tests), or when one configuration is left. The one with the highest lower
+    end of its interval is chosen; the first of equal ones.
 
     Args:
         scores: Score of each finished training by configuration and seed, the higher the better. NaN for a failed
@@ -108,15 +112,15 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: in
         due = [(each, seed) for n, seed in enumerate(seeds) for each in left if n < n_seeds[each]]
         if missing := tuple((each, seed) for each, seed in due if seed not in scores[each]):
             # Not before the round is complete: what is run must not depend on which training ends first.
-            return Race(missing, None, standings)
+            return Race(sum(n_seeds.values()) - len(missing), missing, None, standings)
         rows = {each: np.array([scores[each][seed] for seed in seeds[: n_seeds[each]]]) for each in left}
         whole = [each for each in left if not np.isnan(rows[each]).any()]
         if not whole:
             # Of the round before, which had no failure; none in the first.
             left = [each for each in left if standings[each].n_seeds]
-            standings |= {each: replace(standings[each], is_in=False) for each in standings}
+            standings |= {each: replace(standings[each], has_failed=True) for each in standings}
             break
-        standings |= {each: replace(standings[each], is_in=False) for each in left if each not in whole}
+        standings |= {each: replace(standings[each], has_failed=True) for each in left if each not in whole}
         left, counts = whole, np.array([n_seeds[each] for each in whole])
         means, variances = moments([rows[each] for each in left])
         standings |= zip(left, _standings(means, variances, counts), strict=True)
@@ -125,11 +129,13 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: in
             break
         n_seeds |= zip(left, allotted(means, variances, counts, n_more, most=len(seeds)).tolist(), strict=True)
     chosen = max(left, key=lambda each: standings[each].lower_end, default=None)
-    return Race((), chosen, standings)
+    return Race(sum(n_seeds.values()), (), chosen, standings)
 
 
 def budget(n_configurations: int, *, min_seeds: int, mean_seeds: int) -> tuple[int, int]:
-    """Return the fewest and the most trainings of a race in which none fails."""
+    """Return a lower and an upper bound of the trainings of a race in which none fails."""
+    if n_configurations == 1:
+        return min_seeds, min_seeds
     least, most, size = n_configurations * min_seeds, n_configurations * mean_seeds, round_size(n_configurations)
     return min(most, least + math.ceil(max(0, LEADER_SEEDS - min_seeds) / size) * size), most
 
@@ -185,12 +191,13 @@ def allotted(means: FloatArray, variances: FloatArray, n_seeds: Counts, n_more: 
         means: Mean score of each configuration, shape (..., configurations), two or more.
         variances: Variance of the scores of each, likewise.
         n_seeds: Seeds of each, likewise.
-        n_more: Seeds to give out.
+        n_more: Seeds to give out, no more than `most` leaves.
         most: Most seeds of a configuration.
     """
     places, leader = np.arange(means.shape[-1]), means.argmax(axis=-1)[..., np.newaxis]
-    variances = variances + LEAST_VARIANCE
-    gaps = np.maximum(np.take_along_axis(means, leader, -1) - means, LEAST_GAP)
+    least_gap = LEAST_GAP * np.abs(means).max(axis=-1, keepdims=True) + np.finfo(float).tiny ** 0.25
+    variances = variances + least_gap**2
+    gaps = np.maximum(np.take_along_axis(means, leader, -1) - means, least_gap)
     shares = np.where(places == leader, 0.0, variances / gaps**2)
     of_leader = np.take_along_axis(variances, leader, -1) * (shares**2 / variances).sum(axis=-1, keepdims=True)
     shares = np.where(places == leader, np.sqrt(of_leader), shares)

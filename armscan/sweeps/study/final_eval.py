@@ -117,6 +117,9 @@ class FinalEvaluation:
         where, found = f"{selection.study_name}.user_attrs.{FINAL_EVAL}", selection.user_attrs.get(FINAL_EVAL)
         if not isinstance(found, Mapping):
             raise StudyError(f"{where} is {found!r}, but it must be the settings of the final evaluation")
+        if "mean_seeds" not in found.get("settings", {}):
+            # Its race had other rules.
+            return None
         kept = _Stored.read(where, found)
         return cls(kept.settings, kept.search_seed, kept.control, search, selection, judgement)
 
@@ -227,9 +230,9 @@ def _attributes(searched: Sequence[FrozenTrial], number: int, seed: int) -> dict
 
 
 def n_trainings(settings: FinalEvalSettings) -> tuple[int, int]:
-    """Return the fewest and the most trainings of a final evaluation in which none fails.
+    """Return a lower and an upper bound of the trainings of a final evaluation in which none fails.
 
-    The fewest: the control leads far ahead as soon as it has enough seeds.
+    The lower bound: the control leads far ahead as soon as it has enough seeds.
     """
     if not settings.top_k:
         return 0, 0

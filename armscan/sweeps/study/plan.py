@@ -16,6 +16,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from armscan.errors import printable
+from armscan.sweeps.scheduling.race import budget
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
@@ -97,7 +98,7 @@ def _print_cost(
 
 
 def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None, *, n_left: int) -> tuple[int, int]:
-    """Return the fewest and the most final trainings that are left.
+    """Return a lower and an upper bound of the final trainings that are left.
 
     Args:
         settings: Settings of the study, which may have changed since the final evaluation was begun.
@@ -113,8 +114,10 @@ def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None,
     n_judged = len(wanted & set(map(training_of, complete)))
     if race.is_over:
         return len(wanted) - n_judged, len(wanted) - n_judged
-    n_done = n_judged + sum(map(len, final.scores().values()))
-    return max(0, fewest - n_done), max(0, most - n_done)
+    asked = settings.final_eval
+    bounds = budget(len(race.standings), min_seeds=asked.min_seeds, mean_seeds=asked.mean_seeds)
+    least, most = (max(bound - race.n_trained, len(race.missing)) - n_judged for bound in bounds)
+    return least + asked.judge_seeds, most + 2 * asked.judge_seeds
 
 
 def _final(settings: FinalEvalSettings) -> str:
@@ -123,12 +126,12 @@ def _final(settings: FinalEvalSettings) -> str:
     if not most:
         return "no final evaluation"
     candidates = f"{settings.top_k} candidate{'s' if settings.top_k > 1 else ''}"
-    least, seeds = settings.min_seeds, settings.mean_seeds
+    n_first, n_mean = settings.min_seeds, settings.mean_seeds
+    further = f" at first, and at most {n_mean} each on average," if n_first < n_mean else ""
     return (
         f"at least {fewest} and at most {most} final trainings: {candidates} and the control with "
-        f"{f'{least} seeds each at first and at most ' if least < seeds else ''}{seeds} "
-        f"seed{'s' if seeds > 1 else ''} each{' on average' if least < seeds else ''} to select one, then "
-        f"that one and the control with {settings.judge_seeds} more each on the test volumes"
+        f"{n_first} seed{'s' if n_first > 1 else ''} each{further} to select one, then that one and the control with "
+        f"{settings.judge_seeds} more each on the test volumes"
     )
 
 

@@ -1,8 +1,8 @@
 """A bench for studies: which sampler, pruner and rule of seeds finds the best settings with the fewest trainings.
 
 python -m benchmarks.sweeps.bench collect sac_y [--configs N] [--seeds N] [--workers N]
-python -m benchmarks.sweeps.bench report sac_y [--studies N] [--picture FILE]
-python -m benchmarks.sweeps.bench warm-start sac_y sac_zy [--studies N]
+python -m benchmarks.sweeps.bench report sac_y [--studies N] [--workers N] [--picture FILE]
+python -m benchmarks.sweeps.bench warm-start sac_y sac_zy [--studies N] [--pruner NAME]
 """
 
 from __future__ import annotations
@@ -38,7 +38,11 @@ def main() -> None:
     replaying.add_argument("--trainings", type=int, default=40, help="budget of each search (default: 40)")
     replaying.add_argument("--resamples", type=int, default=50, help="resamples of importances (default: 50)")
     replaying.add_argument(
-        "--samplers", nargs="+", default=SAMPLERS, help="to compare (default: all but gp, which takes hours)"
+        "--samplers",
+        nargs="+",
+        choices=(*SAMPLERS, "gp"),
+        default=SAMPLERS,
+        help="samplers to compare (default: all but gp, which takes hours)",
     )
     replaying.add_argument("--workers", type=int, default=1, help="processes that simulate (default: 1)")
     replaying.add_argument("--picture", type=Path, help="a PNG file that is written")
@@ -46,7 +50,7 @@ def main() -> None:
     starting.add_argument("source", help="name of the sweep that the settings are from, such as sac_y")
     starting.add_argument("target", help="name of the sweep that begins with them, such as sac_zy")
     starting.add_argument("--studies", type=int, default=20, help="studies (default: 20)")
-    starting.add_argument("--pruner", default=DEFAULT.pruner, help=f"of the target (default: {DEFAULT.pruner})")
+    starting.add_argument("--pruner", default=DEFAULT.pruner, help=f"pruner of the target (default: {DEFAULT.pruner})")
     given = parser.parse_args()
     if given.command == "collect":
         collect(given.sweep, given.configs, given.seeds, given.workers, allow_changes=given.allow_changes)

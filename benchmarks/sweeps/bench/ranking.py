@@ -19,9 +19,8 @@ from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "halving")
 # What all are compared with.
 REFERENCE = Rule("random", "none")
-# Candidates of the final evaluation; the seeds of each at first and on average, and whether the control races beside
-# them.
-# Rules are ranked without it: chosen in place of bad candidates, it hides what a sampler finds.
+# Candidates of the final evaluation; seeds of each at first and on average, and whether the control races, too. Rules
+# are ranked without it: chosen in place of bad candidates, it hides what a sampler finds.
 TOP_K = 3
 FINALS = {"fixed": (5, 5, False), "race": (2, 6, False), "control": (2, 6, True)}
 
@@ -33,9 +32,11 @@ def rules(samplers: Iterable[str] = SAMPLERS) -> Iterator[Rule]:
         samplers: Names of groups `study/sampler`. Default: all but `gp`, which takes a hundred times longer than others
             to propose a trial.
     """
+    yield REFERENCE
     for sampler, pruner in itertools.product(samplers, PRUNERS):
-        yield Rule(sampler, pruner)
-    for sampler in ("random", "tpe"):
+        if (rule := Rule(sampler, pruner)) != REFERENCE:
+            yield rule
+    for sampler in {"random", "tpe"}.intersection(samplers):
         yield Rule(sampler, "median", 2)
 
 
@@ -67,7 +68,8 @@ def studies_of(
     _, best = surrogate.best()
 
     def row_of(rule: Rule, number: int) -> dict[str, Any]:
-        silence()
+        if workers > 1:
+            silence()
         found = search(surrogate, sweep, rule, n_trainings=n_trainings, seed=number)
         tops = [candidate.config for candidate in found.candidates[:TOP_K]]
         row = {**vars(rule), "study": number, "n_trials": found.n_trials, "search": tops[0].truth - best}

@@ -52,7 +52,7 @@ class Candidate:
         value: Interquartile mean over its seeds of the mean steps in the best validation.
         config: Its configuration.
         number: Number of the trial in its search, from 0.
-        n_trainings: Environment steps of the search until its end, in whole trainings.
+        n_trainings: Environment steps of the search until the end of this trial, in whole trainings.
         values: Values of its configuration by name.
     """
 

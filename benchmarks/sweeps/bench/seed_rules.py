@@ -72,13 +72,13 @@ def halving(min_seeds: int) -> SeedRule:
 
 
 def allocation(min_seeds: int, mean_seeds: int, *, n_at_once: int | None = None, may_end: bool = True) -> SeedRule:
-    """Return the race of armscan, see `armscan.sweeps.scheduling.race.race`.
+    """Return the race of armscan, see `armscan.sweeps.scheduling.race.race`, with at most the seeds that are simulated.
 
     Args:
         min_seeds: Seeds of all configurations, 2 or more.
         mean_seeds: Seeds of a configuration on average, at most.
         n_at_once: Trainings of a round after the first. Default: None, as many as in armscan.
-        may_end: Whether it ends when the leader is ahead. Default: True, as in armscan.
+        may_end: Whether it may end before its budget is used, see `is_decided`. Default: True, as in armscan.
     """
 
     def choose(scores: FloatArray) -> Chosen:

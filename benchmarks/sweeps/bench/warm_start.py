@@ -28,7 +28,7 @@ class SimulatedSweep(NamedTuple):
         sweep: Name of the sweep.
         surrogate: Simulates its trainings.
         rule: Sampler, pruner and seeds of its trials.
-        n_trials: Whole trials that each search has the budget of.
+        n_trials: Budget of each search, in whole trials.
     """
 
     sweep: str
@@ -58,9 +58,8 @@ def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> p
         n_studies: Number of studies of each kind.
 
     Returns:
-        A row of each study, the columns `trials` and `trainings` of it `cold` and `warm`: how many it takes until the
-        truly best settings of the cold study, or truly better ones, have run to their end; one more than all where they
-        never do.
+        A row of each study, with columns (`trials` or `trainings`, `cold` or `warm`): how many it takes until the truly
+        best settings of the cold study, or better ones, have run to their end; one more than all if they never do.
     """
     rows = []
     for seed in range(n_studies):

@@ -36,7 +36,7 @@ def test_race_ends_within_its_budget_with_one_choice_in_any_order_of_trainings(t
     assert len(trained_otherwise) == len(set(trained_otherwise)) <= most
     has_failed = any(math.isnan(table[number][SEEDS.index(seed)]) for number, seed in trained)
     assert len(trained) >= len(table) * counts[0]
-    assert has_failed or len(table) == 1 or len(trained) >= fewest
+    assert has_failed or len(trained) >= fewest
     assert set(trained) == set(trained_otherwise)
     assert repr(first) == repr(other)
     if any(not np.isnan(row).any() for row in table.values()):
@@ -87,7 +87,7 @@ def test_configuration_whose_training_failed_is_out_at_the_end_of_the_round():
         of_seed[1001] = 1.1
     later = race(scores, SEEDS, min_seeds=2, mean_seeds=4)
     assert {number for number, _ in later.missing} <= {-1, 7}
-    assert not later.standings[4].is_in
+    assert later.standings[4].has_failed
 
 
 def test_where_all_fail_the_round_before_decides_and_nothing_in_the_first():
@@ -96,7 +96,7 @@ def test_where_all_fail_the_round_before_decides_and_nothing_in_the_first():
     assert (ended.is_over, ended.chosen) == (True, None)
     # Both fail in the second round.
     table = {-1: [1.0, 1.1, *[math.nan] * 10], 4: [1.1, 1.2, *[math.nan] * 10]}
-    assert run(table, (2, 4), lambda missing: missing[0])[0].chosen in (-1, 4)
+    assert run(table, (2, 4), lambda missing: missing[0])[0].chosen == 4
 
 
 def test_first_of_equal_configurations_is_chosen():
@@ -133,5 +133,5 @@ def test_race_needs_fewer_trainings_than_the_same_seeds_for_all_at_no_more_regre
         n_trained += len(done)
         regret += true.max() - true[raced.chosen]
         regret_of_all += true.max() - true[table[:, :n_fixed].mean(axis=1).argmax()]
-    assert n_trained / n_studies < 0.75 * n_fixed * n_configurations
+    assert n_trained / n_studies < 0.65 * n_fixed * n_configurations
     assert regret <= 1.05 * regret_of_all

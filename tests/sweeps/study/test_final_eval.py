@@ -183,6 +183,13 @@ def test_plan_counts_the_final_trainings_that_are_left(storage_uri):
         update={"final_eval": settings.final_eval.model_copy(update={"judge_seeds": len(final.judge_seeds) + 2})}
     )
     assert final_trainings_left(more, final, n_left=0) == (4, 4)
+    # A new candidate takes the place of one whose scores then do not count; the control has been judged.
+    better = final.search.ask()
+    better.suggest_float("agent.lr", 1e-4, 1e-2)
+    final.search.tell(better, 0.5)
+    n_missing = len(final.missing_of_selection())
+    least, most = final_trainings_left(settings, final, n_left=0)
+    assert 0 < n_missing <= least <= most
 
 
 def test_control_that_is_the_best_is_the_result(storage_uri):
