@@ -117,7 +117,8 @@ class FinalEvaluation:
         where, found = f"{selection.study_name}.user_attrs.{FINAL_EVAL}", selection.user_attrs.get(FINAL_EVAL)
         if not isinstance(found, Mapping):
             raise StudyError(f"{where} is {found!r}, but it must be the settings of the final evaluation")
-        if "mean_seeds" not in found.get("settings", {}):
+        settings = found.get("settings")
+        if isinstance(settings, Mapping) and "max_seeds" in settings:
             # Its race had other rules.
             return None
         kept = _Stored.read(where, found)

@@ -116,6 +116,10 @@ def test_seeds_are_allotted_as_in_the_optimal_computing_budget_allocation():
     found = allotted(means, variances, np.array([2, 2, 2]), 3000, most=10_000)
     leader = (1.0 + 1.0 / 4.0) ** 0.5
     assert found / found.sum() == pytest.approx(np.array([leader, 1.0, 1.0]) / (leader + 2.0), abs=1e-3)
+    # The unit of the scores does not matter, nor do equal scores.
+    tiny = allotted(1e-12 * means, 1e-24 * variances, np.array([2, 2, 2]), 3000, most=10_000)
+    assert tiny.tolist() == found.tolist()
+    assert allotted(np.zeros(3), np.zeros(3), np.array([2, 2, 2]), 3, most=10).sum() == 9
     capped = allotted(means, variances, np.array([2, 2, 2]), 6, most=4)
     assert capped.tolist() == [4, 4, 4]
 

@@ -285,6 +285,9 @@ def test_final_evaluation_is_read_from_the_storage_and_that_of_an_earlier_versio
     assert FinalEvaluation.stored(storage, search) is None
     final = FinalEvaluation.opened(storage, asked, search, None)
     assert FinalEvaluation.stored(open_storage(storage_uri), search).settings == final.settings
+    before = {"top_k": 2, "min_seeds": 3, "max_seeds": 8, "judge_seeds": 5}
+    final.selection.set_user_attr("final_eval", {"settings": before, "search_seed": 0, "control": None})
+    assert FinalEvaluation.stored(storage, search) is None
 
 
 def test_member_of_the_latest_generation_is_trained_with_its_whole_schedule(storage_uri):
