@@ -17,6 +17,8 @@ from benchmarks.sweeps.bench.seed_rules import MOST_SEEDS
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "halving")
+# Samplers that are also compared with two seeds a trial.
+TWO_SEEDS = ("random", "tpe")
 # What all are compared with.
 REFERENCE = Rule("random", "none")
 # Candidates of the final evaluation; seeds of each at first and on average, and whether the control races, too. Rules
@@ -25,19 +27,16 @@ TOP_K = 3
 FINALS = {"fixed": (5, 5, False), "race": (2, 6, False), "control": (2, 6, True)}
 
 
-def rules(samplers: Iterable[str] = SAMPLERS) -> Iterator[Rule]:
+def rules(samplers: Sequence[str] = SAMPLERS) -> Iterator[Rule]:
     """Yield the rules that are compared: each sampler with each pruner, then two samplers with two seeds a trial.
 
     Args:
         samplers: Names of groups `study/sampler`. Default: all but `gp`, which takes a hundred times longer than others
             to propose a trial.
     """
-    yield REFERENCE
-    for sampler, pruner in itertools.product(samplers, PRUNERS):
-        if (rule := Rule(sampler, pruner)) != REFERENCE:
-            yield rule
-    for sampler in {"random", "tpe"}.intersection(samplers):
-        yield Rule(sampler, "median", 2)
+    whole = itertools.starmap(Rule, itertools.product(samplers, PRUNERS))
+    # Each once, what all are compared with first.
+    yield from dict.fromkeys([REFERENCE, *whole, *(Rule(each, "median", 2) for each in TWO_SEEDS if each in samplers)])
 
 
 def studies_of(
