@@ -2,7 +2,7 @@
 
     python -m benchmarks.sweeps compare [folder=FOLDER] [trials=60] [shortest_s=6] [longest_s=30]
                                         the workers' time spent in trials, beside Hydra's own Optuna sweeper
-    python -m benchmarks.sweeps same_budget [folder=FOLDER] [replicates=4] [seeds=4]
+    python -m benchmarks.sweeps same_budget [folder=FOLDER] [tasks=[sac_y]] [first=0] [replicates=4] [seeds=8]
                                         what both find with the same processor time, by real trainings
     python -m benchmarks.sweeps idle [folder=FOLDER] [trials=60] [shortest_s=1] [longest_s=5]
                                         the same of armscan alone, with trials that are over soon

@@ -1,20 +1,20 @@
 """Compare the configurations that armscan and Hydra's Optuna sweeper find with the same processor time.
 
-    python -m benchmarks.sweeps same_budget [folder=FOLDER] [replicates=4] [seeds=4]
+    python -m benchmarks.sweeps same_budget [folder=FOLDER] [tasks=[sac_y,sac_zy]] [first=0] [replicates=4] [seeds=8]
 
 In each replicate both search once. The replicate's number is the seed of both samplers, and trainings have seeds of
 their own. Both sides have the same space, presets, training seeds and objective, and train one trial at a time
 (`benchmarks.sweeps.searches`):
 
-- armscan: a study with its default sampler, pruner and choice. The search ends when the rest of the budget is needed
-  for the first round of the race: the processor time of each candidate, and the mean of all trials for the default
-  configuration. The race then uses the rest. The longest race whose rounds are complete decides.
+- armscan: a study with its default sampler, pruner and choice. The search has half of the budget, the race the rest:
+  in a study with the default settings, a search of 40 trials with a pruner and the race take as long as each other. The
+  longest race whose rounds are complete decides.
 - Hydra's Optuna sweeper: its default sampler. The trial with the best value is the result.
 
 While budget is left, another trial begins; it always runs to its end. Both results and the default configuration are
 then trained with new seeds, and judged by the objective on the test volumes. Each outcome is a line of `results.jsonl`:
-the same command continues after an interruption, and repeats only the search that was cut off. `replicates=0` prints
-the table of all results so far.
+the same command continues after an interruption, and repeats only the search that was cut off. Several processes may
+share the folder if their replicates or tasks differ. `replicates=0` prints the table of all results so far.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import contextlib
 import functools
 import json
 import shutil
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -41,7 +42,7 @@ from benchmarks.sweeps.searches import NAME, WITHOUT_END, SearchResult, search_b
 
 
 class Task(NamedTuple):
-    """A sweep, the number of seeds of its trials, and the processor seconds of a search: some 20 whole trials."""
+    """A sweep, the number of seeds of its trials, and the processor seconds of a search: some 30 whole trainings."""
 
     words: tuple[str, ...]
     n_seeds: int
@@ -49,8 +50,8 @@ class Task(NamedTuple):
 
 
 TASKS = {
-    "sac_y": Task(("sweep=sac_y",), 1, 175.0),
-    "sac_zy": Task(("sweep=sac_zy", "training.env_steps=8000", "training.eval_every_env_steps=1000"), 2, 250.0),
+    "sac_y": Task(("sweep=sac_y",), 1, 200.0),
+    "sac_zy": Task(("sweep=sac_zy",), 2, 600.0),
 }
 ARMSCAN, HYDRA, DEFAULT = "armscan", "hydra", "default"
 Search = Callable[[Sequence[str], float, Path], SearchResult]
@@ -81,13 +82,23 @@ class Results:
         return row
 
 
-def same_budget(folder: Path, *, replicates: int = 4, seeds: int = 4) -> None:
-    """Make the searches and trainings that are missing, and print the table after each replicate."""
+def same_budget(
+    folder: Path, *, tasks: Sequence[str] = tuple(TASKS), first: int = 0, replicates: int = 4, seeds: int = 8
+) -> None:
+    """Make the searches and trainings that are missing, and print the table after each replicate.
+
+    Args:
+        folder: Folder of the results.
+        tasks: Names of the tasks. Default: all.
+        first: Number of the first replicate, from 0. Default: 0.
+        replicates: Number of replicates. Default: 4.
+        seeds: Number of seeds that judge each configuration. Default: 8.
+    """
     silence_libraries()
     results = Results(folder / "results.jsonl")
     with contextlib.chdir(folder):
-        for replicate in range(replicates):
-            for name in TASKS:
+        for replicate in range(first, first + replicates):
+            for name in tasks:
                 _replicate(results, name, replicate, seeds)
             print(table(results.rows), flush=True)
     if not replicates:
@@ -100,7 +111,7 @@ def _replicate(results: Results, name: str, replicate: int, n_seeds: int) -> Non
     for side in (ARMSCAN, HYDRA) if replicate % 2 else (HYDRA, ARMSCAN):
         if results.find(side=side, **known) is None:
             _warm_up(name)
-            result = _search(side, task, replicate)
+            result = _search(side, task, replicate, Path(f"{name}-{replicate}"))
             print(name, replicate, side, result, flush=True)
             results.add(**known, side=side, **asdict(result))
     best = {DEFAULT: {}, **{side: results.find(side=side, **known)["values"] for side in SEARCHES}}
@@ -117,11 +128,12 @@ def _replicate(results: Results, name: str, replicate: int, n_seeds: int) -> Non
 def _warm_up(name: str) -> None:
     """Train a short trial: the first one of a process imports and compiles."""
     task = TASKS[name]
-    _search(ARMSCAN, task._replace(words=(*task.words, *SHORT), budget_s=0.1), replicate=0)
+    short = task._replace(words=(*task.words, *SHORT), budget_s=0.1)
+    with tempfile.TemporaryDirectory(dir=".") as folder:
+        _search(ARMSCAN, short, 0, Path(folder) / name)
 
 
-def _search(side: str, task: Task, replicate: int) -> SearchResult:
-    folder = Path(NAME)
+def _search(side: str, task: Task, replicate: int, folder: Path) -> SearchResult:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     places = (f"study.storage={folder}/optuna.journal", f"study.folder={folder}", f"study.artifacts={folder}/artifacts")

@@ -12,7 +12,6 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import optuna
@@ -69,8 +68,6 @@ class Meter:
 
     def __init__(self, budget_s: float) -> None:
         self.budget_s, self.used_s = budget_s, 0.0
-        # Of each trial that ran to its end, by its number.
-        self.whole_s: dict[int, float] = {}
 
     def is_used(self, kept_s: float = 0.0) -> bool:
         """Return whether no more than these processor seconds are left."""
@@ -82,9 +79,7 @@ class Meter:
         def timed(attempt: Attempt) -> dict[str, float]:
             start_s = time.process_time()
             try:
-                metrics = run(attempt)
-                self.whole_s[attempt.trial.number] = time.process_time() - start_s
-                return metrics
+                return run(attempt)
             finally:
                 self.used_s += time.process_time() - start_s
 
@@ -105,17 +100,13 @@ class BudgetedScheduler(TrialScheduler):
 
 
 def search_by_armscan(words: Sequence[str], budget_s: float, _: Path) -> SearchResult:
-    """Search by a study of armscan. The search keeps enough of the budget for the first round of the race."""
+    """Search by a study of armscan: half of the budget for the search, the rest for the race."""
     opened = open_for_work(*read_settings(words), words)
     assert opened.final_eval is not None
     meter, final = Meter(budget_s), opened.final_eval
     _add_presets(words, opened, opened.search.scheduler.study)
 
-    def first_round_s() -> float:
-        of_candidates = [meter.whole_s.get(number, fmean(meter.whole_s.values())) for number in final.candidates()]
-        return sum(of_candidates) * final.settings.min_seeds / len(opened.settings.seeds)
-
-    _work(opened.search, words, meter, lambda: meter.is_used(first_round_s()))
+    _work(opened.search, words, meter, lambda: meter.is_used(kept_s=budget_s / 2))
     _work(opened.finals[0], words, meter, meter.is_used, final.missing_of_selection)
     searched = final.search.get_trials()
     chosen = chosen_of(final.scores(), final.selection_seeds, final.settings)

@@ -27,7 +27,7 @@ def clock(monkeypatch):
     return clock
 
 
-def test_pruned_trials_use_the_budget_but_are_not_whole(clock):
+def test_pruned_trials_use_the_budget_too(clock):
     def run(attempt):
         clock.now_s += 3.0
         if attempt.trial.number == 1:
@@ -39,7 +39,6 @@ def test_pruned_trials_use_the_budget_but_are_not_whole(clock):
     with pytest.raises(optuna.TrialPruned):
         meter.timed(run)(attempt(1))
     assert meter.used_s == pytest.approx(6.0)
-    assert meter.whole_s == {0: 3.0}
     assert not meter.is_used()
     assert meter.is_used(kept_s=1.0)
 
@@ -123,6 +122,14 @@ def test_replicates_have_seeds_of_their_own(trained, tmp_path):
     same_budget.same_budget(tmp_path, replicates=2, seeds=3)
     of_default = [seed for name, seed in trained if name is None]
     assert sorted(of_default) == sorted(2 * [5000, 5001, 5002, 5010, 5011, 5012])
+
+
+def test_processes_share_a_folder(trained, tmp_path):
+    for first in (2, 0):
+        same_budget.same_budget(tmp_path, tasks=["sac_y"], first=first, replicates=2, seeds=1)
+    rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
+    assert [len(each) for each in scores_of(rows, "sac_y").values()] == [4, 4, 4]
+    assert sorted(seed for name, seed in trained if name == "a") == [5000, 5010, 5020, 5030]
 
 
 def test_a_benchmark_that_was_killed_goes_on(trained, tmp_path):
