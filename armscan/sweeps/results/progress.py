@@ -21,8 +21,10 @@ from armscan.sweeps.scheduling.state import StudyState, is_feasible
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, STOP
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
-from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, name_of
+from armscan.sweeps.study.final_eval import FinalEvaluation, name_of
 from armscan.sweeps.study.open import OpenedStudy, Phase
+from armscan.sweeps.study.plan import final_trainings_left
+from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import best_trials
 from armscan.utils.console import print_sentence
 from armscan.utils.retry import no_retry
@@ -105,7 +107,7 @@ def _table(opened: OpenedStudy) -> Table:
     for heading in ("trial", "seed", "environment steps", "return"):
         table.add_column(heading, justify="right")
     if opened.final_eval is not None and any(of_final.all for _, of_final in finals):
-        table.caption = _final_summary(opened.final_eval, [len(of_final.finished) for _, of_final in finals])
+        table.caption = final_line(opened.settings, opened.final_eval, [len(each.finished) for _, each in finals])
     for trial in (*state.running, *(trial for _, of_final in finals for trial in of_final.running)):
         lease, finalist = trial.user_attrs.get(LEASE, {}), trial.user_attrs.get(FINALIST)
         name = str(trial.number) if finalist is None else f"{name_of(finalist)}, final"
@@ -116,14 +118,14 @@ def _table(opened: OpenedStudy) -> Table:
     return table
 
 
-def _final_summary(final: FinalEvaluation, n_done: Sequence[int]) -> str:
+def final_line(settings: StudySettings, final: FinalEvaluation, n_done: Sequence[int]) -> str:
     """Return the state of the final evaluation in one line."""
-    _, most = n_trainings(final.settings)
+    _, n_left = final_trainings_left(settings, final, n_left=0)
     race, (n_selected, n_judged) = final.race(), n_done
     number, now = (race.leader, "has the best mean so far") if race.chosen is None else (race.chosen, "chosen")
     stands = "" if number is None else f"; {name_of(number)} {now}"
     done = f"{n_selected} selection and {n_judged} judgement trainings done"
-    return f"final evaluation: {done}, at most {most} in all{stands}"
+    return f"final evaluation: {done}, at most {n_left} left{stands}"
 
 
 def status_line(opened: OpenedStudy, state: StudyState) -> str:

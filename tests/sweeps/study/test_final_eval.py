@@ -10,6 +10,7 @@ import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps.results.judgement import best_metrics, judge, result_note
+from armscan.sweeps.results.progress import final_line
 from armscan.sweeps.results.selection import candidates_of
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
@@ -190,6 +191,7 @@ def test_plan_counts_the_final_trainings_that_are_left(storage_uri):
     n_missing = len(final.missing_of_selection())
     least, most = final_trainings_left(settings, final, n_left=0)
     assert 0 < n_missing <= least <= most
+    assert f"at most {most} left" in final_line(settings, final, [9, 6])
 
 
 def test_control_that_is_the_best_is_the_result(storage_uri):
