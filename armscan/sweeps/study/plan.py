@@ -16,7 +16,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from armscan.errors import printable
-from armscan.sweeps.scheduling.race import budget
+from armscan.sweeps.scheduling.race import budget, round_size
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
@@ -85,16 +85,37 @@ def _print_cost(
     # Final trainings are never pruned.
     whole_s = [spent_s for trial, spent_s in timed if trial.state == TrialState.COMPLETE]
     training_s = fmean(whole_s or seconds) / len(settings.seeds)
-    fewest, most = final_trainings_left(settings, final, n_left=n_left)
-    hours = [(n_left * mean_s + n * training_s) / settings.workers / 3600 for n in (fewest, most)]
+    least, most = hours_left(settings, final, n_left=n_left, trial_s=mean_s, training_s=training_s)
     console.print(
         f"cost       {sum(seconds) / 3600:.2f} hours of workers, {state.busy_hours:.2f} hours in all, "
         f"{state.env_steps:,} environment steps, {spent_mib:.0f} MiB"
     )
     console.print(
-        f"the rest   {n_left} trials and the final evaluation, about {hours[0]:.2f} to {hours[1]:.2f} hours and "
+        f"the rest   {n_left} trials and the final evaluation, about {least:.2f} to {most:.2f} hours and "
         f"{spent_mib / len(state.finished) * n_left:.0f} MiB ({mean_s:.0f} s a trial so far)"
     )
+
+
+def hours_left(
+    settings: StudySettings, final: FinalEvaluation | None, *, n_left: int, trial_s: float, training_s: float
+) -> tuple[float, float]:
+    """Return a lower and an upper bound of the hours that a study takes to its end, if no trial fails.
+
+    The lower bound: no worker ever waits. The upper bound: all final trainings are as few at a time as those of the
+    race's rounds.
+
+    Args:
+        settings: Settings of the study.
+        final: The final evaluation; None if it has not been started.
+        n_left: Trials of the search that are left.
+        trial_s: Seconds of a trial.
+        training_s: Seconds of a final training.
+    """
+    bounds = final_trainings_left(settings, final, n_left=n_left)
+    n_at_once = settings.workers, min(settings.workers, round_size(settings.final_eval.top_k + 1))
+    search_s = n_left * trial_s / settings.workers
+    least, most = ((search_s + n * training_s / at_once) / 3600 for n, at_once in zip(bounds, n_at_once, strict=True))
+    return least, most
 
 
 def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None, *, n_left: int) -> tuple[int, int]:

@@ -18,7 +18,7 @@ from armscan.sweeps.scheduling.state import CONTROL, Limits
 from armscan.sweeps.storage.attribute_names import FINALIST, GENERATION, MEMBER, METRICS, RETRIED, SCHEDULE
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, training_of
-from armscan.sweeps.study.plan import final_trainings_left
+from armscan.sweeps.study.plan import final_trainings_left, hours_left
 from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import make_study
 from tests.sweeps.study.test_study import settings
@@ -192,6 +192,14 @@ def test_plan_counts_the_final_trainings_that_are_left(storage_uri):
     least, most = final_trainings_left(settings, final, n_left=0)
     assert 0 < n_missing <= least <= most
     assert f"at most {most} left" in final_line(settings, final, [9, 6])
+
+
+def test_plan_knows_that_a_round_of_the_race_occupies_few_workers(storage_uri):
+    settings = searched(storage_uri)[1].model_copy(update={"workers": 6})
+    fewest, most = n_trainings(settings.final_eval)
+    hours = hours_left(settings, None, n_left=12, trial_s=3600.0, training_s=1800.0)
+    # Two trainings at a time, as a round has.
+    assert hours == pytest.approx((2.0 + fewest * 0.5 / 6, 2.0 + most * 0.5 / 2))
 
 
 def test_control_that_is_the_best_is_the_result(storage_uri):
