@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -114,8 +115,8 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: in
         if missing := tuple((each, seed) for each, seed in due if seed not in scores[each]):
             # Not before the round is complete: what is run must not depend on which training ends first.
             return Race(sum(n_seeds.values()) - len(missing), missing, None, standings)
-        rows = {each: np.array([scores[each][seed] for seed in seeds[: n_seeds[each]]]) for each in left}
-        whole = [each for each in left if not np.isnan(rows[each]).any()]
+        rows = {each: [scores[each][seed] for seed in seeds[: n_seeds[each]]] for each in left}
+        whole = [each for each in left if not any(map(math.isnan, rows[each]))]
         if not whole:
             # Of the round before, which had no failure; none in the first.
             left = [each for each in left if standings[each].n_seeds]
@@ -123,7 +124,8 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: in
             break
         standings |= {each: replace(standings[each], has_failed=True) for each in left if each not in whole}
         left, counts = whole, np.array([n_seeds[each] for each in whole])
-        means, variances = moments([rows[each] for each in left])
+        of_left = np.array(list(zip_longest(*(rows[each] for each in left), fillvalue=0.0))).T
+        means, variances = moments(of_left, counts)
         standings |= zip(left, _standings(means, variances, counts), strict=True)
         n_more = min(round_size(len(left)), most - sum(n_seeds.values()), int((len(seeds) - counts).sum()))
         if n_more <= 0 or len(left) == 1 or is_decided(means, variances, counts):
@@ -146,15 +148,20 @@ def round_size(n_configurations: int) -> int:
     return max(2, n_configurations // 3)
 
 
-def moments(scores: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance of the scores of each configuration, shape (configurations,).
+def moments(scores: FloatArray, n_seeds: Counts) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance of the scores of each configuration, shape (..., configurations).
 
     Args:
-        scores: Scores of each configuration, one or more.
+        scores: Scores, shape (..., configurations, seeds).
+        n_seeds: Seeds of each configuration that count, the first ones, shape (..., configurations), 1 or more.
     """
-    own = np.array([each.var(ddof=1) if len(each) > 1 else math.nan for each in scores])
-    n_seeds, pooled = np.array(list(map(len, scores))), np.nanmean(own) if np.isfinite(own).any() else 0.0
-    return np.array([each.mean() for each in scores]), moderated_variances(np.nan_to_num(own), pooled, n_seeds)
+    counts = np.arange(scores.shape[-1]) < n_seeds[..., np.newaxis]
+    means = np.where(counts, scores, 0.0).sum(axis=-1) / n_seeds
+    squares = np.where(counts, (scores - means[..., np.newaxis]) ** 2, 0.0).sum(axis=-1)
+    # One seed says nothing of the variance.
+    own, is_known = squares / np.maximum(n_seeds - 1, 1), n_seeds > 1
+    pooled = own.sum(axis=-1, keepdims=True) / np.maximum(is_known.sum(axis=-1, keepdims=True), 1)
+    return means, moderated_variances(own, pooled, n_seeds)
 
 
 def moderated_variances(own: FloatArray, pooled: Any, n_seeds: Any) -> FloatArray:

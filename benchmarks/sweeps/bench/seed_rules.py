@@ -12,7 +12,7 @@ from scipy.special import chdtri, stdtrit
 from scipy.stats import rankdata
 
 from armscan.stats.bootstrap import LEVEL
-from armscan.sweeps.scheduling.race import PRIOR_DF, allotted, is_decided, moderated_variances, round_size
+from armscan.sweeps.scheduling.race import PRIOR_DF, allotted, is_decided, moderated_variances, moments, round_size
 from armscan.utils.arrays import FloatArray
 
 # Seeds that are simulated for each configuration: no rule takes more.
@@ -86,13 +86,13 @@ def allocation(min_seeds: int, mean_seeds: int, *, n_at_once: int | None = None,
         n_seeds, is_over = np.full((n_choices, n_configs), min_seeds), np.zeros(n_choices, bool)
         left = (mean_seeds - min_seeds) * n_configs
         while left > 0 and not is_over.all():
-            means, variances = _moments(scores, n_seeds)
+            means, variances = moments(scores, n_seeds)
             if may_end:
                 is_over |= is_decided(means, variances, n_seeds)
             n_more = min(n_at_once or round_size(n_configs), left)
             more = allotted(means, variances, n_seeds, n_more, most=n_most)
             n_seeds, left = np.where(is_over[:, np.newaxis], n_seeds, more), left - n_more
-        means, variances = _moments(scores, n_seeds)
+        means, variances = moments(scores, n_seeds)
         lower = means - stdtrit(PRIOR_DF + n_seeds - 1, (1 + LEVEL) / 2) * np.sqrt(variances / n_seeds)
         return Chosen(lower.argmax(axis=1), n_seeds.sum(axis=1))
 
@@ -156,12 +156,3 @@ def _worse_half(seen: FloatArray, is_in: Mask) -> Mask:
     means = np.where(is_in, seen.mean(axis=-1), -np.inf)
     n_kept = np.ceil(is_in.sum(axis=1, keepdims=True) / 2)
     return is_in & (rankdata(-means, method="ordinal", axis=1) <= n_kept)
-
-
-def _moments(scores: FloatArray, n_seeds: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-    """Return means and shrunk variances of configurations with two seeds or more, as in a race of armscan."""
-    is_seen = np.arange(scores.shape[-1]) < n_seeds[..., np.newaxis]
-    means = np.where(is_seen, scores, 0.0).sum(axis=-1) / n_seeds
-    squares = np.where(is_seen, (scores - means[..., np.newaxis]) ** 2, 0.0).sum(axis=-1)
-    own = squares / (n_seeds - 1)
-    return means, moderated_variances(own, own.mean(axis=1, keepdims=True), n_seeds)
