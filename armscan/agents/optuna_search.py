@@ -47,11 +47,10 @@ class OptunaSearch:
 
     def agent(self, setup: AgentSetup) -> OptunaAgent:
         """Make an agent."""
-        # Deferred, here and below: only who searches with Optuna waits for its import.
+        # Deferred, here and below: only a search with Optuna needs this slow import.
         import optuna
 
-        # A line for every study would be one an episode, and that of a missing accelerator of the GP's says nothing
-        # that a reader of the results needs.
+        # Optuna prints a line for every study, so for every episode, and warns that the GP sampler has no accelerator.
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         return OptunaAgent(setup.action_names, self)
 

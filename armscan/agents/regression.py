@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class Regression(Parameters):
     """A network that says from one observation where the optimal plane lies, fitted by squared error.
 
-    It is taught with the optimal planes of the training volumes themselves, which no other agent is shown: what it
-    reaches says how much of the task needs no search. The network is that of an actor, of the same size; only the mean
+    It is supervised with the labelled planes of the training volumes, as the plane finder is: what it reaches says how
+    much of the task needs no search. The network is that of an actor, of the same size; only the mean
     of its actions is used. With `own_planes_share` it learns from the planes that it would come to, as in DAgger (Ross
     et al. 2011, arXiv:1011.0686).
 

@@ -69,7 +69,7 @@ class ResidualLearner(PlaneFinderLearner):
         parameters: Parameters of the plane finder.
         setup: Environments, spaces, budget and seed of the agent.
         sac: Hyperparameters of SAC.
-        taught_env_steps: Number of environment steps of the teaching; the rest of the budget is for SAC.
+        pretraining_env_steps: Number of environment steps of the teaching; the rest of the budget is for SAC.
         correction_mm: Largest correction along the normal of the plane, and across, in mm.
         correction_deg: Largest correction of each of the two tilts of the plane, in degrees.
 
@@ -83,12 +83,12 @@ class ResidualLearner(PlaneFinderLearner):
         setup: AgentSetup,
         sac: SAC,
         *,
-        taught_env_steps: int,
+        pretraining_env_steps: int,
         correction_mm: float,
         correction_deg: float,
     ) -> None:
-        self._taught_env_steps = taught_env_steps
-        super().__init__(parameters, replace(setup, total_env_steps=taught_env_steps))
+        self._pretraining_env_steps = pretraining_env_steps
+        super().__init__(parameters, replace(setup, total_env_steps=pretraining_env_steps))
         finder, tilt = self._module, math.sin(math.radians(correction_deg))
         assert isinstance(finder, FinderModule), "only the teaching's own module is corrected"
         limits = torch.tensor([tilt, tilt, correction_mm, correction_mm], device=self._device)
@@ -97,13 +97,15 @@ class ResidualLearner(PlaneFinderLearner):
             make_envs=lambda n: ResidualVectorEnv(setup.make_envs(n), finder, limits, self._volumes),
             observation_space=feature_space(finder),
             action_names=COMPONENTS,
-            total_env_steps=setup.total_env_steps - taught_env_steps,
+            total_env_steps=setup.total_env_steps - pretraining_env_steps,
         )
         try:
             self._sac = sac.agent(sac_setup)
         except InvalidValueError as error:
             budget = "training.env_steps"
-            message = str(error).replace("agent.", "agent.sac.").replace(budget, f"{budget} - agent.taught_env_steps")
+            message = (
+                str(error).replace("agent.", "agent.sac.").replace(budget, f"{budget} - agent.pretraining_env_steps")
+            )
             raise InvalidValueError(message) from error
         self._network = self._module = self._corrected = ResidualModule(finder, self._sac.actor, limits)
 
@@ -124,7 +126,7 @@ class ResidualLearner(PlaneFinderLearner):
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
         """Learn for an epoch, which ends with the teaching if it is of that; see `Learner.learn`."""
-        if (n_left := self._taught_env_steps - super().n_env_steps) > 0:
+        if (n_left := self._pretraining_env_steps - super().n_env_steps) > 0:
             return super().learn(min(n_env_steps, n_left))
         if not self._corrected.is_corrected:
             self._sac.warm_up()

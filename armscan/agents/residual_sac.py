@@ -32,7 +32,7 @@ class ResidualSAC(PlaneFinder):
     sac: SAC
     """Hyperparameters of SAC; its environment steps with random actions are random corrections."""
 
-    taught_env_steps: int
+    pretraining_env_steps: int
     """Number of environment steps of the teaching; the rest of `training.env_steps` is for SAC."""
 
     correction_mm: float = number(2.0, above=0.0, at_most=50.0)
@@ -45,7 +45,7 @@ class ResidualSAC(PlaneFinder):
         super().__post_init__()
         if not isinstance(self.sac, SAC):
             raise InvalidValueError(f"agent.sac is {self.sac!r}, but it must be hyperparameters of SAC")
-        check_int("agent.taught_env_steps", self.taught_env_steps, at_least=1)
+        check_int("agent.pretraining_env_steps", self.pretraining_env_steps, at_least=1)
 
     def agent(self, setup: AgentSetup) -> ResidualLearner:
         """Make an agent that has learned nothing yet.
@@ -53,12 +53,12 @@ class ResidualSAC(PlaneFinder):
         Raises:
             InvalidValueError: If the environment does not show or allow what it needs, or the training is too short.
         """
-        if self.taught_env_steps >= setup.total_env_steps:
+        if self.pretraining_env_steps >= setup.total_env_steps:
             raise InvalidValueError(
-                f"agent.taught_env_steps is {self.taught_env_steps}, but it must be below training.env_steps = "
-                f"{setup.total_env_steps}, which leaves the rest to SAC"
+                f"agent.pretraining_env_steps is {self.pretraining_env_steps}, but it must be below "
+                f"training.env_steps = {setup.total_env_steps}, which leaves the rest to SAC"
             )
-        self.check(replace(setup, total_env_steps=self.taught_env_steps))
+        self.check(replace(setup, total_env_steps=self.pretraining_env_steps))
         import_tianshou()
         from armscan.agents.residual_learner import ResidualLearner
 
@@ -66,7 +66,7 @@ class ResidualSAC(PlaneFinder):
             self,
             setup,
             self.sac,
-            taught_env_steps=self.taught_env_steps,
+            pretraining_env_steps=self.pretraining_env_steps,
             correction_mm=self.correction_mm,
             correction_deg=self.correction_deg,
         )

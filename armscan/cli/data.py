@@ -188,7 +188,7 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolum
     from armscan.config.command_hints import armscan_command
     from armscan.volumes.markups import MARKUP_SUFFIX
 
-    headings = ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "as good\nover °, °, mm")
+    headings = ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "equally good\nrz, rx °, along mm")
     rows = []
     for _, plane in labelled:
         rz, rx, tx, ty = plane.action.to_array()

@@ -29,8 +29,8 @@ MISSING = "–"
 HOW = (
     "95 % intervals resample seeds, volumes and episodes. If all episodes of a rate are equal, its interval is "
     "Wilson's, which takes episodes as independent. Means include failed episodes; the IQM is the mean of their middle "
-    "half. On plane: the last plane is this close to the labelled one. Success: the reward accepts the last plane, "
-    "which may be another."
+    "half. On plane: share of episodes whose last plane is this close to the labelled one. Success: share of episodes "
+    "whose last plane the reward accepts; it may lie far from the labelled one."
 )
 COUNTS = {"episodes": "n_episodes", "started solved": "n_started_solved", "seeds": "n_seeds", "volumes": "n_volumes"}
 # A heading, and a cell for each line.

@@ -31,7 +31,7 @@ class SolvedCriterion:
 
     success_rate: float = 1.0
     mean_steps: float = 1.2
-    n_epochs: int = 2
+    n_epochs: int = 3
 
     def __post_init__(self) -> None:
         check_float("training.solved.success_rate", self.success_rate, at_least=0.0, at_most=1.0)

@@ -50,7 +50,7 @@ class Task(NamedTuple):
 
 
 TASKS = {
-    "sac_y": Task(("sweep=sac_y",), 1, 200.0),
+    "sac_y": Task(("sweep=sac_y",), 1, 250.0),
     "sac_zy": Task(("sweep=sac_zy",), 2, 600.0),
 }
 ARMSCAN, HYDRA, DEFAULT = "armscan", "hydra", "default"

@@ -25,7 +25,7 @@ def made(phantom, total_env_steps=200, rules=None, **changes):
     names = (*NAMES, "stop") if (rules or {}).get("ends") == "on_stop" else NAMES
     setup = setup_for(env_factory, phantom, action_names=names, total_env_steps=total_env_steps)
     sac = SAC(network=MLP((8,)), **SMALL_SAC)
-    learner = ResidualSAC(**SMALL | {"sac": sac, "taught_env_steps": N_TAUGHT} | changes).agent(setup)
+    learner = ResidualSAC(**SMALL | {"sac": sac, "pretraining_env_steps": N_TAUGHT} | changes).agent(setup)
     return learner, env_factory.make_env([phantom])
 
 
@@ -110,9 +110,12 @@ def test_learner_stops_where_its_plane_finder_does(phantom):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"taught_env_steps": 200}, "agent.taught_env_steps is 200, but it must be below training.env_steps = 200"),
-        ({"taught_env_steps": 0}, "agent.taught_env_steps is 0"),
-        ({"taught_env_steps": 3}, "look 12 times before the first gradient step"),
+        (
+            {"pretraining_env_steps": 200},
+            "agent.pretraining_env_steps is 200, but it must be below training.env_steps = 200",
+        ),
+        ({"pretraining_env_steps": 0}, "agent.pretraining_env_steps is 0"),
+        ({"pretraining_env_steps": 3}, "look 12 times before the first gradient step"),
         ({"correction_mm": 0.0}, "agent.correction_mm is 0"),
         ({"sac": None}, "agent.sac is None"),
     ],
@@ -123,7 +126,7 @@ def test_impossible_parameters_are_refused(phantom, changes, message):
 
 
 def test_what_sac_refuses_is_named_by_its_keys(phantom):
-    message = r"agent.sac.learning_starts is 900, .* below training.env_steps - agent.taught_env_steps = 176"
+    message = r"agent.sac.learning_starts is 900, .* below training.env_steps - agent.pretraining_env_steps = 176"
     with pytest.raises(InvalidValueError, match=message):
         made(phantom, sac=SAC(network=MLP((8,)), **SMALL_SAC | {"learning_starts": 900}))
     with pytest.raises(InstantiationException) as refused:

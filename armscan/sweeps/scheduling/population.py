@@ -31,7 +31,7 @@ Values = dict[str, Any]
 
 
 class PopulationSampler(RandomSampler):
-    """Settings of a population; draws the values of its first generation at random.
+    """Settings of a population, as a sampler of Optuna, which `study/sampler` requires; see `Population`.
 
     Args:
         population: Number of members, 2 or more.

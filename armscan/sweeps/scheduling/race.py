@@ -29,9 +29,9 @@ MOST_FACTOR = 4
 # Prior degrees of freedom: the weight of the pooled variance in that of each configuration, of which two or three seeds
 # say little.
 PRIOR_DF = 4.0
-# Least gap between two means, as a share of the largest mean and at least, and its square as the least variance: both
-# are divisors.
-LEAST_GAP, LEAST = 1e-6, 1e-100
+# Least gap between two means, as a share of the largest mean, and in any case: gaps are divisors. So are variances, to
+# which the square of the gap is added.
+MIN_RELATIVE_GAP, MIN_GAP = 1e-6, 1e-100
 
 UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 
@@ -203,7 +203,7 @@ def allotted(means: FloatArray, variances: FloatArray, n_seeds: Counts, n_more: 
         most: Most seeds of a configuration.
     """
     places, leader = np.arange(means.shape[-1]), means.argmax(axis=-1)[..., np.newaxis]
-    least_gap = np.maximum(LEAST_GAP * np.abs(means).max(axis=-1, keepdims=True), LEAST)
+    least_gap = np.maximum(MIN_RELATIVE_GAP * np.abs(means).max(axis=-1, keepdims=True), MIN_GAP)
     variances = variances + least_gap**2
     gaps = np.maximum(np.take_along_axis(means, leader, -1) - means, least_gap)
     shares = np.where(places == leader, 0.0, variances / gaps**2)

@@ -120,8 +120,8 @@ class Limits(Section):
         max_failures: Largest number of failed trials, without retried ones, 0 or more; one more ends the study.
             Default: 10.
         max_retries: Number of retries of a trial whose worker died, 0 or more. Default: 1.
-        timeout_hours: Wall time of the whole study, in hours, above 0. Default: None, no limit.
-        max_env_steps: Environment steps of all trials together, 1 or more. Default: None, no limit.
+        timeout_hours: Time in which at least one trial of the search runs, in hours, above 0. Default: None, no limit.
+        max_env_steps: Environment steps of all trials of the search, 1 or more. Default: None, no limit.
     """
 
     n_trials: int = Field(ge=1, description="a whole number of at least 1")

@@ -42,7 +42,7 @@ def note_run(
         folder: The folder of the study or the trial.
         figures: Figures in Markdown. Default: "", none.
     """
-    # Deferred: it takes a second, and only who works at a study needs it.
+    # Deferred: it takes a second, and only workers and launchers need it.
     from optuna_dashboard import get_note, save_note
 
     address = client.uri.rstrip("/") if client.uri.startswith("http") else LOCAL_UI

@@ -166,7 +166,7 @@ def _deliver(opened: OpenedStudy, tracked: TrackedRun, status: str) -> None:
     is_there = tracked.end(status, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
     left = []
     if is_there:
-        # Who may write into the folder of a study can execute code in it.
+        # Anyone who may write into the folder of a study can execute code in it.
         deliveries = sync(opened.folder, lambda _: opened.search.client, trust=True)
         left = [each.folder for each in deliveries if each.left]
         with contextlib.suppress(ArmscanError), no_retry():

@@ -41,7 +41,7 @@ class StudyMonitor:
         return True
 
     def is_alive(self) -> bool:
-        """Return whether the worker of any trial is."""
+        """Return whether the worker of any running trial is alive."""
         return any(
             not self._liveness[phase.name].is_dead(trial)
             for phase in self._opened.phases

@@ -100,10 +100,10 @@ def _print_power(power: pd.DataFrame) -> None:
     needed = needed_seeds(power)
     rows = [
         # Rounded down, so that no share reads as enough that is not.
-        (f"{difference:.0%}", *(f"{floor(100 * share)}%" for share in row), needed.get(float(difference), "") or "more")
+        (f"{difference:.0%}", *(f"{floor(100 * share)}%" for share in row), needed.get(float(difference), "") or "none")
         for difference, row in power.iterrows()
     ]
-    print(f"\n{markdown(['difference', *power.columns, 'seeds for 80 %'], rows)}", flush=True)
+    print(f"\n{markdown(['difference', *power.columns, 'first with 80 %'], rows)}", flush=True)
 
 
 def _print_keys(keys: dict[str, Key]) -> None:
