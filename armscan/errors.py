@@ -92,7 +92,7 @@ class DisplayError(ArmscanError, RuntimeError):
     """There is no screen, notebook or library that could show a window."""
 
 
-class AwayError(ArmscanError, RuntimeError):
+class ServiceUnavailableError(ArmscanError, RuntimeError):
     """A service cannot be reached, and is not waited for any longer."""
 
 
@@ -100,7 +100,7 @@ class TrackingError(ArmscanError, RuntimeError):
     """The tracking store cannot be reached or used."""
 
 
-class TrackingAwayError(TrackingError, AwayError):
+class TrackingUnavailableError(TrackingError, ServiceUnavailableError):
     """The tracking store cannot be reached, and is not waited for any longer."""
 
 
@@ -108,7 +108,7 @@ class StudyError(ArmscanError, RuntimeError):
     """A study cannot be started or resumed."""
 
 
-class StorageAwayError(StudyError, AwayError):
+class StorageUnavailableError(StudyError, ServiceUnavailableError):
     """The storage of a study cannot be reached, and is not waited for any longer."""
 
 

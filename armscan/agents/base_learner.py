@@ -77,7 +77,7 @@ class SupervisedLearner(BaseLearner):
 
     def __init__(self, network: nn.Module, lr: float, envs: Any, setup: AgentSetup) -> None:
         super().__init__(setup)
-        self._envs, self._teacher = envs, teacher_of(envs)
+        self._envs, self._labelled_envs = envs, labelled_envs_of(envs)
         self._network = network.to(self._device)
         self._optimiser = torch.optim.Adam(self._network.parameters(), lr=lr)
         self._n_env_steps = 0
@@ -157,7 +157,7 @@ class SupervisedLearner(BaseLearner):
         self._n_env_steps, self._n_epochs = state["n_env_steps"], state["n_epochs"]
 
 
-def teacher_of(envs: Any) -> ArmscanVectorEnv:
+def labelled_envs_of(envs: Any) -> ArmscanVectorEnv:
     """Return the environments that tell a supervised learner the labelled planes."""
     assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
     return envs.unwrapped

@@ -52,13 +52,13 @@ class CompiledSAC(sac.SAC[Any]):
         arguments: Keyword arguments of Tianshou's SAC.
 
     Attributes:
-        why_tianshou: Reason why Tianshou computes the updates; None if they are compiled.
+        fallback_reason: Reason why Tianshou computes the updates; None if they are compiled.
     """
 
     def __init__(self, *, compute: Compute, replay: ReplayBuffer, **arguments: Any) -> None:
         super().__init__(**arguments)
-        self.why_tianshou = why_tianshou(self, compute, replay)
-        if self.why_tianshou is not None:
+        self.fallback_reason = fallback_reason(self, compute, replay)
+        if self.fallback_reason is not None:
             return
         optimisers: list[Any] = [self.policy_optim, self.critic_optim, self.critic2_optim]
         self._adams = [AdamVectors(each._optim) for each in optimisers]
@@ -72,7 +72,7 @@ class CompiledSAC(sac.SAC[Any]):
 
     def update(self, buffer: ReplayBuffer, sample_size: int | None) -> Any:
         """Take a gradient step; see Tianshou's."""
-        if self.why_tianshou is None and sample_size:
+        if self.fallback_reason is None and sample_size:
             return self.update_repeatedly(buffer, sample_size, 1)
         return super().update(buffer, sample_size)
 
@@ -129,7 +129,7 @@ class CompiledSAC(sac.SAC[Any]):
         return self._layers
 
 
-def why_tianshou(algorithm: sac.SAC[Any], compute: Compute, replay: ReplayBuffer) -> str | None:
+def fallback_reason(algorithm: sac.SAC[Any], compute: Compute, replay: ReplayBuffer) -> str | None:
     """Return why the updates of an algorithm are left to Tianshou; None if they can be compiled."""
     optimisers: list[Any] = [*algorithm._optimizers]
     entropy = [algorithm.alpha._optim] if isinstance(algorithm.alpha, sac.AutoAlpha) else []
@@ -138,7 +138,7 @@ def why_tianshou(algorithm: sac.SAC[Any], compute: Compute, replay: ReplayBuffer
         return "its networks are not fully connected with ReLU"
     if type(replay) is not Replay:
         return f"its replay buffer is {type(replay).__name__}"
-    if not compute.is_plain:
+    if not compute.is_float32_on_cpu:
         return f"it computes with {compute.precision} on {compute.torch_device}"
     if compute.compile:
         return "compute.compile=true"

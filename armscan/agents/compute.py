@@ -47,7 +47,7 @@ class Compute:
         return "cuda" if self.device == "cuda" or (self.device == "auto" and _has_cuda()) else "cpu"
 
     @property
-    def is_plain(self) -> bool:
+    def is_float32_on_cpu(self) -> bool:
         """Return whether tensors are on the CPU in 32 bits, so that a plain copy of a network computes the same."""
         return self.torch_device == "cpu" and self.precision == "float32"
 

@@ -60,7 +60,7 @@ class Inference:
 
     def __init__(self, actor: nn.Module, bounded: Bounded, compute: Compute, *, is_sampling: bool = False) -> None:
         self._actor, self._bounded, self._is_sampling = actor, bounded, is_sampling
-        self._layers = _layers_of(actor) if compute.is_plain and not is_sampling else None
+        self._layers = _layers_of(actor) if compute.is_float32_on_cpu and not is_sampling else None
         self._generators: list[torch.Generator] = []
 
     def begin(self, seeds: Sequence[int]) -> None:

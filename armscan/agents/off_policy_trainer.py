@@ -34,7 +34,7 @@ class EvenUpdatesTrainer(OffPolicyTrainer):
         n_env_steps = collector.collect_step - self._learning_starts
         n_due = self._n_due(n_env_steps) - self._n_due(n_env_steps - collect_stats.n_collected_steps)
         stats = TrainingStats()
-        if n_due and self.algorithm.why_tianshou is None:
+        if n_due and self.algorithm.fallback_reason is None:
             stats = self.algorithm.update_repeatedly(collector.buffer, self.params.batch_size, n_due)
             # Tianshou copies them deeply, and smooths losses for its progress bar.
             self._logger.log_update_data(vars(stats), self._current_update_step)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from armscan.agents.base_learner import SupervisedLearner, diverged, teacher_of
+from armscan.agents.base_learner import SupervisedLearner, diverged, labelled_envs_of
 from armscan.agents.finder_parameters import FinderParameters
 from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork, PlaneModule, looks_of
 from armscan.agents.plane_geometry import common_geometry
@@ -57,7 +57,7 @@ class PlaneFinderLearner(SupervisedLearner):
             hidden_sizes=finder.hidden_sizes,
         )
         sure = None if finder.sure_mm is None or finder.sure_deg is None else (finder.sure_mm, finder.sure_deg)
-        geometry = common_geometry(teacher_of(envs).rules, finder.n_looks)
+        geometry = common_geometry(labelled_envs_of(envs).rules, finder.n_looks)
         module = FinderModule(
             network,
             geometry,
@@ -91,7 +91,7 @@ class PlaneFinderLearner(SupervisedLearner):
 
     def _volumes(self, rng: np.random.Generator, n_episodes: int) -> dict[str, Any] | None:
         """Draw the volume of each episode where phantoms have a share of them; None leaves that to the environments."""
-        phantom_share, names = self._finder.phantom_share, self._teacher.rules.names
+        phantom_share, names = self._finder.phantom_share, self._labelled_envs.rules.names
         groups = [[name for name in names if name.startswith(PHANTOM) == of_phantoms] for of_phantoms in (True, False)]
         if phantom_share is None or not all(groups):
             return None
@@ -169,7 +169,9 @@ class PlaneFinderLearner(SupervisedLearner):
 
     def _optima(self, envs: Any) -> Tensor:
         """Return the labelled planes of the current episodes, shape (num_envs, 4)."""
-        optima = torch.as_tensor(teacher_of(envs).optimal_actions[:, :4], dtype=torch.float32, device=self._device)
+        optima = torch.as_tensor(
+            labelled_envs_of(envs).optimal_actions[:, :4], dtype=torch.float32, device=self._device
+        )
         planes: Tensor = self._module.geometry.planes(optima)
         return planes
 

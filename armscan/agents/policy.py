@@ -40,7 +40,7 @@ class Policy(nn.Module):
         self._bounded = bounded
         self.differs = "the agent draws its actions, of which this is the most likely one" if is_sampling else None
         """Reason why the learner's own `act` may give other numbers; None if it gives the same."""
-        if self.differs is None and not compute.is_plain:
+        if self.differs is None and not compute.is_float32_on_cpu:
             self.differs = f"the agent has computed with {compute.precision} on {compute.torch_device}"
 
     def forward(self, observations: Batch) -> torch.Tensor:

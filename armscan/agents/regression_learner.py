@@ -83,7 +83,7 @@ class RegressionLearner(SupervisedLearner):
 
     def _step(self, observations: Observed, rng: np.random.Generator) -> Observed:
         """Store the observations, starts of episodes included; return those of the next planes."""
-        self._examples.add(observations, self._teacher.optimal_actions)
+        self._examples.add(observations, self._labelled_envs.optimal_actions)
         observations, _, terminated, truncated, _ = self._envs.step(self._next_planes(observations, rng))
         self._n_env_steps += self._envs.num_envs
         if (has_ended := terminated | truncated).any():

@@ -106,7 +106,7 @@ def _fill_input(layers: Layers, obs: Floats, actions: Floats) -> None:
 
 
 @fast_njit
-def _judge(critic: Floats, layers: Layers, values: Floats) -> int:
+def _q_values(critic: Floats, layers: Layers, values: Floats) -> int:
     """Fill a critic's values, shape (n, 1); returns where the weights of its head start."""
     n: int = values.shape[0]
     head: int = forward(critic, layers, n)
@@ -125,14 +125,14 @@ def _critic_gradient(critic: Weights, layers: Layers, head: int, d_values: Float
 
 
 @fast_njit
-def _update_critic(critic: Weights, layers: Layers, adam: Adam, returns: Floats) -> float:
+def _update_critic(critic: Weights, layers: Layers, adam: Adam, td_targets: Floats) -> float:
     """Take a gradient step of a critic; returns its loss."""
-    n = returns.size
+    n = td_targets.size
     values, d_values = np.empty((n, 1), F), np.empty((n, 1), F)
-    head = _judge(critic.values, layers, values)
+    head = _q_values(critic.values, layers, values)
     loss = 0.0
     for i in range(n):
-        error = values[i, 0] - returns[i]
+        error = values[i, 0] - td_targets[i]
         loss += error * error
         d_values[i, 0] = F(2.0) * error / F(n)
     _critic_gradient(critic, layers, head, d_values, False)
@@ -151,7 +151,7 @@ def _update_actor(
     values, d_values, d_actions = np.empty((2, n, 1), F), np.ones((n, 1), F), np.empty((2, n, n_action), F)
     _fill_input(critic_layers, obs, drawn.actions)
     for k in range(2):
-        head = _judge(agent.critics[k].values, critic_layers, values[k])
+        head = _q_values(agent.critics[k].values, critic_layers, values[k])
         _critic_gradient(agent.critics[k], critic_layers, head, d_values, True)
         d_x = layer_view(critic_layers.gradient, critic_layers.sizes, n, 0)
         for i in range(n):
@@ -207,7 +207,7 @@ def _update_coefficient(entropy: Entropy, mean_log_prob: float) -> float:
 
 
 @fast_njit
-def _returns(
+def _td_targets(
     transitions: Transitions,
     index: Ints,
     obs_next: Floats,
@@ -217,15 +217,15 @@ def _returns(
     alpha: np.float32,
 ) -> Floats:
     """Return the critics' targets for a batch, from the actions drawn after it."""
-    values, returns = np.empty((2, index.size, 1), F), np.empty(index.size, F)
+    values, td_targets = np.empty((2, index.size, 1), F), np.empty(index.size, F)
     _fill_input(layers, obs_next, drawn.actions)
     for k in range(2):
-        _judge(agent.targets[k], layers, values[k])
+        _q_values(agent.targets[k], layers, values[k])
     for i in range(index.size):
         future = min(values[0, i, 0], values[1, i, 0]) - alpha * drawn.log_prob[i]
         is_over = transitions.terminated[index[i]]
-        returns[i] = transitions.rew[index[i]] + (0.0 if is_over else agent.gamma * future)
-    return returns
+        td_targets[i] = transitions.rew[index[i]] + (0.0 if is_over else agent.gamma * future)
+    return td_targets
 
 
 @fast_njit
@@ -264,12 +264,12 @@ def update(
         alpha = F(np.exp(agent.entropy.log_alpha.values[0]))
         _take(transitions.obs_next, index, obs)
         drawn = _act(agent.actor, actor_layers, noise[step, 0])
-        returns = _returns(transitions, index, obs, drawn, agent, critic_layers, alpha)
+        td_targets = _td_targets(transitions, index, obs, drawn, agent, critic_layers, alpha)
         _take(transitions.obs, index, obs)
         _take(transitions.act, index, actions)
         _fill_input(critic_layers, obs, actions)
         for k in range(2):
-            losses[step, 1 + k] = _update_critic(agent.critics[k], critic_layers, agent.adams[1 + k], returns)
+            losses[step, 1 + k] = _update_critic(agent.critics[k], critic_layers, agent.adams[1 + k], td_targets)
         losses[step, 0], mean_log_prob = _update_actor(agent, actor_layers, critic_layers, noise[step, 1], alpha)
         losses[step, 3] = _update_coefficient(agent.entropy, mean_log_prob)
         losses[step, 4] = np.exp(agent.entropy.log_alpha.values[0])

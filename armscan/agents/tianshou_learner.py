@@ -100,7 +100,7 @@ class TianshouLearner(BaseLearner):
         """Return how gradient steps are computed: `compiled`, or `Tianshou` with the reason, if there is one."""
         if not isinstance(self._algorithm, CompiledSAC):
             return "Tianshou"
-        reason = self._algorithm.why_tianshou
+        reason = self._algorithm.fallback_reason
         return "compiled" if reason is None else f"Tianshou, because {reason}"
 
     @property

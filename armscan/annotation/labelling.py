@@ -8,7 +8,7 @@ from pathlib import Path
 from PIL import Image
 
 from armscan.anatomy import SUCCESS_THRESHOLD, FoundPlane, LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
-from armscan.envs.rendering import Beside, draw_plane, view_of
+from armscan.envs.rendering import ReferencePlane, draw_plane, view_of
 from armscan.errors import InvalidValueError, OptimalPlaneError, listed
 from armscan.utils.files import atomic_write
 from armscan.volumes import (
@@ -120,7 +120,7 @@ def _make_folder(folder: Path) -> None:
 
 def _write_picture(path: Path, volume: LabelVolume, action: ManipulatorAction, tissues: Tissues) -> None:
     """Draw the slice, and the plane from two sides; beside it the plane that the volume had before, if any."""
-    beside = None if volume.optimal_action is None else Beside(volume.optimal_action, "former plane")
+    beside = None if volume.optimal_action is None else ReferencePlane(volume.optimal_action, "former plane")
     picture = Image.fromarray(draw_plane(volume, action, view_of(volume, action, tissues=tissues), beside=beside))
     try:
         atomic_write(path, lambda file: picture.save(file, "PNG"))

@@ -64,7 +64,7 @@ def report(study: str | None, runs: str | None, out: Path | None, watch: bool, s
 
 def _watch(write: Callable[[int | None], Path]) -> None:
     """Rewrite a report until Ctrl-C, and then for the last time."""
-    from armscan.errors import StorageAwayError
+    from armscan.errors import StorageUnavailableError
     from armscan.utils.retry import no_retry
 
     print(f"look at   {write(WATCH_S)}", f"it is written every {WATCH_S} s; Ctrl-C ends that", sep="\n", flush=True)
@@ -72,7 +72,7 @@ def _watch(write: Callable[[int | None], Path]) -> None:
         while True:
             time.sleep(WATCH_S)
             # What is there stays as it is until the storage is back.
-            with contextlib.suppress(StorageAwayError), no_retry():
+            with contextlib.suppress(StorageUnavailableError), no_retry():
                 write(WATCH_S)
     finally:
         write(None)

@@ -98,7 +98,7 @@ def make_armscan_vector_env(num_envs: int = 1, volumes: Volumes = None, **kwargs
     return _wrapped(ArmscanVectorEnv(num_envs, volumes, **kwargs), **wrappers)
 
 
-def side_by_side(env: Env, num_envs: int) -> VectorEnv[Any, Any, Any]:
+def vectorise(env: Env, num_envs: int) -> VectorEnv[Any, Any, Any]:
     """Return many environments without autoreset that play by the rules of one, with its wrappers.
 
     Args:
@@ -112,7 +112,7 @@ def side_by_side(env: Env, num_envs: int) -> VectorEnv[Any, Any, Any]:
         return ArmscanVectorEnv.sharing(env.rules, num_envs)
     if isinstance(env, FrameStack | BestActionMemory):
         form = VectorFrameStack if isinstance(env, FrameStack) else VectorBestActionMemory
-        wrapped: VectorEnv[Any, Any, Any] = form(side_by_side(env.env, num_envs), **env.arguments)
+        wrapped: VectorEnv[Any, Any, Any] = form(vectorise(env.env, num_envs), **env.arguments)
         return wrapped
     raise InvalidValueError(
         f"env is {env!r}, but it must be an ArmscanEnv, alone or in the wrappers FrameStack and BestActionMemory"

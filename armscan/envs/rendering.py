@@ -41,7 +41,7 @@ TITLE_GAP = 7
 Box = tuple[int, int, int, int]
 
 
-class Beside(NamedTuple):
+class ReferencePlane(NamedTuple):
     """Another plane to draw beside the current one, and its name, such as `optimal plane`."""
 
     action: ManipulatorAction
@@ -65,7 +65,7 @@ def draw_frame(episode: Episode) -> NDArray[np.uint8]:
         episode.plane,
         episode.view,
         transform=scene.transform,
-        beside=Beside(scene.optimum, "optimal plane"),
+        beside=ReferencePlane(scene.optimum, "optimal plane"),
         history=History(episode.rewards, range(rules.max_steps + 1), -rules.success_threshold, "reward by step"),
         caption=f"step {episode.n_steps}",
     )
@@ -77,7 +77,7 @@ def draw_plane(
     view: View,
     *,
     transform: RigidTransform | None = None,
-    beside: Beside | None = None,
+    beside: ReferencePlane | None = None,
     history: History | None = None,
     caption: str = "",
 ) -> NDArray[np.uint8]:
@@ -154,7 +154,7 @@ def _write_facts(
     volume: LabelVolume,
     plane: ManipulatorAction,
     view: View,
-    beside: Beside | None,
+    beside: ReferencePlane | None,
     caption: str,
 ) -> None:
     x, y = FACTS_AT
@@ -186,7 +186,7 @@ def _shortened(line: str) -> str:
     return shortened
 
 
-def _write_legend(draw: ImageDraw.ImageDraw, beside: Beside | None) -> None:
+def _write_legend(draw: ImageDraw.ImageDraw, beside: ReferencePlane | None) -> None:
     x, y = LEGEND_AT
     legend = [("current plane", PLANE_INK)] + ([(beside.name, OPTIMUM_INK)] if beside else [])
     legend += [(name, tuple(TISSUE_INKS[label].tolist())) for label, name in LABEL_NAMES.items() if label > 0]

@@ -105,7 +105,7 @@ def resume_run(
     """Resume a run; see `resume`. The printed lines of a multirun's job begin with its label."""
     folder = _folder_of(client.get_run(run_id))
     with folder_lock(folder):
-        # What it has left because the store was away; it may have ended just before the folder was free.
+        # What it has left because the store was unavailable; it may have ended just before the folder was free.
         sync(folder, lambda _: client)
         run = client.get_run(run_id)
         _check_unfinished(run)

@@ -80,7 +80,7 @@ def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: s
         notes: Notes on the table, such as missing folds.
 
     Raises:
-        TrackingError: If the store is away.
+        TrackingError: If the store is unavailable.
     """
     from mlflow.entities import Metric
 

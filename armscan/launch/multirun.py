@@ -196,7 +196,7 @@ def _close_parent(
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
     note_end(folder, word["run_id"], word["tracking"]["uri"], status, tags)
     store, experiment_id = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
-    # With what jobs have left because the store was away.
+    # With what jobs have left because the store was unavailable.
     sync(folder, lambda _: store)
     below = store.children(experiment_id, word["run_id"])
     # Others may have put a run of theirs below it.

@@ -59,7 +59,7 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
         if each.add(search.storage, search.study):
             print_sentence(printable(each.message))
     for phase in opened.phases:
-        if phase.scheduler.go_on():
+        if phase.scheduler.resume():
             print(f"{phase.name}: was stopped, and resumes")
         if n_failed := phase.scheduler.reset_failures():
             print(f"{phase.name}: {n_failed} failures before this start are ignored")

@@ -1,4 +1,4 @@
-"""An MLflow store that can be away for a while."""
+"""An MLflow store that can be unavailable for a while."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from armscan.config.credentials import mask_passwords
-from armscan.errors import TrackingAwayError
+from armscan.errors import TrackingUnavailableError
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.tags import PARENT_TAG
 from armscan.utils.retry import RetryPolicy
@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 # What MLflow says of a store that it cannot reach, of one that fails, and of what is not there.
-AWAY, NOT_THERE = ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "REQUEST_LIMIT_EXCEEDED"), "RESOURCE_DOES_NOT_EXIST"
+UNAVAILABLE, NOT_THERE = (
+    ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "REQUEST_LIMIT_EXCEEDED"),
+    "RESOURCE_DOES_NOT_EXIST",
+)
 MAX_REASON_CHARS = 300
 # A loaded server takes longer for more than it is waited for.
 PER_PAGE = 100
@@ -58,7 +61,9 @@ class TrackingStore:
         self._retry_policy = None
         if retry_s is not None:
             named = f"tracking.uri is {uri!r}"
-            self._retry_policy = RetryPolicy("the tracking store", named, why_away, TrackingAwayError, retry_s=retry_s)
+            self._retry_policy = RetryPolicy(
+                "the tracking store", named, unavailable_reason, TrackingUnavailableError, retry_s=retry_s
+            )
         # Which waits for nothing.
         self.mlflow = self._asked(connect)
 
@@ -68,7 +73,7 @@ class TrackingStore:
         return partial(self._asked, getattr(self.mlflow, name))
 
     def create_run(self, experiment_id: str, *, name: str, tags: Mapping[str, str]) -> Run:
-        """Make a run, and only one, also where the store goes away before it has answered."""
+        """Make a run, and only one, also where the store becomes unavailable before it has answered."""
         made, n_asked = uuid.uuid4().hex, 0
 
         def create() -> Run:
@@ -98,9 +103,11 @@ class TrackingStore:
         try:
             return asked()
         except Exception as error:
-            if (reason := why_away(error)) is None:
+            if (reason := unavailable_reason(error)) is None:
                 raise
-            raise TrackingAwayError(f"tracking.uri is {self.uri!r}, but this store cannot be used: {reason}") from error
+            raise TrackingUnavailableError(
+                f"tracking.uri is {self.uri!r}, but this store cannot be used: {reason}"
+            ) from error
 
 
 def all_pages(ask: Callable[..., PagedList[T]]) -> list[T]:
@@ -114,7 +121,7 @@ def all_pages(ask: Callable[..., PagedList[T]]) -> list[T]:
             return found
 
 
-def why_away(error: BaseException) -> str | None:
+def unavailable_reason(error: BaseException) -> str | None:
     """Return why a store cannot be reached or written to for now; None if an error says anything else."""
     from mlflow.exceptions import MlflowException
     from requests import RequestException
@@ -122,14 +129,14 @@ def why_away(error: BaseException) -> str | None:
 
     match error:
         case MlflowException(error_code=code):
-            is_away = code in AWAY
+            is_unavailable = code in UNAVAILABLE
         case RequestException(response=response) if response is not None:
-            is_away = response.status_code >= 500
+            is_unavailable = response.status_code >= 500
         case DBAPIError():
-            is_away = error.connection_invalidated or isinstance(error, OperationalError)
+            is_unavailable = error.connection_invalidated or isinstance(error, OperationalError)
         case _:
-            is_away = isinstance(error, OSError)
-    return reason_in(error) if is_away else None
+            is_unavailable = isinstance(error, OSError)
+    return reason_in(error) if is_unavailable else None
 
 
 def reason_in(error: BaseException) -> str:

@@ -32,7 +32,7 @@ PRUNED = " (pruned)"
 # No run of armscan has so many runs above it; a stranger's may be above themselves.
 MAX_DEPTH = 8
 MAX_REASON_CHARS, MAX_DIGITS = 5000, 9
-# For a store that is away, where somebody waits for this process to end.
+# For a store that is unavailable, where somebody waits for this process to end.
 SHORT_WAIT_S = 2.0
 
 
@@ -40,7 +40,7 @@ class TrackedRun:
     """A run in MLflow, and the training callback that fills it.
 
     Everything logged goes to the run's outbox and is uploaded in the background, so training never waits for the store.
-    `armscan runs sync FOLDER` uploads what a store that was away has missed.
+    `armscan runs sync FOLDER` uploads what a store that was unavailable has missed.
 
     Args:
         store: Store of the run.
@@ -126,7 +126,7 @@ class TrackedRun:
             histories = {name: store.get_metric_history(run_id, name) for name in run.data.metrics}
             logged = {(name, point.step) for name, points in histories.items() for point in points}
         tracked = cls(store, outbox, name=run.info.run_name or run_id, logged=logged)
-        tracked.go_on()
+        tracked.resume()
         tracked.set_tags(dict(tags) | changed | {"resumed": str(n_resumed)})
         tracked._log_config(config)
         if (diff := source().diff) and f"resumed.{DIFF_SUM}" in changed:
@@ -241,7 +241,7 @@ class TrackedRun:
         except OSError as failure:
             log(f"run {self.run_id}: its end is not noted ({failure.strerror})")
 
-    def go_on(self) -> None:
+    def resume(self) -> None:
         """Mark the run as RUNNING again, also if it was ended after its last process had died."""
         self._is_resumed = True
         self._add(status=("RUNNING", now_ms()))
@@ -274,7 +274,7 @@ class TrackedRun:
         self._outbox.close()
         if failure is not None:
             again = armscan_command("runs", "sync", str(self._outbox.folder))
-            how = "delivers the rest" if self._uploader.is_away else "delivers the rest once the store takes it"
+            how = "delivers the rest" if self._uploader.is_unavailable else "delivers the rest once the store takes it"
             log(f"run {self.run_id}: {self._store.uri} has not got all of it ({failure}): {again} {how}")
         return self._is_delivered
 

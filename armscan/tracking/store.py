@@ -29,7 +29,7 @@ LOCK_TIMEOUT_S = 120
 MAX_TEXT_CHARS, N_SHOWN_CHARS = 500, 40
 # Where there is no configuration that says it.
 USUAL_WAIT_S = 120.0
-# A server that is away should be said to be away within seconds, not after minutes of retries.
+# A server that is unavailable should be said to be so within seconds, not after minutes of retries.
 DEFAULTS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
@@ -189,7 +189,7 @@ def store_errors(uri: str) -> Iterator[None]:
     # The making of a new database is told table by table.
     for library in ("alembic", "mlflow"):
         logging.getLogger(library).setLevel(logging.WARNING)
-    # What they tell of a store that is away is raised as well.
+    # What they tell of a store that is unavailable is raised as well.
     for library in ("mlflow.store.db.utils", "urllib3.connectionpool"):
         logging.getLogger(library).setLevel(logging.CRITICAL)
     try:

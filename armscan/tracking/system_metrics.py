@@ -13,7 +13,7 @@ PREFIX = "system/"
 class SystemMetrics:
     """A thread that looks at CPU, memory, disk, network and GPUs, every so often and once at its end.
 
-    MLflow's own thread would ask the store each time, and write there itself: it ends where the store is away.
+    MLflow's own thread would ask the store each time, and write there itself: it ends where the store is unavailable.
 
     Args:
         take: Function that takes the metrics by name, and the number of the measurement, which is MLflow's step.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from armscan.config.trust import TRUST
 from armscan.errors import TrackingError, UntrustedError
-from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, why_away
+from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, unavailable_reason
 from armscan.tracking.logged_model import deliver_model
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
 from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, shortened
@@ -46,9 +46,9 @@ class Uploader:
         self._thread.start()
 
     @property
-    def is_away(self) -> bool:
+    def is_unavailable(self) -> bool:
         """Return whether the store is unavailable, as far as is known, rather than refusing entries."""
-        return self._failure is None or why_away(self._failure) is not None
+        return self._failure is None or unavailable_reason(self._failure) is not None
 
     def wake(self) -> None:
         """Signal that an entry was added."""
@@ -67,7 +67,7 @@ class Uploader:
         """
         until_s, is_told = time.monotonic() + wait_s, False
         while not self._is_done.wait(min(LOOK_S, max(0.0, until_s - time.monotonic()))):
-            if not self.is_away or time.monotonic() > until_s:
+            if not self.is_unavailable or time.monotonic() > until_s:
                 break
             if self._failure is not None and not is_told:
                 is_told = True
@@ -111,8 +111,8 @@ class Uploader:
         """Log once that the store is unavailable or refuses entries, and once that it is back."""
         before, self._failure = self._failure, failure
         if failure is not None and before is None:
-            is_away = why_away(failure) is not None
-            said = "cannot be reached or written to" if is_away else "refuses what it is given"
+            is_unavailable = unavailable_reason(failure) is not None
+            said = "cannot be reached or written to" if is_unavailable else "refuses what it is given"
             log(f"{self._store.uri} {said} ({reason_in(failure)}): what is tracked is kept in {self._outbox.file}")
         elif failure is None and before is not None:
             log(f"{self._store.uri} is back: everything is delivered")

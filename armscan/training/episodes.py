@@ -15,7 +15,7 @@ from armscan.agents.protocols import Agent
 from armscan.anatomy import nerve_area_error, tissue_dice
 from armscan.envs import ArmscanVectorEnv
 from armscan.envs.episode import Episode
-from armscan.envs.factory import side_by_side
+from armscan.envs.factory import vectorise
 from armscan.envs.history import rows_of
 from armscan.envs.vector_env import reset_each, step_each
 from armscan.stats.on_plane import ON_PLANE, OnPlane
@@ -44,7 +44,7 @@ def evaluate(
     names = list(env.get_wrapper_attr("volumes"))
     count = check_int("episodes", n_episodes, at_least=1)
     planned = [(names[i % len(names)], seed + i) for i in range(count)]
-    envs, player = side_by_side(env, min(count, MOST_SIDE_BY_SIDE)), batch_agent(agent)
+    envs, player = vectorise(env, min(count, MOST_SIDE_BY_SIDE)), batch_agent(agent)
     batches = (planned[i : i + envs.num_envs] for i in range(0, count, envs.num_envs))
     return Evaluation(tuple(chain.from_iterable(_play_all(player, envs, batch) for batch in batches)), on_plane)
 

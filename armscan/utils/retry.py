@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
-from armscan.errors import AwayError
+from armscan.errors import ServiceUnavailableError
 from armscan.utils.log import log
 
 T = TypeVar("T")
@@ -36,7 +36,7 @@ class RetryPolicy:
         what: str,
         named: str,
         reason: Callable[[BaseException], str | None],
-        error: type[AwayError],
+        error: type[ServiceUnavailableError],
         *,
         retry_s: float | None = None,
     ) -> None:
@@ -53,20 +53,20 @@ class RetryPolicy:
             operate: Operation to call; it may be repeated although it succeeded, if only its answer was lost.
 
         Raises:
-            AwayError: If the service stays unavailable, or this thread is in `no_retry`.
+            ServiceUnavailableError: If the service stays unavailable, or this thread is in `no_retry`.
         """
         try:
             return operate()
         except Exception as error:
-            reason, away = self._reason(error), error
+            reason, cause = self._reason(error), error
             if reason is None:
                 raise
         if getattr(_this_thread, "no_retry", False):
-            raise self._error(f"{self._named}, but it is away: {reason}") from away
+            raise self._error(f"{self._named}, but it is unavailable: {reason}") from cause
         with self._told(reason):
-            return self._waited(operate, reason, away)
+            return self._waited(operate, reason, cause)
 
-    def _waited(self, operate: Callable[[], T], reason: str, away: Exception) -> T:
+    def _waited(self, operate: Callable[[], T], reason: str, cause: Exception) -> T:
         until_s, pause_s = time.monotonic() + self._retry_s, FIRST_PAUSE_S
         while not self._is_over and time.monotonic() < until_s:
             time.sleep(pause_s)
@@ -77,11 +77,11 @@ class RetryPolicy:
                 told = self._reason(error)
                 if told is None:
                     raise
-                reason, away = told, error
+                reason, cause = told, error
         # After one timeout nothing is retried: cleaning up would take as long again.
         self._is_over = True
         long = f"{self._retry_s:g} s" if self._retry_s < 60 else f"{self._retry_s / 60:g} minutes"
-        raise self._error(f"{self._named}, but it has been away for {long}: {reason}") from away
+        raise self._error(f"{self._named}, but it has been unavailable for {long}: {reason}") from cause
 
     @contextmanager
     def _told(self, reason: str) -> Iterator[None]:
@@ -89,11 +89,11 @@ class RetryPolicy:
         with self._changing:
             self._n_waiting += 1
             if self._n_waiting == 1 and not self._is_over:
-                log(f"{self._what} is away ({reason}): waiting")
+                log(f"{self._what} is unavailable ({reason}): waiting")
         is_back = True
         try:
             yield
-        except (AwayError, KeyboardInterrupt):
+        except (ServiceUnavailableError, KeyboardInterrupt):
             is_back = False
             raise
         finally:
@@ -105,7 +105,7 @@ class RetryPolicy:
 
 @contextmanager
 def no_retry() -> Iterator[None]:
-    """Return a context in which this thread does not retry: `RetryPolicy.call` raises `AwayError` at once."""
+    """Return a context in which this thread does not retry: `RetryPolicy.call` raises its error at once."""
     before = getattr(_this_thread, "no_retry", False)
     _this_thread.no_retry = True
     try:

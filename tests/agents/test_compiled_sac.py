@@ -125,7 +125,7 @@ def test_compiled_updates_agree_with_those_of_tianshou(hidden_sizes, n_obs, n_ac
     shape = {"hidden_sizes": hidden_sizes, "n_obs": n_obs, "n_action": n_action, "alpha": alpha}
     replay = filled_replay(n_obs, n_action)
     ours, theirs = compiled(replay, **shape), algorithm(sac.SAC, **shape)
-    assert ours.why_tianshou is None
+    assert ours.fallback_reason is None
     for seed in range(10):
         ten, their_ten = (updated(each, replay, 10, batch_size=batch_size, seed=seed) for each in (ours, theirs))
         for one, other in zip(ten, their_ten, strict=True):
@@ -236,7 +236,7 @@ def test_either_update_goes_on_from_the_others_state():
     for k in range(3):
         for each in (ours, theirs):
             updated(each, replay, 10, seed=k)
-        mixed.why_tianshou = "every other time" if k == 1 else None
+        mixed.fallback_reason = "every other time" if k == 1 else None
         updated(mixed, replay, 10, seed=k)
     assert_same_state(ours, theirs, 1e-3)
     assert_same_state(mixed, theirs, 1e-3)
@@ -283,13 +283,13 @@ def test_weights_that_are_not_finite_are_not_hidden():
 )
 def test_anything_else_is_left_to_tianshou(changes, reason):
     ours = compiled(filled_replay(5, 2), **changes)
-    assert ours.why_tianshou == reason
+    assert ours.fallback_reason == reason
 
 
 def test_other_replay_buffers_are_left_to_tianshou():
     replay = filled_replay(5, 2, PrioritizedVectorReplayBuffer, alpha=0.6, beta=0.4)
     ours = compiled(replay)
-    assert ours.why_tianshou == "its replay buffer is PrioritizedVectorReplayBuffer"
+    assert ours.fallback_reason == "its replay buffer is PrioritizedVectorReplayBuffer"
     with policy_within_training_step(ours.policy):
         assert type(ours.update(replay, 8)) is sac.SACTrainingStats
 

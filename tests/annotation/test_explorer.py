@@ -12,7 +12,7 @@ from matplotlib.backend_bases import MouseButton, MouseEvent
 import armscan.annotation.explorer
 from armscan.annotation.explorer import explore
 from armscan.cli.main import main
-from armscan.envs.rendering import HEIGHT, WIDTH, Beside, draw_plane, view_of
+from armscan.envs.rendering import HEIGHT, WIDTH, ReferencePlane, draw_plane, view_of
 from armscan.errors import DisplayError, InvalidValueError
 from armscan.volumes import LabelVolume, ManipulatorAction
 
@@ -77,7 +77,7 @@ def test_explore_looks_at_the_plane_that_a_slider_is_dragged_to(explorer, phanto
 
 
 def test_explore_jumps_to_the_optimal_plane_and_shows_it_beside(explorer, phantom):
-    beside = Beside(explorer.optimum, "optimal plane")
+    beside = ReferencePlane(explorer.optimum, "optimal plane")
     assert (explorer.picture() != draw_plane(phantom, explorer.plane, explorer.view)).any()
     click(explorer, explorer.optimum_button)
     assert explorer.plane == beside.action

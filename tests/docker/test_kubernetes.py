@@ -41,7 +41,7 @@ def test_job_is_indexed_and_repeats_only_what_may_help(job):
     assert job["backoffLimitPerIndex"] > 0
     taken_away, ended = job["podFailurePolicy"]["rules"]
     assert taken_away == {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget", "status": "True"}]}
-    # 0 is the end of the study, 2 may be a server that is away, 130 a worker that was told to leave.
+    # 0 is the end of the study, 2 may be a server that is unavailable, 130 a worker that was told to leave.
     assert (ended["action"], ended["onExitCodes"]) == ("FailIndex", {"operator": "In", "values": [1]})
 
 

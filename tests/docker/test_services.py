@@ -104,7 +104,7 @@ def n_connections(server):
 
 
 @pytest.mark.parametrize("containers", ["processes"], indirect=True)
-def test_postgres_understands_its_words_and_says_when_it_is_away(containers, postgres_there, postgres_programs):
+def test_postgres_understands_its_words_and_says_when_it_is_unavailable(containers, postgres_there, postgres_programs):
     words = shlex.split(containers.services["postgres"]["command"])
     (data,) = selected(postgres_there, "SHOW data_directory")
     # What it would have with these words, said without a start.

@@ -34,7 +34,7 @@ def print_result(opened: OpenedStudy) -> int:
     scheduler, settings = opened.search.scheduler, opened.settings
     state = scheduler.state()
     print_sentence(status_line(opened, state))
-    if stopped := scheduler.look_for_stop():
+    if stopped := scheduler.read_stop_request():
         print_sentence(printable(f"the study was stopped {stopped}; the same command resumes it"))
         return 0
     wrong = scheduler.failure_reason(state)

@@ -15,7 +15,7 @@ from armscan.sweeps.results.charts import charts_of
 from armscan.sweeps.results.csv_tables import all_numbers, cause_of
 from armscan.sweeps.results.judgement import HOW, Judgement, judge
 from armscan.sweeps.results.population_charts import population_charts
-from armscan.sweeps.results.selection import candidates_of, decided
+from armscan.sweeps.results.selection import candidates_of, decision_section
 from armscan.sweeps.results.summary import ConfigResult, final_results, final_table
 from armscan.sweeps.scheduling.state import StudyState, env_steps_of, is_feasible
 from armscan.sweeps.scheduling.termination import REASON
@@ -65,7 +65,7 @@ def write_report(
         "<h2>Result</h2>",
         _judgement(judgement) if judgement is not None else "",
         _result(found, trials) if found else "<p>No final evaluation yet.</p>",
-        decided(final, judgement, candidates, state) if final is not None else "",
+        decision_section(final, judgement, candidates, state) if final is not None else "",
         _running(state.running),
         *population_charts(trials, objectives[0], *best or (None,)),
         *charts_of(study, trials, objectives, tables["importances"]),

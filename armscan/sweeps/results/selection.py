@@ -134,7 +134,7 @@ def score_rows(candidates: Sequence[Candidate]) -> Iterator[dict[str, Any]]:
             yield {"candidate": key_of(each.number), "seed": seed, "score": score, "outcome": each.outcome}
 
 
-def decided(
+def decision_section(
     final: FinalEvaluation, judgement: Judgement | None, candidates: Sequence[Candidate], searched: StudyState
 ) -> str:
     """Return how a study has decided, step by step, as HTML."""

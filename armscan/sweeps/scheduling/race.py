@@ -130,7 +130,7 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: in
         n_more = min(round_size(len(left)), most - sum(n_seeds.values()), int((len(seeds) - counts).sum()))
         if n_more <= 0 or len(left) == 1 or is_decided(means, variances, counts):
             break
-        n_seeds |= zip(left, allotted(means, variances, counts, n_more, most=len(seeds)).tolist(), strict=True)
+        n_seeds |= zip(left, allocate(means, variances, counts, n_more, most=len(seeds)).tolist(), strict=True)
     chosen = max(left, key=lambda each: standings[each].lower_end, default=None)
     return Race(sum(n_seeds.values()), (), chosen, standings)
 
@@ -192,7 +192,7 @@ def is_decided(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> NDA
     return np.asarray((n_leader[..., 0] >= LEADER_SEEDS) & (is_behind.sum(axis=-1) == means.shape[-1] - 1))
 
 
-def allotted(means: FloatArray, variances: FloatArray, n_seeds: Counts, n_more: int, *, most: int) -> Counts:
+def allocate(means: FloatArray, variances: FloatArray, n_seeds: Counts, n_more: int, *, most: int) -> Counts:
     """Return the seeds of each configuration after more of them are given out, shape (..., configurations).
 
     Args:

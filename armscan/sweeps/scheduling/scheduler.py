@@ -67,7 +67,7 @@ class TrialScheduler:
         self.study, self.storage = study, storage
         self.limits, self._plan = limits, plan
         self.termination = termination
-        # Who asked the study to stop, as far as this process knows; see `look_for_stop`.
+        # Who asked the study to stop, as far as this process knows; see `read_stop_request`.
         self.stopped = ""
 
     def state(self) -> StudyState:
@@ -91,7 +91,7 @@ class TrialScheduler:
             if outcome is not None:
                 self._tell(outcome, is_repeated=is_repeated)
             state = self.state()
-            # If the storage went away in the middle, one may have been claimed before, and only the answer been lost.
+            # If the storage became unavailable in the middle, one may have been claimed, and only the answer been lost.
             own = [trial for trial in state.running if is_repeated and trial.user_attrs.get(LEASE) == lease]
             is_repeated = True
             if own:
@@ -152,19 +152,19 @@ class TrialScheduler:
         reset = self.study.user_attrs.get(RESET_FAILURES, ()) if state.failed else ()
         return self.limits.failure_reason(state, reset)
 
-    def look_for_end(self, state: StudyState | None = None) -> None:
-        """Look whether the study ends before its last trial; see `Termination.look`."""
+    def check_termination(self, state: StudyState | None = None) -> None:
+        """Look whether the study ends before its last trial; see `Termination.check`."""
         if self.termination is not None:
-            self.termination.look(state or self.state())
+            self.termination.check(state or self.state())
 
-    def look_for_stop(self) -> str:
+    def read_stop_request(self) -> str:
         """Return the user who stopped the study; an empty string if it was not stopped."""
         self.stopped = str(self.study.user_attrs.get(STOP, ""))
         return self.stopped
 
-    def go_on(self) -> bool:
+    def resume(self) -> bool:
         """Resume a stopped study that is started again; return whether it was stopped."""
-        was_stopped = bool(self.look_for_stop())
+        was_stopped = bool(self.read_stop_request())
         if was_stopped:
             self.study.set_user_attr(STOP, "")
             self.stopped = ""
@@ -218,7 +218,7 @@ class TrialScheduler:
                     self.study._storage.set_trial_user_attr(trial._trial_id, LEASE, dict(lease))
             if not is_checking:
                 return None
-            self.look_for_stop()
+            self.read_stop_request()
             return self.state()
 
         return self.storage.transaction(renewed)

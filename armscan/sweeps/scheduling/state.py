@@ -158,8 +158,8 @@ def _reason(trial: FrozenTrial) -> str:
 class PendingWrites(list[Callable[[], object]]):
     """Short writes about a trial, which go with its next report, its outcome or its requeue.
 
-    Each is repeated if the storage went away before the write was known to be there. One thread appends and flushes; a
-    requeue writes in another.
+    Each is repeated if the storage became unavailable before the write was known to be there. One thread appends and
+    flushes; a requeue writes in another.
     """
 
     def write(self) -> int:

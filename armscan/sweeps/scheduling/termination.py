@@ -37,7 +37,7 @@ class Termination:
         """Reason why the study has ended; None while it continues."""
         return ended_because(self._study, self._asked)
 
-    def look(self, state: StudyState) -> None:
+    def check(self, state: StudyState) -> None:
         """Look whether the study ends, once for each number of finished trials, without holding the lock."""
         n_seen = len(state.finished)
         if n_seen == self._n_seen:

@@ -25,7 +25,7 @@ Number = int | Annotated[float, Field(allow_inf_nan=False)]
 
 
 def _kept(choices: list[Any]) -> list[Any]:
-    kept = [as_kept(each) for each in choices]
+    kept = [optuna_value(each) for each in choices]
     if len(set(map(repr, kept))) < max(1, len(kept)):
         raise ValueError
     return kept
@@ -94,7 +94,7 @@ class Parameter:
         except (ValueError, UserWarning) as error:
             raise InvalidValueError(f"{where}: {error}") from error
         several = {key: each if isinstance(each, list) else [each] for key, each in (read.when or {}).items()}
-        return cls(name, distribution, {key: tuple(map(as_kept, values)) for key, values in several.items()})
+        return cls(name, distribution, {key: tuple(map(optuna_value, values)) for key, values in several.items()})
 
     def applies(self, chosen: Mapping[str, Value]) -> bool:
         """Return whether it is searched where these values were chosen before."""
@@ -136,15 +136,15 @@ class Parameter:
         return tuple(drawn.choices) if isinstance(drawn, CategoricalDistribution) else (drawn.low, drawn.high)
 
 
-def as_kept(value: Any) -> Value:
+def optuna_value(value: Any) -> Value:
     """Return a value as Optuna stores it: a number or a string, a list as the string that Hydra reads."""
-    kept: Value = written(value) if isinstance(value, list | tuple | Mapping) else value
+    kept: Value = hydra_literal(value) if isinstance(value, list | tuple | Mapping) else value
     return kept
 
 
 def overrides_of(chosen: Mapping[str, Value]) -> list[str]:
     """Return values as they are written on the command line, those of earlier versions by their new names."""
-    return [f"{name}={written(value)}" for name, value in renamed(chosen).items()]
+    return [f"{name}={hydra_literal(value)}" for name, value in renamed(chosen).items()]
 
 
 def rounded_overrides(chosen: Mapping[str, Value]) -> list[str]:
@@ -154,16 +154,16 @@ def rounded_overrides(chosen: Mapping[str, Value]) -> list[str]:
     )
 
 
-def written(value: Any) -> str:
+def hydra_literal(value: Any) -> str:
     """Return a value as Hydra reads it on the command line."""
     if value is None:
         return "null"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list | tuple):
-        return f"[{','.join(map(written, value))}]"
+        return f"[{','.join(map(hydra_literal, value))}]"
     if isinstance(value, Mapping):
-        return "{" + ",".join(f"{key}:{written(each)}" for key, each in value.items()) + "}"
+        return "{" + ",".join(f"{key}:{hydra_literal(each)}" for key, each in value.items()) + "}"
     # Neither that of a list, nor one in which nothing but a string is read.
     if isinstance(value, str) and not value.startswith(("[", "{")) and not PLAIN_TEXT.fullmatch(value):
         return QuotedString(value, Quote.single).with_quotes()

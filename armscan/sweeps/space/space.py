@@ -10,7 +10,7 @@ from optuna.distributions import CategoricalDistribution, distribution_to_json
 from optuna.trial import BaseTrial
 
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.space.parameter import Parameter, Value, as_kept, written
+from armscan.sweeps.space.parameter import Parameter, Value, hydra_literal, optuna_value
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Space:
             if name in values and parameter.contains(values[name]):
                 chosen[name] = values[name]
             elif misfit is None and (name in values or not partly):
-                value = f"{name}={written(values[name])}" if name in values else f"{name} has no value and"
+                value = f"{name}={hydra_literal(values[name])}" if name in values else f"{name} has no value and"
                 misfit = f"{value} is not in the space"
         return chosen, misfit
 
@@ -105,7 +105,8 @@ class Space:
         kept: dict[str, Parameter] = {}
         for each in self.parameters:
             can_apply = all(
-                as_kept(fixed[name]) in values if name in fixed else name in kept for name, values in each.when.items()
+                optuna_value(fixed[name]) in values if name in fixed else name in kept
+                for name, values in each.when.items()
             )
             if each.name not in fixed and can_apply:
                 open_yet = {name: values for name, values in each.when.items() if name not in fixed}

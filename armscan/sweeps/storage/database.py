@@ -1,4 +1,4 @@
-"""Studies in SQLite or PostgreSQL: transactions, locks, and retries while the database is away."""
+"""Studies in SQLite or PostgreSQL: transactions, locks, and retries while the database is unavailable."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from sqlalchemy import URL, Connection, create_engine, inspect, text
 from sqlalchemy.exc import DBAPIError, OperationalError, SQLAlchemyError
 
 from armscan.config.credentials import STORAGE_PASSWORD, database_url
-from armscan.errors import StorageAwayError
+from armscan.errors import StorageUnavailableError
 from armscan.sweeps.storage.checked_reads import CheckedReads
 from armscan.utils.retry import RetryPolicy
 
 T = TypeVar("T")
 NO_SAVEPOINT = "no such savepoint"
 # Of a SQLite file that another process has locked, that cannot be read for now, or whose disk is full.
-AWAY_IN_SQLITE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_IOERR", "SQLITE_FULL")
+UNAVAILABLE_IN_SQLITE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_IOERR", "SQLITE_FULL")
 # One of a PostgreSQL database's advisory locks.
 ADVISORY_LOCK = 0xA235CA
 # A lost machine holds the lock for so long, until its connection is closed.
@@ -43,9 +43,9 @@ class ConnectionLostError(Exception):
     """The connection was lost in the middle of a transaction."""
 
 
-def why_away(error: BaseException) -> str | None:
+def unavailable_reason(error: BaseException) -> str | None:
     """Return why a database cannot be reached for now; None if the error says that the request is wrong."""
-    is_away = isinstance(error, ConnectionLostError)
+    is_unavailable = isinstance(error, ConnectionLostError)
     # Optuna wraps errors, and may have asked again on a connection that was lost: the first one says why.
     while isinstance(error, ConnectionLostError | StorageInternalError | SQLAlchemyError | sqlite3.Error):
         cause = error.__cause__ or error.__context__
@@ -56,10 +56,10 @@ def why_away(error: BaseException) -> str | None:
     if isinstance(error, DBAPIError):
         in_sqlite = getattr(error.orig, "sqlite_errorname", None)
         if in_sqlite is None:
-            is_away |= error.connection_invalidated or isinstance(error, OperationalError)
+            is_unavailable |= error.connection_invalidated or isinstance(error, OperationalError)
         else:
-            is_away |= str(in_sqlite).startswith(AWAY_IN_SQLITE)
-    if not is_away:
+            is_unavailable |= str(in_sqlite).startswith(UNAVAILABLE_IN_SQLITE)
+    if not is_unavailable:
         return None
     message = str(error.orig if isinstance(error, DBAPIError) else error).strip()
     return message.splitlines()[0] if message else type(error).__name__
@@ -70,7 +70,7 @@ class _CheckedStorage(CheckedReads, _CachedStorage):
 
 
 class DatabaseStorage(_CheckedStorage):
-    """An Optuna storage in a database; each call is retried while the database is away.
+    """An Optuna storage in a database; each call is retried while the database is unavailable.
 
     A call may be repeated although it was done and only its answer was lost: a value is set again, and a new trial that
     no worker knows has no lease and is reclaimed. A state is set within a transaction, which looks at it first.
@@ -88,7 +88,7 @@ class DatabaseStorage(_CheckedStorage):
         self.transaction(partial(self._backend.set_trial_param, trial_id, name, value, distribution))
 
     def transaction(self, operate: Callable[[], T], *, is_exclusive: bool = False) -> T:
-        """Run an operation in one transaction, and again where the database went away in the middle.
+        """Run an operation in one transaction, and again where the database became unavailable in the middle.
 
         Args:
             operate: Function that reads and writes through this storage, in this thread.
@@ -146,9 +146,9 @@ for _name in BaseStorage.__abstractmethods__ - {"set_trial_param"}:
 
 
 def open_database(uri: str, *, retry: bool = False) -> DatabaseStorage:
-    """Open a database, for which `retry` waits while it is away, and create its tables if there are none."""
+    """Open a database, for which `retry` waits while it is unavailable, and create its tables if there are none."""
     logging.getLogger("alembic").setLevel(logging.WARNING)
-    retry_policy = RetryPolicy("the storage", f"study.storage is {uri!r}", why_away, StorageAwayError)
+    retry_policy = RetryPolicy("the storage", f"study.storage is {uri!r}", unavailable_reason, StorageUnavailableError)
     opened = partial(_opened, database_url(uri, STORAGE_PASSWORD))
     return DatabaseStorage(retry_policy.call(opened) if retry else opened(), retry_policy)
 

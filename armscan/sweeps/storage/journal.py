@@ -19,7 +19,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import BaseJournalBackend
 from optuna.storages.journal._storage import JournalOperation
 
-from armscan.errors import StorageAwayError, StudyError
+from armscan.errors import StorageUnavailableError, StudyError
 from armscan.sweeps.storage.attributes import UNREADABLE
 from armscan.sweeps.storage.checked_reads import CheckedReads
 from armscan.utils.files import FULL_DISK, truncate_torn_line
@@ -85,7 +85,9 @@ class JournalFile(BaseJournalBackend):
         self._n_studies = self._n_trials = 0
         self.lock_file = path.with_name(f".{path.name}.lock")
         self._lock = FileLock(self.lock_file)
-        self._retry_policy = RetryPolicy("the storage", f"study.storage is {str(path)!r}", _why_full, StorageAwayError)
+        self._retry_policy = RetryPolicy(
+            "the storage", f"study.storage is {str(path)!r}", _why_full, StorageUnavailableError
+        )
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -110,7 +112,7 @@ class JournalFile(BaseJournalBackend):
                 yield operation
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """See `BaseJournalBackend`; a full disk is waited for as a database that is away."""
+        """See `BaseJournalBackend`; a full disk is waited for as a database that is unavailable."""
         self._retry_policy.call(partial(self._append, logs))
 
     def _append(self, logs: list[dict[str, Any]]) -> None:

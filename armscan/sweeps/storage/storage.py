@@ -16,7 +16,7 @@ from optuna.study import Study
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.config.credentials import STORAGE_PASSWORD, check_address, database_url, mask_passwords
-from armscan.errors import StorageAwayError, StudyError
+from armscan.errors import StorageUnavailableError, StudyError
 from armscan.sweeps.storage.database import DatabaseStorage, open_database, tables_in
 from armscan.sweeps.storage.journal import CheckedJournal, open_journal
 from armscan.utils.files import SQLITE_PREFIX, sqlite_file
@@ -54,8 +54,8 @@ class Storage:
         """Run an operation that excludes all other processes, and return its result.
 
         Args:
-            decide: Short, because the others wait. If the storage goes away in the middle, it is called again when the
-                storage is back: then all of its writes are there, or none.
+            decide: Short, because the others wait. If the storage becomes unavailable in the middle, it is called again
+                when the storage is back: then all of its writes are there, or none.
         """
         if self.lock_file is None:
             assert isinstance(self.optuna, DatabaseStorage)
@@ -151,7 +151,7 @@ def _refused_in_one_line(uri: str, where: str) -> Iterator[None]:
         raise StudyError(f"{where} is {uri!r}, but it must be a file, sqlite:///FILE or postgresql://...")
     try:
         yield
-    except StorageAwayError:
+    except StorageUnavailableError:
         raise
     except (SQLAlchemyError, StorageInternalError, OSError, ImportError, RuntimeError, ValueError) as error:
         shown = uri if "://" in uri else str(sqlite_file(uri))

@@ -166,7 +166,7 @@ def open_for_work(
         task: Task of its trials.
         config: Configuration of its trials without the searched values.
         words: Overrides that its trials are composed from.
-        retry: Whether to wait for a store or a storage that is away. Default: False.
+        retry: Whether to wait for a store or a storage that is unavailable. Default: False.
 
     Raises:
         StudyError: If the storage cannot be used, or the study that exists is another.

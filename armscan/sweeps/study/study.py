@@ -39,7 +39,7 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
         StudyError: If the study that exists searches another space, has other objectives, or has trials with another
             configuration.
     """
-    wanted = described(settings, fixed)
+    wanted = comparable_settings(settings, fixed)
 
     def made() -> optuna.Study:
         study = optuna.create_study(
@@ -83,11 +83,11 @@ def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapp
     """
     study = storage.study(settings.name) if storage is not None else None
     if study is not None and not settings.allow_config_changes:
-        _check_same(settings, study, described(settings, fixed))
+        _check_same(settings, study, comparable_settings(settings, fixed))
     return study
 
 
-def described(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
+def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a study's storage keeps of its settings, to compare it with the same study started again."""
     of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
     if settings.constraints:

@@ -17,7 +17,7 @@ from armscan.config.defaults import to_plain
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError, listed
 from armscan.sweeps.scheduling.state import FINISHED
-from armscan.sweeps.space.parameter import Value, as_kept, overrides_of, written
+from armscan.sweeps.space.parameter import Value, hydra_literal, optuna_value, overrides_of
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attribute_names import (
     BEGUN_WITH,
@@ -34,7 +34,7 @@ from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.study.study import best_trials, described, is_ours
+from armscan.sweeps.study.study import best_trials, comparable_settings, is_ours
 
 PRESET, SOURCE = "preset {}", "study {}"
 # Best settings of a study with another configuration that are tried first.
@@ -132,11 +132,11 @@ def values_of(space: Space, words: Sequence[str]) -> tuple[dict[str, Value], str
     # Of a group the name that was chosen, of any other key its value.
     found = {each.name: choices.get(each.name, OmegaConf.select(config, each.name)) for each in space.parameters}
     plain = {key: to_plain(value) if OmegaConf.is_config(value) else value for key, value in found.items()}
-    return space.fit({key: as_kept(value) for key, value in plain.items()})
+    return space.fit({key: optuna_value(value) for key, value in plain.items()})
 
 
 def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], storage: Storage | None) -> InitialTrials:
-    source, wanted = _source(settings, name, storage), described(settings, fixed)
+    source, wanted = _source(settings, name, storage), comparable_settings(settings, fixed)
     trials = [trial for trial in source.get_trials(deepcopy=False) if trial.state in FINISHED]
     difference = _difference(source.user_attrs, wanted)
     # Only if the configurations agree: others may have values that no space has.
@@ -194,13 +194,13 @@ def _difference(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | No
 def _not_searched(params: Mapping[str, Value], chosen: Mapping[str, Value], fixed: Mapping[str, Value]) -> str | None:
     """Return which value of a trial this study neither searches nor has; None if there is none."""
     other = [key for key, value in params.items() if key not in chosen and (key not in fixed or fixed[key] != value)]
-    return f"{other[0]}={written(params[other[0]])}, which this study does not try" if other else None
+    return f"{other[0]}={hydra_literal(params[other[0]])}, which this study does not try" if other else None
 
 
 def _plain(flat: Mapping[str, Any]) -> dict[str, Value]:
     """Return the values of a flattened configuration as Optuna keeps them; its lists are JSON."""
     is_list = {key: isinstance(value, str) and value.startswith("[") for key, value in flat.items()}
-    return {key: as_kept(json.loads(value) if is_list[key] else value) for key, value in flat.items()}
+    return {key: optuna_value(json.loads(value) if is_list[key] else value) for key, value in flat.items()}
 
 
 def first_different(settings: Iterable[dict[str, Value]]) -> tuple[dict[str, Value], ...]:

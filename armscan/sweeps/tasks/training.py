@@ -74,7 +74,7 @@ class TrainingTask:
         """
         for seed in attempt.seeds:
             if seed not in attempt.seeds_done:
-                attempt.keep_seed(seed, _trained(attempt, seed))
+                attempt.keep_seed(seed, _train(attempt, seed))
         of_seeds = [attempt.seeds_done[seed] for seed in attempt.seeds]
         scores = {name: np.array([metrics[name] for metrics in of_seeds]) for name in of_seeds[0]}
         figures = {name: mean if name == "solved" else interquartile_mean for name in scores}
@@ -83,15 +83,15 @@ class TrainingTask:
     def validate(self, attempt: Attempt) -> dict[str, float]:
         """Train, and play episodes on the validation volumes that chose no weights; return their metrics."""
         (seed,) = attempt.seeds
-        return _trained(attempt, seed, partial(_validated, attempt))
+        return _train(attempt, seed, partial(_evaluate_on_validation, attempt))
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
         """Train, evaluate, record a video and keep the policy; return the metrics of the test."""
         (seed,) = attempt.seeds
-        return _trained(attempt, seed, partial(_concluded, attempt))
+        return _train(attempt, seed, partial(_evaluate_on_test, attempt))
 
 
-def _validated(
+def _evaluate_on_validation(
     attempt: Attempt, setup: Experiment, result: TrainingResult, tracked: TrackedRun, folder: Path
 ) -> dict[str, float]:
     """Evaluate a trained agent on the validation volumes; return its metrics there."""
@@ -105,7 +105,7 @@ def _validated(
     return metrics
 
 
-def _concluded(
+def _evaluate_on_test(
     attempt: Attempt, setup: Experiment, result: TrainingResult, tracked: TrackedRun, folder: Path
 ) -> dict[str, float]:
     """Evaluate a trained agent beside the baselines, and store the results; return the metrics of the test."""
@@ -127,7 +127,7 @@ def _concluded(
     return metrics
 
 
-def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:
+def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:
     """Train with one seed, from the last checkpoint if there is one; return metrics, also those of `conclude`."""
     config, choices = attempt.config(seed)
     setup = set_up(config)
@@ -136,7 +136,7 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
     reporter = Reporter(attempt, seed, setup.budget)
     pruned, concluded = None, {}
     with folder_lock(folder):
-        setup, tracked, earlier = _begun(attempt, seed, setup, config, choices, folder)
+        setup, tracked, earlier = _start_or_resume(attempt, seed, setup, config, choices, folder)
         attempt.opened(tracked)
         with tracked:
             try:
@@ -164,7 +164,7 @@ def _trained(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> d
     return reporter.metrics(result) | concluded
 
 
-def _begun(
+def _start_or_resume(
     attempt: Attempt, seed: int, setup: Experiment, config: DictConfig, choices: dict[str, str], folder: Path
 ) -> tuple[Experiment, TrackedRun, list[EpochReport]]:
     """Open the tracked run of a training, and restore the agent as an earlier attempt left it."""

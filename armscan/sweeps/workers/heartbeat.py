@@ -24,10 +24,10 @@ DEAD_AFTER_S = 40.0
 # Up to so many running trials, each worker checks all at each heartbeat, and less often with more of them: a check
 # costs the storage something for each running trial.
 MAX_CHECKERS = 64
-# Longest time between two checks that counts as silence, in expected intervals: in a longer one the storage was away
-# for all, and nobody could renew a lease.
+# Longest time between two checks that counts as silence, in expected intervals: in a longer one the storage was
+# unavailable for all, and nobody could renew a lease.
 MAX_UNSEEN = 1.5
-# If the storage is away, the trial cannot be requeued: it is reclaimed later, because its process is gone.
+# If the storage is unavailable, the trial cannot be requeued: it is reclaimed later, because its process is gone.
 REQUEUE_TIMEOUT_S = 5.0
 
 
@@ -100,7 +100,7 @@ class Heartbeat:
         # Held while a trial is claimed or requeued, so that leaving in between forgets none.
         self._changing, self._cleaning = threading.Lock(), threading.Lock()
         self._stopped = threading.Event()
-        # Two: heartbeats wait for a storage that is away, and leaving does not.
+        # Two: heartbeats wait for a storage that is unavailable, and leaving does not.
         self._threads = [threading.Thread(target=each, daemon=True) for each in (self._watch, self._beat)]
 
     @contextmanager
@@ -164,7 +164,7 @@ class Heartbeat:
     def _watch(self) -> None:
         while not self._stopped.wait(POLL_S):
             is_told = False
-            # A shared folder may be away for a moment.
+            # A shared folder may be unavailable for a moment.
             with suppress(OSError):
                 is_told = self._is_told_to_leave()
             if is_told:
@@ -181,7 +181,7 @@ class Heartbeat:
         while True:
             try:
                 self._renew()
-            # Any error of a storage that is away for long: the next heartbeat may reach it again.
+            # Any error of a storage that is unavailable for long: the next heartbeat may reach it again.
             except Exception as error:
                 log(f"heartbeat failed: {error!r}")
             if self._stopped.wait(HEARTBEAT_S):

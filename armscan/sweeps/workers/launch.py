@@ -20,7 +20,7 @@ from armscan.errors import ArmscanError, StudyError
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, silence_launcher
 from armscan.sweeps.results.judgement import best_metrics, judge, result_note
 from armscan.sweeps.results.progress import progress_display
-from armscan.sweeps.space.parameter import written
+from armscan.sweeps.space.parameter import hydra_literal
 from armscan.sweeps.study.arguments import STORAGE, USUAL_LAUNCHER, WORKER_KEY, StudyCommand, fixed_by
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.open import OpenedStudy
@@ -60,7 +60,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     ProcessInfo.current(str(working_folder())).write(folder / LAUNCHER_FILE)
     words = _words(opened, given, launcher, folder)
     tracked = TrackedRun.joined(opened.search.client, opened.search.run_id, name=opened.settings.name, folder=folder)
-    tracked.go_on()
+    tracked.resume()
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
     with _leaving(opened, folder, tracked, leave_s), progress_display(opened, folder):
         if launcher not in ON_THIS_MACHINE:
@@ -79,8 +79,8 @@ def _words(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: Path
     words = ["-m", *given.launching]
     # The addresses that only this machine's environment has.
     addresses = {STORAGE: opened.settings.storage, TRACKING_URI: opened.config.tracking.uri}
-    words += [f"{key}={written(uri)}" for key, uri in addresses.items() if key not in fixed]
-    words += [f"{WORKER_KEY}={','.join(map(str, range(n_workers)))}", f"hydra.sweep.dir={written(str(folder))}"]
+    words += [f"{key}={hydra_literal(uri)}" for key, uri in addresses.items() if key not in fixed]
+    words += [f"{WORKER_KEY}={','.join(map(str, range(n_workers)))}", f"hydra.sweep.dir={hydra_literal(str(folder))}"]
     if launcher == USUAL_LAUNCHER:
         # Before the others, which may say something else.
         words.insert(1, f"hydra.launcher.timeout_min={MINUTES_WITHOUT_END}")
@@ -143,7 +143,7 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
             signal.signal(each, signal.SIG_IGN)
         (folder / STOP_FILE).touch()
         _end_workers(folder)
-        # If the storage is away, the next start does it; if it is damaged, the result says so.
+        # If the storage is unavailable, the next start does it; if it is damaged, the result says so.
         with contextlib.suppress(ArmscanError), no_retry():
             for phase in opened.phases:
                 for trial in phase.scheduler.reclaim(LivenessCheck().is_dead):
@@ -162,7 +162,7 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
 
 
 def _deliver(opened: OpenedStudy, tracked: TrackedRun, status: str) -> None:
-    """End the study's own run, and upload what its trials buffered while their store was away."""
+    """End the study's own run, and upload what its trials buffered while their store was unavailable."""
     is_there = tracked.end(status, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
     left = []
     if is_there:

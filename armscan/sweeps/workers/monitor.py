@@ -9,7 +9,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 
-from armscan.errors import ArmscanError, StorageAwayError
+from armscan.errors import ArmscanError, StorageUnavailableError
 from armscan.sweeps.study.open import OpenedStudy
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.utils.retry import no_retry
@@ -32,7 +32,7 @@ class StudyMonitor:
     def is_over(self) -> bool:
         """Return whether no trial is running, and none is missing."""
         for phase in self._opened.phases:
-            stopped = phase.scheduler.look_for_stop()
+            stopped = phase.scheduler.read_stop_request()
             state = phase.scheduler.state()
             if state.running or phase.scheduler.end_reason(state) is None:
                 return False
@@ -57,7 +57,7 @@ class StudyMonitor:
                     if self.is_over():
                         return True
                     is_alive = self.is_alive()
-                except StorageAwayError:
+                except StorageUnavailableError:
                     # The workers wait for it, too.
                     is_alive = True
                 if is_alive:

@@ -16,16 +16,16 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
-from armscan.errors import ArmscanError, AwayError, StudyError
+from armscan.errors import ArmscanError, ServiceUnavailableError, StudyError
 from armscan.sweeps.workers.leave_request import LeaveRequest
 from armscan.sweeps.workers.slurm import NOW, SOON, SlurmSignals
 from armscan.utils.processes import ProcessInfo, child_command, on_parent_exit
 
 LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
-# Exit codes of a worker that was told to leave, of one whose storage was away for too long, of one that cannot work at
-# the study as it is stored, and of all that are not restarted.
-LEFT, AWAY, REFUSED = 130, 75, 65
-ENDS = (0, LEFT, AWAY, REFUSED)
+# Exit codes of a worker that was told to leave, of one whose storage was unavailable for too long, of one that cannot
+# work at the study as it is stored, and of all that are not restarted.
+LEFT, UNAVAILABLE, REFUSED = 130, 75, 65
+ENDS = (0, LEFT, UNAVAILABLE, REFUSED)
 GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"
 # A worker that is killed again and again does no work; its trials have failed long before.
 MAX_RESTARTS = 100
@@ -51,8 +51,8 @@ def run_worker(words: Sequence[str], number: int, folder: Path) -> None:
         for _ in range(MAX_RESTARTS):
             if not launcher.is_alive or (folder / STOP_FILE).exists():
                 return
-            code = _worked(study_input, launcher.directory, log_file, signals)
-            if signals.is_received and code not in (0, AWAY):
+            code = _run_worker(study_input, launcher.directory, log_file, signals)
+            if signals.is_received and code not in (0, UNAVAILABLE):
                 signals.requeue_job()
                 return
             if code in ENDS:
@@ -73,7 +73,7 @@ def _launcher_of(folder: Path) -> ProcessInfo:
     )
 
 
-def _worked(study_input: bytes, directory: str, log_file: BinaryIO, signals: SlurmSignals) -> int:
+def _run_worker(study_input: bytes, directory: str, log_file: BinaryIO, signals: SlurmSignals) -> int:
     """Run the process of a worker to its end; return its exit code."""
     with subprocess.Popen(
         child_command(__name__, worker_main.__name__),
@@ -139,4 +139,4 @@ def worker_main(supervisor_pid: int) -> None:
         work(words, make_heartbeat)
     except ArmscanError as error:
         log(str(error))
-        raise SystemExit(AWAY if isinstance(error, AwayError) else REFUSED) from error
+        raise SystemExit(UNAVAILABLE if isinstance(error, ServiceUnavailableError) else REFUSED) from error

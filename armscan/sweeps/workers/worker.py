@@ -17,7 +17,7 @@ from armscan.config.command_hints import kept_command
 from armscan.config.compose import compose_run
 from armscan.config.defaults import MULTIRUN, to_plain
 from armscan.config.error_messages import one_line_message
-from armscan.errors import FolderInUseError, StorageAwayError, TrackingAwayError
+from armscan.errors import FolderInUseError, StorageUnavailableError, TrackingUnavailableError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import ClaimStatus, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
@@ -57,12 +57,12 @@ class Worker:
         Returns:
             Why the phase has ended; None if it has not.
         """
-        self._phase.scheduler.look_for_stop()
+        self._phase.scheduler.read_stop_request()
         outcome: TrialOutcome | None = None
         conclude: Callable[[], None] | None = None
         while True:
             # It may take seconds, in which others claim trials.
-            self._phase.scheduler.look_for_end()
+            self._phase.scheduler.check_termination()
             # One round trip for the trial before and the next: with many workers these add up.
             trial = self._heartbeat.claim(outcome, conclude)
             self._heartbeat.clean_up()
@@ -80,9 +80,9 @@ class Worker:
         """Wait until a trial of this phase can be claimed, or none ever will be, or only the other phase has some."""
         scheduler = self._phase.scheduler
         while True:
-            scheduler.look_for_stop()
+            scheduler.read_stop_request()
             state = scheduler.state()
-            scheduler.look_for_end(state)
+            scheduler.check_termination(state)
             status = scheduler.claim_status(state)
             # A running trial may yet have to be retried.
             if status.can_claim or (status.end_reason is not None and not state.running):
@@ -112,10 +112,10 @@ class Worker:
             log(f"trial {trial.number}: {error}")
             self._heartbeat.requeue()
             time.sleep(WAIT_S)
-        except TrackingAwayError:
+        except TrackingUnavailableError:
             self._heartbeat.requeue()
             raise
-        except StorageAwayError:
+        except StorageUnavailableError:
             raise
         # Any other error of a trial fails the trial, not the study; this process is told to leave in other ways.
         except (Exception, SystemExit, KeyboardInterrupt) as error:
@@ -208,7 +208,7 @@ def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None
         make_heartbeat: Function that makes the heartbeat of this worker in a phase.
 
     Raises:
-        AwayError: If the storage or the tracking store is away for longer than a worker waits.
+        ServiceUnavailableError: If the storage or the tracking store is unavailable for longer than a worker waits.
     """
     silence_libraries()
     opened = open_for_work(*read_settings(words), words, retry=True)
@@ -225,5 +225,5 @@ def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None
             assert other is not None
             run_phase(other, phase)
         log(f"{phase.name}: {reason}")
-        if phase.scheduler.look_for_stop() or phase.scheduler.failure_reason(phase.scheduler.state()):
+        if phase.scheduler.read_stop_request() or phase.scheduler.failure_reason(phase.scheduler.state()):
             return

@@ -13,7 +13,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, IntD
 from scipy.stats import qmc
 
 from armscan.config.compose import compose, of_run
-from armscan.sweeps.space.parameter import Value, as_kept
+from armscan.sweeps.space.parameter import Value, optuna_value
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.tasks.attempt import config_sha256
 from armscan.utils.arrays import FloatArray
@@ -72,7 +72,7 @@ def values_at(space: Space, places: FloatArray) -> dict[str, Value]:
 
 def default_of(space: Space, config: DictConfig) -> dict[str, Value]:
     """Return the values that the keys of a space have in a configuration."""
-    return {each.name: as_kept(OmegaConf.select(config, each.name)) for each in space.parameters}
+    return {each.name: optuna_value(OmegaConf.select(config, each.name)) for each in space.parameters}
 
 
 def value_at(distribution: BaseDistribution, place: float) -> Value:

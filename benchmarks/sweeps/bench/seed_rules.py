@@ -12,7 +12,7 @@ from scipy.special import chdtri, stdtrit
 from scipy.stats import rankdata
 
 from armscan.stats.bootstrap import LEVEL
-from armscan.sweeps.scheduling.race import PRIOR_DF, allotted, is_decided, moderated_variances, moments, round_size
+from armscan.sweeps.scheduling.race import PRIOR_DF, allocate, is_decided, moderated_variances, moments, round_size
 from armscan.utils.arrays import FloatArray
 
 # Seeds that are simulated for each configuration: no rule takes more.
@@ -90,7 +90,7 @@ def allocation(min_seeds: int, mean_seeds: int, *, n_at_once: int | None = None,
             if may_end:
                 is_over |= is_decided(means, variances, n_seeds)
             n_more = min(n_at_once or round_size(n_configs), left)
-            more = allotted(means, variances, n_seeds, n_more, most=n_most)
+            more = allocate(means, variances, n_seeds, n_more, most=n_most)
             n_seeds, left = np.where(is_over[:, np.newaxis], n_seeds, more), left - n_more
         means, variances = moments(scores, n_seeds)
         lower = means - stdtrit(PRIOR_DF + n_seeds - 1, (1 + LEVEL) / 2) * np.sqrt(variances / n_seeds)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from armscan.sweeps.scheduling.race import LEADER_SEEDS, MOST_FACTOR, allotted, budget, race
+from armscan.sweeps.scheduling.race import LEADER_SEEDS, MOST_FACTOR, allocate, budget, race
 
 SEEDS = tuple(range(1000, 1012))
 score = st.one_of(st.floats(-9, 9), st.sampled_from([0.0, 1.0, math.nan]))
@@ -113,14 +113,14 @@ def test_seeds_are_allotted_as_in_the_optimal_computing_budget_allocation():
     """Shares in proportion to variance over squared gap; the leader's balances them (Chen et al. 2000)."""
     means, variances = np.array([5.0, 4.0, 3.0]), np.array([1.0, 1.0, 4.0])
     # 1 / 1 and 4 / 4, so equal shares, and the square root of 1 + 1 / 4 times that for the leader.
-    found = allotted(means, variances, np.array([2, 2, 2]), 3000, most=10_000)
+    found = allocate(means, variances, np.array([2, 2, 2]), 3000, most=10_000)
     leader = (1.0 + 1.0 / 4.0) ** 0.5
     assert found / found.sum() == pytest.approx(np.array([leader, 1.0, 1.0]) / (leader + 2.0), abs=1e-3)
     # The unit of the scores does not matter, nor do equal scores.
-    tiny = allotted(1e-12 * means, 1e-24 * variances, np.array([2, 2, 2]), 3000, most=10_000)
+    tiny = allocate(1e-12 * means, 1e-24 * variances, np.array([2, 2, 2]), 3000, most=10_000)
     assert tiny.tolist() == found.tolist()
-    assert allotted(np.zeros(3), np.zeros(3), np.array([2, 2, 2]), 3, most=10).sum() == 9
-    capped = allotted(means, variances, np.array([2, 2, 2]), 6, most=4)
+    assert allocate(np.zeros(3), np.zeros(3), np.array([2, 2, 2]), 3, most=10).sum() == 9
+    capped = allocate(means, variances, np.array([2, 2, 2]), 6, most=4)
     assert capped.tolist() == [4, 4, 4]
 
 

@@ -295,7 +295,7 @@ def test_witness_takes_a_worker_elsewhere_for_dead_when_its_lease_is_not_renewed
         assert not any(found_dead_after(0, 10, 10, 10))
     assert found_dead_after(9, 10) == [False, True]
     scheduler.renew(_trial(scheduler), lease | {"beat": 3})
-    # Nobody looked for long, because the storage was away: then it could not be renewed, either.
+    # Nobody looked for long, because the storage was unavailable: then it could not be renewed, either.
     assert found_dead_after(0, 10, 500, 10, 10) == [False, False, False, False, True]
 
 

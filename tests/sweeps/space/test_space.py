@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from optuna.trial import FixedTrial
 
 from armscan.errors import InvalidValueError
-from armscan.sweeps.space.parameter import overrides_of, written
+from armscan.sweeps.space.parameter import hydra_literal, overrides_of
 from armscan.sweeps.space.space import Space
 
 DESCRIBED = {
@@ -35,7 +35,7 @@ def test_space_gives_a_trial_what_is_searched_beside_its_choices():
 def test_space_is_written_as_the_command_line_has_it():
     chosen = {"network": "mlp", "network.hidden_sizes": "[64,64]", "agent.lr": 1e-4, "a.b": None, "c": False}
     texts = ["it's, odd", "a\\b", "a\\", "a\\'b", "true", "Null", "nan", "1e3"]
-    values = [OverridesParser.create().parse_override(f"a={written(text)}").value() for text in texts]
+    values = [OverridesParser.create().parse_override(f"a={hydra_literal(text)}").value() for text in texts]
     assert [value if isinstance(value, str) else value.text for value in values] == texts
     words = overrides_of({**chosen, "d": "it's, odd"})
     assert words[:5] == ["network=mlp", "network.hidden_sizes=[64,64]", "agent.lr=0.0001", "a.b=null", "c=false"]
@@ -43,7 +43,7 @@ def test_space_is_written_as_the_command_line_has_it():
     assert [str(value) if hasattr(value, "text") else value for value in read] == [
         *("mlp", [64, 64], 1e-4, None, False, "it's, odd")
     ]
-    assert written({"a": [1, {"b": True}]}) == "{a:[1,{b:true}]}"
+    assert hydra_literal({"a": [1, {"b": True}]}) == "{a:[1,{b:true}]}"
 
 
 def test_space_extremes_have_every_choice_and_both_ends():

@@ -9,10 +9,10 @@ from optuna.exceptions import StorageInternalError
 from optuna.trial import TrialState
 from sqlalchemy.exc import OperationalError
 
-from armscan.errors import StorageAwayError
+from armscan.errors import StorageUnavailableError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits
-from armscan.sweeps.storage.database import why_away
+from armscan.sweeps.storage.database import unavailable_reason
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.study import make_study
 from armscan.utils import retry
@@ -54,7 +54,7 @@ def test_study_waits_while_its_disk_is_full_and_loses_no_trial(disk, uri, capfd)
     def is_waiting():
         # One worker at least: it may hold the lock that the other waits for.
         told.extend(capfd.readouterr())
-        return any(f"the storage is away ({reason}): waiting" in "".join(told) for reason in FULL)
+        return any(f"the storage is unavailable ({reason}): waiting" in "".join(told) for reason in FULL)
 
     disk.fill()
     wait_until(is_waiting)
@@ -73,10 +73,10 @@ def test_study_on_a_disk_that_stays_full_is_answered_in_one_line(disk, uri, monk
     storage = open_storage(uri)
     study = make_study(storage, settings(storage=uri), {})
     disk.fill()
-    with pytest.raises(StorageAwayError) as given_up:
+    with pytest.raises(StorageUnavailableError) as given_up:
         study.set_user_attr("note", "x" * 2**20)
     line = str(given_up.value)
-    assert line.startswith(f"study.storage is '{uri}', but it has been away for 0.5 s: ")
+    assert line.startswith(f"study.storage is '{uri}', but it has been unavailable for 0.5 s: ")
     assert line.endswith(FULL)
     disk.empty()
     assert make_study(open_storage(uri), settings(storage=uri), {}).trials == []
@@ -90,6 +90,6 @@ def test_savepoint_of_a_transaction_that_sqlite_has_rolled_back_is_not_the_reaso
     lost.__context__ = OperationalError("INSERT", None, full)
     error, outer = OperationalError("ROLLBACK TO SAVEPOINT", None, lost), StorageInternalError("during the commit")
     error.__cause__, outer.__cause__ = lost, error
-    assert why_away(outer) == "database or disk is full"
+    assert unavailable_reason(outer) == "database or disk is full"
     lost.__context__ = None
-    assert why_away(outer) is None
+    assert unavailable_reason(outer) is None

@@ -107,7 +107,7 @@ def make(storage_uri):
 
 
 def run_one(scheduler):
-    scheduler.look_for_end()
+    scheduler.check_termination()
     trial = scheduler.claim({"worker": "a"})
     if trial is not None:
         scheduler.study.tell(trial, 1.0)
@@ -133,8 +133,8 @@ def test_study_is_looked_at_once_for_each_number_of_finished_trials(make):
     scheduler = make(last=10)
     for _ in range(3):
         run_one(scheduler)
-        scheduler.look_for_end()
-        scheduler.look_for_end()
+        scheduler.check_termination()
+        scheduler.check_termination()
     assert make.looks == 4
 
 

@@ -1,4 +1,4 @@
-"""Storages that are away for a while: nothing is lost, nothing is done twice, and nobody waits for ever."""
+"""Storages that are unavailable for a while: nothing is lost, nothing is done twice, and nobody waits for ever."""
 
 import multiprocessing
 import os
@@ -14,12 +14,12 @@ from optuna.trial import TrialState
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import SQLAlchemyError
 
-from armscan.errors import StorageAwayError
+from armscan.errors import StorageUnavailableError
 from armscan.sweeps.results import progress as screen
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits, PendingWrites, TrialOutcome
 from armscan.sweeps.storage.attribute_names import LEASE, RETRY_OF
-from armscan.sweeps.storage.database import why_away
+from armscan.sweeps.storage.database import unavailable_reason
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.workers import heartbeat as lease
 from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
@@ -101,7 +101,7 @@ def test_trial_is_told_once_where_the_answer_is_lost(open_scheduler, lose_commit
     assert outcome.is_told
     assert [each.value for each in open_scheduler().state().finished] == [3.0]
     said = [line.partition("  ")[2] for line in capsys.readouterr().out.splitlines()]
-    assert said == ["the storage is away (the connection is lost): waiting", "the storage is back"]
+    assert said == ["the storage is unavailable (the connection is lost): waiting", "the storage is back"]
 
 
 def test_trial_that_was_failed_by_another_meanwhile_is_not_told(open_scheduler, lose_commit):
@@ -220,16 +220,16 @@ def test_retry_policy_ends_in_one_line_that_does_not_show_the_password(open_sche
     trial = scheduler.claim({})
     postgres.stop()
     try:
-        with pytest.raises(StorageAwayError) as given_up:
+        with pytest.raises(StorageUnavailableError) as given_up:
             scheduler.claim({})
         began_s = time.monotonic()
-        with pytest.raises(StorageAwayError):
+        with pytest.raises(StorageUnavailableError):
             scheduler.study.tell(trial, 1.0)
         # It is not waited for again.
         assert time.monotonic() - began_s < 5.0
         line = f"study.storage is 'postgresql://armscan@127.0.0.1:{postgres.port}/"
         assert str(given_up.value).startswith(line)
-        assert "but it has been away for 5 s: connection failed" in str(given_up.value)
+        assert "but it has been unavailable for 5 s: connection failed" in str(given_up.value)
         assert capsys.readouterr().out.count("\n") == 1
     finally:
         postgres.start()
@@ -239,7 +239,7 @@ def test_thread_without_retry_is_told_at_once(open_scheduler, postgres, capsys):
     scheduler = open_scheduler()
     postgres.stop()
     try:
-        with retry.no_retry(), pytest.raises(StorageAwayError, match="but it is away: connection failed"):
+        with retry.no_retry(), pytest.raises(StorageUnavailableError, match="but it is unavailable: connection failed"):
             scheduler.state()
     finally:
         postgres.start()
@@ -273,17 +273,17 @@ def test_worker_that_is_told_to_leave_while_the_storage_is_away_leaves_soon(open
 
 def test_screen_says_once_that_the_storage_is_away_and_shows_what_is_new_when_it_is_back(monkeypatch, capsys):
     monkeypatch.setattr(screen, "REFRESH_S", 0.0)
-    stopped, is_away = threading.Event(), [True, True, False, False]
+    stopped, is_unavailable = threading.Event(), [True, True, False, False]
 
     def show():
-        if len(is_away) == 2:
+        if len(is_unavailable) == 2:
             stopped.set()
-        if is_away.pop(0):
-            raise StorageAwayError("it is away")
+        if is_unavailable.pop(0):
+            raise StorageUnavailableError("it is unavailable")
         print("trial 3 done")
 
     screen.repeat(show, stopped)
-    assert capsys.readouterr().out.splitlines() == ["it is away", "trial 3 done", "trial 3 done"]
+    assert capsys.readouterr().out.splitlines() == ["it is unavailable", "trial 3 done", "trial 3 done"]
 
 
 @pytest.mark.parametrize(("statement", "is_waited_for"), [("SELECT * FROM nowhere", False), ("DELETE FROM a", True)])
@@ -296,4 +296,4 @@ def test_only_what_passes_is_waited_for(tmp_path, statement, is_waited_for):
     with pytest.raises(SQLAlchemyError) as raised, engine.begin() as connection:
         connection.execute(text(statement))
     locked.close()
-    assert (why_away(raised.value) is not None) is is_waited_for
+    assert (unavailable_reason(raised.value) is not None) is is_waited_for

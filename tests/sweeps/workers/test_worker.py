@@ -353,8 +353,8 @@ def test_stopped_study_requeues_its_trial_and_goes_on_when_it_is_started_again(w
     # Until it is told to go on, workers that come do nothing.
     assert len(work("a", n_trials=3).trials) == 2
     scheduler = TrialScheduler(study, work.storage("a"), Limits(n_trials=3))
-    assert scheduler.go_on()
-    assert not scheduler.go_on()
+    assert scheduler.resume()
+    assert not scheduler.resume()
     assert [trial.state.name for trial in work("a", n_trials=3).trials] == ["COMPLETE"] * 3
 
 

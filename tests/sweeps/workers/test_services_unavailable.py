@@ -1,4 +1,4 @@
-"""A study whose PostgreSQL and whose MLflow server are away for a while in the middle of it."""
+"""A study whose PostgreSQL and whose MLflow server are unavailable for a while in the middle of it."""
 
 import contextlib
 import os
@@ -115,7 +115,7 @@ def test_study_loses_nothing_while_its_services_are_away(services, tmp_path, awa
         assert process.wait(HANG_S) == 0, (folder / "printed").read_text()
     assert_complete(storage_uri, server.uri, 2)
     log = worker_log(folder)
-    assert log.count("the storage is away") == log.count("the storage is back") == 1
+    assert log.count("the storage is unavailable") == log.count("the storage is back") == 1
     # Of each run that was at hand, once.
     said = [line.partition("  ")[2] for line in log.splitlines() if "cannot be reached or written to" in line]
     assert 1 <= len(said) == len(set(said)) <= 4

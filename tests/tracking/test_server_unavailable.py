@@ -1,4 +1,4 @@
-"""Tracking stores that are away for a while, or for good: training goes on, and nothing is lost."""
+"""Tracking stores that are unavailable for a while, or for good: training goes on, and nothing is lost."""
 
 import os
 import shutil
@@ -13,9 +13,9 @@ import requests
 from mlflow import MlflowClient
 
 from armscan.cli.main import main
-from armscan.errors import TrackingAwayError, TrackingError
+from armscan.errors import TrackingError, TrackingUnavailableError
 from armscan.tracking import TrackedRun, abandon, deliver_pending, note_end, open_store, sync, uploader
-from armscan.tracking.client import reason_in, why_away
+from armscan.tracking.client import reason_in, unavailable_reason
 from armscan.tracking.notes import notes
 from armscan.tracking.outbox import file_of
 from armscan.utils.files import cache_folder
@@ -98,7 +98,7 @@ def test_run_goes_on_while_the_server_is_away_and_nothing_is_lost_or_there_twice
     file = tmp_path / "best.pt"
     file.write_text("weights")
     tracked.log_files(file)
-    # With a server that is away each request takes seconds; a training waits for a line in a file only.
+    # With a server that is unavailable each request takes seconds; a training waits for a line in a file only.
     assert senders
     assert threading.current_thread() not in senders
     assert tracked.end("FINISHED")
@@ -194,7 +194,7 @@ def test_store_is_waited_for_with_a_retry_policy(server, capfd):
     server.stop()
     with pytest.raises(TrackingError, match="this store cannot be used: Connection refused"):
         open_store(server.uri, experiment="test", artifacts="-", wait_s=1.0)
-    with pytest.raises(TrackingAwayError, match=r"has been away for 0\.1 s: Connection refused"):
+    with pytest.raises(TrackingUnavailableError, match=r"has been unavailable for 0\.1 s: Connection refused"):
         open_store(server.uri, experiment="test", artifacts="-", wait_s=1.0, retry_s=0.1)
     back = threading.Timer(1.0, server.start)
     back.start()
@@ -202,7 +202,10 @@ def test_store_is_waited_for_with_a_retry_policy(server, capfd):
     back.join()
     assert experiment_id
     said = [line.partition("  ")[2] for line in capfd.readouterr().out.splitlines()]
-    assert said[-2:] == ["the tracking store is away (Connection refused): waiting", "the tracking store is back"]
+    assert said[-2:] == [
+        "the tracking store is unavailable (Connection refused): waiting",
+        "the tracking store is back",
+    ]
 
 
 def test_figures_are_kept_where_files_cannot_be_because_the_disk_is_full(tmp_path, monkeypatch, capfd):
@@ -313,7 +316,9 @@ def test_end_of_a_run_is_noted_without_its_store(opened, server, tmp_path):
 def test_run_that_cannot_be_made_is_answered_in_one_line(server, opened, tmp_path):
     server.stop()
     try:
-        with pytest.raises(TrackingAwayError, match=r"tracking.uri is 'http://.*cannot be used: Connection refused"):
+        with pytest.raises(
+            TrackingUnavailableError, match=r"tracking.uri is 'http://.*cannot be used: Connection refused"
+        ):
             begun(opened, tmp_path)
     finally:
         server.start()
@@ -336,4 +341,4 @@ def test_sync_answers_a_mistake_in_one_line(words, capsys):
 def test_reason_shows_no_password(monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", "hidden")
     error = OSError("http://me:other@host:1/: hidden is wrong")
-    assert why_away(error) == reason_in(error) == "http://me:***@host:1/: *** is wrong"
+    assert unavailable_reason(error) == reason_in(error) == "http://me:***@host:1/: *** is wrong"
