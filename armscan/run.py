@@ -41,12 +41,12 @@ def run(config: DictConfig) -> None:
     """Run a configuration composed by Hydra: a single run, a job of a multirun, or a worker of a study."""
     if config.get("study") is not None:
         # Deferred, because only studies need Optuna.
-        from armscan.sweeps.study.arguments import words_of_trials
+        from armscan.sweeps.study.arguments import trial_overrides
         from armscan.sweeps.workers.supervisor import run_worker
 
         hydra_config = HydraConfig.get()
-        words = words_of_trials([*hydra_config.overrides.task, *hydra_config.overrides.hydra])
-        run_worker(words, int(config.study.worker), Path(hydra_config.sweep.dir))
+        overrides = trial_overrides([*hydra_config.overrides.task, *hydra_config.overrides.hydra])
+        run_worker(overrides, int(config.study.worker), Path(hydra_config.sweep.dir))
         return
     invocation = Invocation.current()
     if invocation.job is not None:
@@ -109,9 +109,9 @@ def main() -> int:
             if PLAN not in sys.argv[1:]:
                 print("preparing a study: its space is checked first", flush=True)
             # Deferred, after the first line: wrong words are answered before Optuna is loaded.
-            from armscan.sweeps.study.arguments import check_training_words
+            from armscan.sweeps.study.arguments import check_training_overrides
 
-            check_training_words(sys.argv[1:])
+            check_training_overrides(sys.argv[1:])
             from armscan.sweeps.command import run_study
 
             return run_study(sys.argv[1:], launch)

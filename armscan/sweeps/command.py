@@ -13,7 +13,7 @@ from armscan.errors import printable
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher
 from armscan.sweeps.results.console import print_result
 from armscan.sweeps.storage.storage import existing_storage
-from armscan.sweeps.study.arguments import STORAGE, StudyCommand, words_of_trials
+from armscan.sweeps.study.arguments import STORAGE, StudyCommand, trial_overrides
 from armscan.sweeps.study.components import check_space, read_settings
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.open import open_for_work
@@ -26,16 +26,16 @@ from armscan.utils.console import print_sentence
 from armscan.utils.log import silence_libraries
 
 
-def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:
+def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:
     """Run a study, or show what it would run.
 
     Returns:
         The exit code: 0 if there is a result, 1 where too many trials failed.
     """
-    given = StudyCommand.read(words)
+    given = StudyCommand.read(arguments)
     silence_libraries()
-    trial_words = words_of_trials(given.words)
-    settings, task, config = read_settings(trial_words)
+    overrides = trial_overrides(given.overrides)
+    settings, task, config = read_settings(overrides)
     for key, uri in ((STORAGE, settings.storage), (TRACKING_URI, config.tracking.uri)):
         check_address(key, uri)
     launcher = compose_run(given.launching)[1][LAUNCHER]
@@ -47,13 +47,13 @@ def run_study(words: Sequence[str], launch: Callable[[Sequence[str]], object]) -
     existing = existing_study(storage, settings, to_plain(config))
     if not given.is_plan:
         check_launcher(launcher)
-    check_space(settings, task, trial_words, config)
-    initial = initial_trials(settings, trial_words, to_plain(config), existing)
+    check_space(settings, task, overrides, config)
+    initial = initial_trials(settings, overrides, to_plain(config), existing)
     if given.is_plan:
         final = FinalEvaluation.stored(storage, existing) if storage is not None and existing is not None else None
         print_plan(settings, existing, final, initial)
         return 0
-    opened = open_for_work(settings, task, config, trial_words)
+    opened = open_for_work(settings, task, config, overrides)
     search = opened.search.scheduler
     for each in initial:
         if each.add(search.storage, search.study):

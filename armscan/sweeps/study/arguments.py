@@ -25,76 +25,76 @@ TASK_TARGET, TRAINING_TASK = "study.task._target_", "armscan.sweeps.tasks.traini
 USUAL_LAUNCHER = "submitit_local"
 WORKER_KEY, SPACE, STORAGE, SEARCH_PATH = "study.worker", "study.space", "study.storage", "hydra.searchpath"
 # Of one key: where the range begins, say, or all of it.
-SPACE_WORD = re.compile(r"\+*study\.space(?:\.(.+?)(?:\.(low|high|log|step|choices|when))?)?=(.*)", re.DOTALL)
+SPACE_OVERRIDE = re.compile(r"\+*study\.space(?:\.(.+?)(?:\.(low|high|log|step|choices|when))?)?=(.*)", re.DOTALL)
 NO_RANGE = ",low:null,high:null,log:null,step:null"
 
 
 @dataclass(frozen=True)
 class StudyCommand:
-    """The checked command line of a study, without options, and whether to show the plan only."""
+    """The checked overrides of a study's command line, and whether to show the plan only."""
 
-    words: tuple[str, ...]
+    overrides: tuple[str, ...]
     is_plan: bool
 
     @classmethod
-    def read(cls, words: Sequence[str]) -> Self:
-        """Parse the words of the command line."""
-        own = [word for word in words if word not in (*MULTIRUN, PLAN)]
-        overrides = OverridesParser.create().parse_overrides(own)
-        keys = [each.key_or_group for each in overrides]
+    def read(cls, arguments: Sequence[str]) -> Self:
+        """Parse the arguments of the command line."""
+        overrides = [each for each in arguments if each not in (*MULTIRUN, PLAN)]
+        parsed = OverridesParser.create().parse_overrides(overrides)
+        keys = [each.key_or_group for each in parsed]
         if (n_given := keys.count(SWEEP)) != 1:
             given = f"is given {n_given} times" if n_given else "is not set"
             raise InvalidValueError(f"{SWEEP} {given}, but it must be once: give {SWEEP}=NAME")
-        if not {*MULTIRUN} & {*words}:
-            raise InvalidValueError(f"a study has many runs, which needs -m: {run_command(['-m', *words])}")
+        if not {*MULTIRUN} & {*arguments}:
+            raise InvalidValueError(f"a study has many runs, which needs -m: {run_command(['-m', *arguments])}")
         if RESUME in keys:
             raise InvalidValueError(f"{RESUME} is not for a study, which resumes by its own command: type that again")
         if STUDY in keys:
             raise InvalidValueError("study is a section of the configuration: give its keys, such as study.n_trials=40")
-        for override in overrides:
+        for override in parsed:
             _check(override)
-        return cls(tuple(map(_merging, own)), PLAN in words)
+        return cls(tuple(map(_merging, overrides)), PLAN in arguments)
 
     @property
     def launching(self) -> list[str]:
-        """Words of the command line that launches the workers."""
-        is_chosen = any(word.startswith(f"{LAUNCHER}=") for word in self.words)
-        return [*self.words, *([] if is_chosen else [f"{LAUNCHER}={USUAL_LAUNCHER}"])]
+        """Overrides of the command line that launches the workers."""
+        is_chosen = any(each.startswith(f"{LAUNCHER}=") for each in self.overrides)
+        return [*self.overrides, *([] if is_chosen else [f"{LAUNCHER}={USUAL_LAUNCHER}"])]
 
 
-def words_of_trials(words: Sequence[str]) -> list[str]:
-    """Return the words that the configuration of a trial is composed of.
+def trial_overrides(overrides: Sequence[str]) -> list[str]:
+    """Return the overrides that the configuration of a trial is composed of.
 
     Those of Hydra itself are for the launching of workers, but for the one that says where configurations are found.
     """
     others = ("hydra", f"{WORKER_KEY}=")
-    return [word for word in words if not word.lstrip("+~").startswith(others) or word.startswith(SEARCH_PATH)]
+    return [each for each in overrides if not each.lstrip("+~").startswith(others) or each.startswith(SEARCH_PATH)]
 
 
-def check_training_words(words: Sequence[str]) -> None:
+def check_training_overrides(arguments: Sequence[str]) -> None:
     """Check the configuration of a study's trainings as that of a run, before Optuna is loaded.
 
     Args:
-        words: Words of the command line. Those of a study with another task than training are left to its task.
+        arguments: Arguments of the command line. Those of a study with another task than training are left to its task.
 
     Raises:
         InvalidValueError: If a value is not allowed.
     """
-    config = compose(words_of_trials(StudyCommand.read(words).words), return_hydra_config=True)
+    config = compose(trial_overrides(StudyCommand.read(arguments).overrides), return_hydra_config=True)
     if OmegaConf.select(config, TASK_TARGET) == TRAINING_TASK:
         check_words(of_run(config)[0])
 
 
-def fixed_by(words: Sequence[str]) -> dict[str, Any]:
-    """Return the values that words give to keys and groups of the configuration."""
-    return {each.key_or_group: each.value() for each in OverridesParser.create().parse_overrides(list(words))}
+def fixed_by(overrides: Sequence[str]) -> dict[str, Any]:
+    """Return the values that overrides give to keys and groups of the configuration."""
+    return {each.key_or_group: each.value() for each in OverridesParser.create().parse_overrides(list(overrides))}
 
 
-def _merging(word: str) -> str:
-    """Return a word; one that changes the study's space is rewritten, so that Hydra changes it key by key."""
-    given = SPACE_WORD.fullmatch(word)
+def _merging(override: str) -> str:
+    """Return an override; one that changes the study's space is rewritten, so that Hydra changes it key by key."""
+    given = SPACE_OVERRIDE.fullmatch(override)
     if given is None:
-        return word
+        return override
     key, part, value = given.groups()
     if part:
         # Choices stand in the place of a range.

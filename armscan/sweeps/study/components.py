@@ -32,9 +32,9 @@ TERMINATOR_MEMBERS = ("check", "reason")
 TASK_MEMBERS = ("metrics", "final_metric", "check", "run", "validate", "evaluate")
 
 
-def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig]:
+def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictConfig]:
     """Return a study's settings from its command line, the task, and the configuration without searched values."""
-    config = compose(words, return_hydra_config=True)
+    config = compose(overrides, return_hydra_config=True)
     if config.get(SWEEP) is not None:
         raise InvalidValueError(
             f"what {SWEEP}= names sets only the section {SWEEP} of the configuration: its file must begin with the "
@@ -47,7 +47,7 @@ def read_settings(words: Sequence[str]) -> tuple[StudySettings, Task, DictConfig
         raise InvalidValueError("there is no study in the configuration: give sweep=NAME of a file with one")
     if "space" in section:
         # What is given a value is not searched.
-        section["space"] = Space.read(section["space"]).without(fixed_by(words))
+        section["space"] = Space.read(section["space"]).without(fixed_by(overrides))
         if not section["space"].parameters:
             raise InvalidValueError("nothing is left to search: each key of study.space is given a value")
     settings = StudySettings.read("study", section)
@@ -104,7 +104,7 @@ def make_terminator(settings: StudySettings) -> Terminator:
     return cast(Terminator, terminator)
 
 
-def check_space(settings: StudySettings, task: Task, words: Sequence[str], config: DictConfig) -> None:
+def check_space(settings: StudySettings, task: Task, overrides: Sequence[str], config: DictConfig) -> None:
     """Build the experiment without the space, then with each choice and both ends of each range.
 
     Choices of groups and of keys at the top are tried beside values of all others, too, as a trial has them.
@@ -112,7 +112,7 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
     Args:
         settings: Settings of the study.
         task: Task of its trials, which checks each configuration.
-        words: Overrides that its trials are composed from.
+        overrides: Overrides that its trials are composed from.
         config: Configuration of its trials without the searched values.
 
     Raises:
@@ -124,11 +124,11 @@ def check_space(settings: StudySettings, task: Task, words: Sequence[str], confi
     for chosen in whole:
         # Before an agent is built, because the first of a process compiles for many seconds.
         with _named(chosen):
-            compose_run([*words, *overrides_of(chosen)])
+            compose_run([*overrides, *overrides_of(chosen)])
     task.check(config)
     for chosen in (*tried, *map(settings.space.completed, whole)):
         with _named(chosen):
-            task.check(compose_run([*words, *overrides_of(chosen)])[0])
+            task.check(compose_run([*overrides, *overrides_of(chosen)])[0])
 
 
 @contextmanager

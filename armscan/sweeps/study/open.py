@@ -1,4 +1,4 @@
-"""A study as its workers and its launcher see it, from the same words."""
+"""A study as its workers and its launcher see it, from the same overrides."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ class OpenedStudy:
 
 
 def open_for_work(
-    settings: StudySettings, task: Task, config: DictConfig, words: Sequence[str], *, retry: bool = False
+    settings: StudySettings, task: Task, config: DictConfig, overrides: Sequence[str], *, retry: bool = False
 ) -> OpenedStudy:
     """Open a study, and make it if there is none.
 
@@ -165,7 +165,7 @@ def open_for_work(
         settings: Settings of the study, as `read_settings` returns them.
         task: Task of its trials.
         config: Configuration of its trials without the searched values.
-        words: Overrides that its trials are composed from.
+        overrides: Overrides that its trials are composed from.
         retry: Whether to wait for a store or a storage that is unavailable. Default: False.
 
     Raises:
@@ -181,7 +181,7 @@ def open_for_work(
 
     @functools.cache
     def create_run() -> str:
-        tags = {**source().tags, STUDY_TAG: settings.name, STORAGE_TAG: storage.uri, "overrides": " ".join(words)}
+        tags = {**source().tags, STUDY_TAG: settings.name, STORAGE_TAG: storage.uri, "overrides": " ".join(overrides)}
         return str(client.create_run(experiment_id, name=f"study {settings.name}", tags=tags).info.run_id)
 
     def tracked_run() -> str:
@@ -220,7 +220,7 @@ def open_for_work(
     )
     final_eval = None
     if settings.final_eval.top_k:
-        control, misfit = values_of(settings.space, words)
+        control, misfit = values_of(settings.space, overrides)
         final_eval = FinalEvaluation.opened(storage, settings, study, None if misfit else control)
     finals = _final_phases(search, settings, task, final_eval) if final_eval is not None else ()
     return OpenedStudy(settings=settings, config=config, search=search, final_eval=final_eval, finals=finals)

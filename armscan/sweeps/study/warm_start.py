@@ -83,7 +83,7 @@ class InitialTrials:
 
 
 def initial_trials(
-    settings: StudySettings, words: Sequence[str], fixed: Mapping[str, Any], study: optuna.Study | None
+    settings: StudySettings, overrides: Sequence[str], fixed: Mapping[str, Any], study: optuna.Study | None
 ) -> list[InitialTrials]:
     """Return the trials that a study begins with: of the presets of `study.enqueue`, then of other studies.
 
@@ -91,7 +91,7 @@ def initial_trials(
 
     Args:
         settings: Settings of the study.
-        words: Overrides that its trials are composed from.
+        overrides: Overrides that its trials are composed from.
         fixed: Configuration of its trials without the searched values.
         study: Study; None if it does not exist yet.
 
@@ -103,32 +103,32 @@ def initial_trials(
     sources = [name for name in settings.warm_start if SOURCE.format(name) not in begun_with]
     storage = existing_storage(settings.storage) if sources else None
     initial = [
-        *(_of_preset(settings.space, name, words) for name in presets),
+        *(_of_preset(settings.space, name, overrides) for name in presets),
         *(_of_study(settings, name, fixed, storage) for name in sources),
     ]
     # First what is taken: the settings of a trial with a value need not be tried again.
     return sorted(initial, key=lambda each: not each.taken)
 
 
-def _of_preset(space: Space, name: str, words: Sequence[str]) -> InitialTrials:
-    chosen, misfit = values_of(space, words if name == DEFAULT else [f"experiment={name}"])
+def _of_preset(space: Space, name: str, overrides: Sequence[str]) -> InitialTrials:
+    chosen, misfit = values_of(space, overrides if name == DEFAULT else [f"experiment={name}"])
     if misfit:
         return InitialTrials(PRESET.format(name), f"preset {name} is not tried: {misfit}")
     message = f"preset {name} is tried first: {' '.join(overrides_of(chosen))}"
     return InitialTrials(PRESET.format(name), message, (), (chosen,))
 
 
-def values_of(space: Space, words: Sequence[str]) -> tuple[dict[str, Value], str | None]:
+def values_of(space: Space, overrides: Sequence[str]) -> tuple[dict[str, Value], str | None]:
     """Return the values that a configuration has of the keys of a space, and those that do not lie in it.
 
     Args:
         space: Space of the keys.
-        words: Overrides that the configuration is composed from.
+        overrides: Overrides that the configuration is composed from.
 
     Returns:
         See `Space.fit`.
     """
-    config, choices = compose_run(words)
+    config, choices = compose_run(overrides)
     # Of a group the name that was chosen, of any other key its value.
     found = {each.name: choices.get(each.name, OmegaConf.select(config, each.name)) for each in space.parameters}
     plain = {key: to_plain(value) if OmegaConf.is_config(value) else value for key, value in found.items()}

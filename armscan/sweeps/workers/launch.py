@@ -48,7 +48,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
         opened: The study.
         given: Command that started it.
         launcher: Choice of `hydra/launcher`.
-        launch: Function that launches Hydra's jobs, one for each worker, from words of the command line.
+        launch: Function that launches Hydra's jobs, one for each worker, from arguments of the command line.
 
     Raises:
         KeyboardInterrupt: If it is interrupted; the workers have been asked to leave.
@@ -58,35 +58,38 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     folder = working_folder() / opened.folder / "workers" / started
     folder.mkdir(parents=True)
     ProcessInfo.current(str(working_folder())).write(folder / LAUNCHER_FILE)
-    words = _words(opened, given, launcher, folder)
+    arguments = _arguments(opened, given, launcher, folder)
     tracked = TrackedRun.joined(opened.search.client, opened.search.run_id, name=opened.settings.name, folder=folder)
     tracked.resume()
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
     with _leaving(opened, folder, tracked, leave_s), progress_display(opened, folder):
         if launcher not in ON_THIS_MACHINE:
-            _launch_elsewhere(opened, folder, launcher, lambda: launch(words))
+            _launch_elsewhere(opened, folder, launcher, lambda: launch(arguments))
         elif launcher == USUAL_LAUNCHER:
             keep_gpus()
             with _block_sigint():
-                launch(words)
+                launch(arguments)
         else:
-            launch(words)
+            launch(arguments)
 
 
-def _words(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: Path) -> list[str]:
-    """Return the words that the workers are launched with."""
-    n_workers, fixed = opened.settings.workers, fixed_by(given.words)
-    words = ["-m", *given.launching]
+def _arguments(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: Path) -> list[str]:
+    """Return the arguments that the workers are launched with."""
+    n_workers, fixed = opened.settings.workers, fixed_by(given.overrides)
+    arguments = ["-m", *given.launching]
     # The addresses that only this machine's environment has.
     addresses = {STORAGE: opened.settings.storage, TRACKING_URI: opened.config.tracking.uri}
-    words += [f"{key}={hydra_literal(uri)}" for key, uri in addresses.items() if key not in fixed]
-    words += [f"{WORKER_KEY}={','.join(map(str, range(n_workers)))}", f"hydra.sweep.dir={hydra_literal(str(folder))}"]
+    arguments += [f"{key}={hydra_literal(uri)}" for key, uri in addresses.items() if key not in fixed]
+    arguments += [
+        f"{WORKER_KEY}={','.join(map(str, range(n_workers)))}",
+        f"hydra.sweep.dir={hydra_literal(str(folder))}",
+    ]
     if launcher == USUAL_LAUNCHER:
         # Before the others, which may say something else.
-        words.insert(1, f"hydra.launcher.timeout_min={MINUTES_WITHOUT_END}")
+        arguments.insert(1, f"hydra.launcher.timeout_min={MINUTES_WITHOUT_END}")
     if launcher == "joblib":
-        words.append(f"hydra.launcher.n_jobs={n_workers}")
-    return words
+        arguments.append(f"hydra.launcher.n_jobs={n_workers}")
+    return arguments
 
 
 def _launch_elsewhere(opened: OpenedStudy, folder: Path, launcher: str, launch: Callable[[], object]) -> None:

@@ -39,13 +39,13 @@ def local_workers(folder: Path) -> list[ProcessInfo]:
     return [each for each in workers if each.is_here and each.is_alive]
 
 
-def run_worker(words: Sequence[str], number: int, folder: Path) -> None:
+def run_worker(overrides: Sequence[str], number: int, folder: Path) -> None:
     """Run one job of a launcher: a worker, restarted when it is killed, until it ends by itself."""
     launcher = _launcher_of(folder)
     if not launcher.is_current:
         # A Ctrl-C reaches all processes of a terminal, but it is the launcher that asks the workers to leave.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    study_input = pickle.dumps((list(words), number, folder))
+    study_input = pickle.dumps((list(overrides), number, folder))
     n_errors = 0
     with SlurmSignals.handled() as signals, (folder / f"worker-{number}.log").open("ab") as log_file:
         for _ in range(MAX_RESTARTS):
@@ -112,7 +112,7 @@ def worker_main(supervisor_pid: int) -> None:
     """
     request = LeaveRequest()
     on_parent_exit(supervisor_pid, request.ask_now)
-    words, number, folder = pickle.load(sys.stdin.buffer)
+    overrides, number, folder = pickle.load(sys.stdin.buffer)
     ProcessInfo.current().write(folder / f"worker-{number}.json")
     launcher = ProcessInfo.read(folder / LAUNCHER_FILE)
     # Slurm's come twice: Slurm sends them to all processes of the job, and the supervisor forwards them.
@@ -136,7 +136,7 @@ def worker_main(supervisor_pid: int) -> None:
         leave=partial(os._exit, LEFT),
     )
     try:
-        work(words, make_heartbeat)
+        work(overrides, make_heartbeat)
     except ArmscanError as error:
         log(str(error))
         raise SystemExit(UNAVAILABLE if isinstance(error, ServiceUnavailableError) else REFUSED) from error

@@ -36,19 +36,19 @@ MAX_REASON_CHARS = 2000
 
 
 class Worker:
-    """Runs trials of one phase of a study, one after another, each with its values beside the command's words.
+    """Runs trials of one phase of a study, one after another, each with its values beside the command's overrides.
 
     Args:
         phase: The phase.
-        words: Command line of the study, as words.
+        overrides: Overrides that its trials are composed from.
         heartbeat: Heartbeat of the worker in this phase.
         other: Scheduler of another phase, whose trials can be run while this one waits. Default: None, there is none.
     """
 
     def __init__(
-        self, phase: Phase, words: Sequence[str], heartbeat: Heartbeat, other: TrialScheduler | None = None
+        self, phase: Phase, overrides: Sequence[str], heartbeat: Heartbeat, other: TrialScheduler | None = None
     ) -> None:
-        self._phase, self._words, self._heartbeat, self._other = phase, words, heartbeat, other
+        self._phase, self._overrides, self._heartbeat, self._other = phase, overrides, heartbeat, other
         self._tracked: TrackedRun | None = None
 
     def work(self) -> str | None:
@@ -138,7 +138,7 @@ class Worker:
         trial.study.sampler = make("sampler", phase.sampler, BaseSampler, seed=int(seed))
         # Of a new object each time: what the trial believes written may have been lost with the connection.
         chosen = phase.scheduler.storage.transaction(lambda: phase.suggest(Trial(trial.study, trial._trial_id)))
-        config, choices = compose_run([*self._words, *overrides_of(chosen)])
+        config, choices = compose_run([*self._overrides, *overrides_of(chosen)])
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)
         config_sum = config_sha256(to_plain(config))
@@ -151,7 +151,7 @@ class Worker:
             trial=trial,
             overrides=overrides_of(chosen),
             composed=(config, choices),
-            command=kept_command([MULTIRUN[0], *self._words]),
+            command=kept_command([MULTIRUN[0], *self._overrides]),
             seeds=phase.seeds_of(trial),
             study_folder=phase.folder,
             run_id=self._tracked.run_id,
@@ -200,23 +200,23 @@ class Worker:
             tracked.end("FAILED", reason="taken over by another worker")
 
 
-def work(words: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None:
+def work(overrides: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None:
     """Work on a study until it is over.
 
     Args:
-        words: Command line of the study, as words.
+        overrides: Overrides that its trials are composed from.
         make_heartbeat: Function that makes the heartbeat of this worker in a phase.
 
     Raises:
         ServiceUnavailableError: If the storage or the tracking store is unavailable for longer than a worker waits.
     """
     silence_libraries()
-    opened = open_for_work(*read_settings(words), words, retry=True)
+    opened = open_for_work(*read_settings(overrides), overrides, retry=True)
 
     def run_phase(phase: Phase, other: Phase | None) -> str | None:
         heartbeat = make_heartbeat(phase.scheduler, on_death=phase.close_runs_of)
         with heartbeat.running():
-            return Worker(phase, words, heartbeat, None if other is None else other.scheduler).work()
+            return Worker(phase, overrides, heartbeat, None if other is None else other.scheduler).work()
 
     for phase in opened.phases:
         # While the selection waits for other workers, this one trains the control for the judgement.

@@ -6,7 +6,7 @@ import pytest
 from armscan.errors import InvalidValueError, StudyError
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
+from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
@@ -113,7 +113,7 @@ def test_space_is_changed_key_by_key_on_the_command_line():
         *("study.space.network.vector.hidden_sizes.choices=[[8]]", "agent.target_entropy_per_dim=-1"),
         "study.space.network.vector.hidden_sizes.when={network: auto}",
     ]
-    settings, _, _ = read_settings(words_of_trials(StudyCommand.read(words).words))
+    settings, _, _ = read_settings(trial_overrides(StudyCommand.read(words).overrides))
     assert settings.space == Space.read(
         {
             "agent.lr": {"low": 1e-4, "high": 0.5, "log": True},

@@ -12,7 +12,7 @@ from armscan.sweeps.scheduling.state import CONTROL, Limits, StudyState
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attribute_names import TAKEN_FROM
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.arguments import StudyCommand, words_of_trials
+from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import FinalEvalSettings
@@ -172,7 +172,7 @@ def test_settings_of_a_taken_trial_are_not_tried_again(study_in):
 
 def test_preset_whose_values_do_not_lie_in_the_space_is_not_tried():
     given = StudyCommand.read(["-m", "sweep=sac_y", "study.space.agent.lr.low=5e-3"])
-    words = words_of_trials(given.words)
+    words = trial_overrides(given.overrides)
     asked, _, config = read_settings(words)
     (each,) = initial_trials(asked, words, to_plain(config), None)
     assert each.message == "preset best_y is not tried: agent.lr=0.001 is not in the space"
