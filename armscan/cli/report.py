@@ -11,6 +11,7 @@ import click
 
 from armscan.cli.options import FILE_PATH, examples, is_given, storage_option, tracking_option
 from armscan.errors import InvalidValueError, StudyError, listed
+from armscan.utils.files import nearest_existing
 
 # Between two writings of a report that is watched.
 WATCH_S = 10
@@ -45,7 +46,7 @@ def report(study: str | None, runs: str | None, out: Path | None, watch: bool, s
     if watch and runs is not None:
         raise click.UsageError("--watch is given, but it is for --study, and this report is of --runs")
     if out is not None:
-        nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
+        nearest = nearest_existing(out)
         if not nearest.is_dir():
             raise InvalidValueError(f"--out is {str(out)!r}, but {nearest} is not a folder: name one, or a new one")
     if runs is not None:
@@ -75,7 +76,8 @@ def _watch(write: Callable[[int | None], Path]) -> None:
             with contextlib.suppress(StorageUnavailableError), no_retry():
                 write(WATCH_S)
     finally:
-        write(None)
+        with contextlib.suppress(StorageUnavailableError), no_retry():
+            write(None)
 
 
 def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int | None], Path]:

@@ -128,8 +128,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
 
         table = print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
         if store is not None and runs:
-            _keep_page(table, Multirun.folder, word, store)
-            _pool_folds(Multirun.folder, word, outcomes, runs, store)
+            _keep_tables(table, Multirun.folder, word, outcomes, runs, store)
             print_where_to_look(Multirun.folder, word["tracking"]["uri"], files=(RESULTS_PAGE, ""))
             compare = armscan_command("report", "--runs", word["run_id"], tracking=word["tracking"]["uri"])
             print(f"compare   {compare}")
@@ -147,6 +146,24 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     if store is not None and not runs:
         remove_run_folder(Multirun.folder)
     return 1 if failed or not outcomes else 0
+
+
+def _keep_tables(
+    table: ResultTable,
+    folder: Path,
+    word: Mapping[str, Any],
+    outcomes: Mapping[str, JobOutcome],
+    runs: Sequence[Run],
+    store: TrackingStore,
+) -> None:
+    """Keep the table of the jobs and that over all folds; an error is printed, because the grid itself has ended."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        _keep_page(table, folder, word, store)
+        _pool_folds(folder, word, outcomes, runs, store)
+    except (TrackingError, MlflowException, OSError) as error:
+        print(f"the tables of the grid are not kept: {one_line_message(error) or error}", file=sys.stderr)
 
 
 def _keep_page(table: ResultTable, folder: Path, word: Mapping[str, Any], store: TrackingStore) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Sequence
 
@@ -24,6 +23,7 @@ from armscan.sweeps.study.warm_start import initial_trials
 from armscan.sweeps.workers.launch import run_workers
 from armscan.utils.console import print_sentence
 from armscan.utils.log import silence_libraries
+from armscan.utils.processes import n_usable_cores
 
 
 def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:
@@ -40,7 +40,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
         check_address(key, uri)
     launcher = compose_run(given.launching)[1][LAUNCHER]
     if launcher in ON_THIS_MACHINE:
-        settings.check_workers(len(os.sched_getaffinity(0)))
+        settings.check_workers(n_usable_cores())
     population_of(settings, config)
     # Before the space is checked, which takes seconds, and anything is made.
     storage = existing_storage(settings.storage)

@@ -52,8 +52,13 @@ def stop_trial(uri: str, name: str, number: int) -> str:
         number: Number of the trial.
 
     Raises:
-        StudyError: If there is no such trial, or it has ended.
+        StudyError: If there is no such trial, it has ended, or it is a training of the final evaluation.
     """
+    if name.endswith(FINAL_SUFFIXES):
+        raise StudyError(
+            f"the run belongs to {name}, but a training of the final evaluation cannot be stopped alone, because that "
+            "would decide the result: stop the study"
+        )
     storage = _storage_with(uri, name)
     trials = optuna.load_study(study_name=name, storage=storage.optuna).get_trials(deepcopy=False)
     if number >= len(trials):

@@ -14,7 +14,7 @@ from packaging.version import InvalidVersion, Version
 import armscan
 from armscan.config.trust import needs_trust, stored_config
 from armscan.errors import TrackingError, listed
-from armscan.tracking.client import TrackingStore
+from armscan.tracking.client import TrackingStore, all_pages
 from armscan.tracking.store import open_existing_store, store_errors
 from armscan.tracking.tags import EVALUATED_TAG, VERSION_TAG
 from armscan.utils.files import BEST_CHECKPOINT, CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from armscan.training import Fingerprints
 
 ID = re.compile(r"[0-9a-f]{1,32}")
-MAX_EXPERIMENTS = 1000
 N_SHOWN = 4
 
 
@@ -144,7 +143,7 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
         TrackingError: If no run is meant, or several are.
     """
     check_run_id(run_id)
-    experiments = client.search_experiments(max_results=MAX_EXPERIMENTS)
+    experiments = all_pages(client.search_experiments)
     found = client.search_runs(
         [experiment.experiment_id for experiment in experiments],
         filter_string=f"attributes.run_id LIKE '{run_id}%'",

@@ -20,7 +20,7 @@ from armscan.config.credentials import SERVER_PASSWORD, TRACKING_PASSWORD, check
 from armscan.errors import TrackingError
 from armscan.tracking.client import TrackingStore, reason_in
 from armscan.tracking.view import VIEW, VIEW_TAG
-from armscan.utils.files import SQLITE_PREFIX, check_writable, sqlite_file
+from armscan.utils.files import SQLITE_PREFIX, check_writable, nearest_existing, sqlite_file
 from armscan.utils.validation import check_bool, check_float
 
 EXAMPLES = {"uri": "sqlite:///mlruns.db", "experiment": "armscan", "artifacts": "mlartifacts"}
@@ -245,7 +245,7 @@ def _check_writable(location: str | None) -> None:
     folder = Path(url2pathname(urlsplit(location).path))
     try:
         # Nothing is made, so that another mistake leaves nothing behind.
-        check_writable(next(each for each in (folder, *folder.parents) if each.exists()) / "any")
+        check_writable(nearest_existing(folder) / "any")
     except OSError as error:
         raise TrackingError(
             f"the artifacts of runs lie in {folder}, as their experiment or tracking.artifacts says, but no file can "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -134,9 +135,11 @@ def train(
     reports = list(earlier)
     start_s = time.perf_counter() - (reports[-1].wall_s if reports else 0.0)
     is_solved = budget.solved is not None and budget.solved.holds(reports)
-    for callback in callbacks:
-        callback.on_start(budget.env_steps, tuple(reports))
-    try:
+    with ExitStack() as stack:
+        for callback in callbacks:
+            # Also after an error in the start of a later one.
+            stack.callback(callback.on_end)
+            callback.on_start(budget.env_steps, tuple(reports))
         if not reports:
             learner.warm_up()
         end = min(budget.env_steps, until_env_steps or budget.env_steps)
@@ -158,8 +161,5 @@ def train(
             for callback in callbacks:
                 callback.on_epoch(report)
             is_solved = budget.solved is not None and budget.solved.holds(reports)
-    finally:
-        for callback in callbacks:
-            callback.on_end()
     learner.load_weights(load_checkpoint(folder / BEST_CHECKPOINT)[0])
     return TrainingResult(tuple(reports), is_solved, time.perf_counter() - start_s)

@@ -125,6 +125,12 @@ def _full_disk(error: BaseException | None) -> OSError | None:
     return error
 
 
+def nearest_existing(path: Path) -> Path:
+    """Return a path, or the nearest of the folders above it that exists."""
+    path = path.absolute()
+    return next(each for each in (path, *path.parents) if each.exists())
+
+
 def check_writable(path: Path) -> None:
     """Raise the `OSError` that `atomic_write` would meet at a place, where it follows links; leave nothing there."""
     if path.is_dir():

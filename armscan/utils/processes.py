@@ -34,6 +34,12 @@ def limit_threads() -> None:
         os.environ.setdefault(variable, "1")
 
 
+def n_usable_cores() -> int:
+    """Return the number of cores that this process may use."""
+    # macOS has no affinity.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def collect_garbage_rarely() -> None:
     """Collect cyclic garbage after 50,000 new objects, not after 700, and not at the end of the process.
 

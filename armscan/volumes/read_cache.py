@@ -16,6 +16,7 @@ from armscan.volumes import (
     labelmap,
     nifti_header,
     orientation,
+    plane,
     reading,
     resampling,
     segmentation,
@@ -33,6 +34,7 @@ from armscan.volumes.volume import LabelVolume
 # What volumes are made by: changed code never meets what the old one has read.
 CODE = (
     *(header_checks, labelmap, nifti_header, orientation, reading, resampling, segmentation, stored_voxels, summary),
+    plane,
     volume,
 )
 # A text header that says so has its voxels in another file, or may have.

@@ -106,6 +106,7 @@ def same_budget(
 
 
 def _replicate(results: Results, name: str, replicate: int, n_seeds: int) -> None:
+    assert n_seeds <= SEEDS_APART, f"seeds is {n_seeds}, but replicates have seeds of their own up to {SEEDS_APART}"
     task, known = TASKS[name], {"task": name, "replicate": replicate}
     # They take turns in searching first.
     for side in (ARMSCAN, HYDRA) if replicate % 2 else (HYDRA, ARMSCAN):
@@ -142,14 +143,17 @@ def _search(side: str, task: Task, replicate: int, folder: Path) -> SearchResult
     return SEARCHES[side]([*words, f"study.seed={replicate}", f"study.seeds={seeds}"], task.budget_s, folder)
 
 
-def scores_of(rows: Sequence[Row], task: str) -> dict[str, FloatArray]:
-    """Return mean scores over seeds of the default configuration and of each side, shape (n_replicates, n_volumes).
+def scores_of(rows: Sequence[Row], task: str) -> tuple[list[int], dict[str, FloatArray]]:
+    """Return the replicates, and mean scores over seeds of the default configuration and of each side.
 
     Args:
         rows: Rows of the results. Only seeds with all scores count, and replicates with such a seed.
         task: Name of the task.
+
+    Returns:
+        Numbers of the replicates, and scores of each side, shape (n_replicates, n_volumes).
     """
-    scores: dict[str, list[FloatArray]] = {side: [] for side in (DEFAULT, *SEARCHES)}
+    replicates, scores = [], {side: [] for side in (DEFAULT, *SEARCHES)}
     of_task = [row for row in rows if row["task"] == task]
     for replicate in sorted({row["replicate"] for row in of_task}):
         own = [row for row in of_task if row["replicate"] == replicate]
@@ -160,10 +164,11 @@ def scores_of(rows: Sequence[Row], task: str) -> dict[str, FloatArray]:
         }
         seeds = set.intersection(*map(set, trained.values()))
         if best.keys() == scores.keys() and seeds:
+            replicates.append(replicate)
             for side, of_seeds in trained.items():
                 by_volume = [[score for _, score in sorted(of_seeds[seed].items())] for seed in seeds]
                 scores[side].append(np.mean(by_volume, axis=0))
-    return {side: np.array(each) for side, each in scores.items()}
+    return replicates, {side: np.array(each) for side, each in scores.items()}
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -174,21 +179,20 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def _column(rows: Sequence[Row], task: str) -> Mapping[str, str]:
-    scores = scores_of(rows, task)
-    n_replicates = len(scores[DEFAULT])
-    if not n_replicates:
+    replicates, scores = scores_of(rows, task)
+    if not replicates:
         return {}
 
     def mean(side: str, name: str) -> str:
-        of_side = [row[name] for row in rows if row["task"] == task and row.get("side") == side]
-        return f"{fmean(of_side[:n_replicates]):.1f}"
+        of_task = (row for row in rows if row["task"] == task and row.get("side") == side)
+        return f"{fmean(row[name] for row in of_task if row['replicate'] in replicates):.1f}"
 
     def less(ours: str, theirs: str) -> str:
         return with_interval(paired_difference(scores[ours], scores[theirs]))
 
     signs = np.sign((scores[ARMSCAN] - scores[HYDRA]).mean(axis=1))
     return {
-        "replicates": f"{n_replicates}",
+        "replicates": f"{len(replicates)}",
         "processor s of each search: armscan, Hydra": ", ".join(mean(side, "processor_s") for side in SEARCHES),
         "trials: armscan, of them pruned; trainings of its race": (
             f"{mean(ARMSCAN, 'n_trials')}, {mean(ARMSCAN, 'n_pruned')}; {mean(ARMSCAN, 'n_raced')}"

@@ -110,7 +110,7 @@ def trained(monkeypatch):
 def test_both_are_judged_with_the_same_seeds_and_volumes(trained, tmp_path):
     same_budget.same_budget(tmp_path, replicates=2, seeds=3)
     rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
-    scores = scores_of(rows, "sac_y")
+    _, scores = scores_of(rows, "sac_y")
     assert scores["armscan"] == pytest.approx(np.array([[2.0, 3.0], [2.0, 3.0]]))
     assert scores["hydra"] - scores["armscan"] == pytest.approx(np.ones((2, 2)))
     assert scores["default"] - scores["armscan"] == pytest.approx(np.full((2, 2), 3.0))
@@ -128,7 +128,9 @@ def test_processes_share_a_folder(trained, tmp_path):
     for first in (2, 0):
         same_budget.same_budget(tmp_path, tasks=["sac_y"], first=first, replicates=2, seeds=1)
     rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
-    assert [len(each) for each in scores_of(rows, "sac_y").values()] == [4, 4, 4]
+    replicates, scores = scores_of(rows, "sac_y")
+    assert replicates == [0, 1, 2, 3]
+    assert [len(each) for each in scores.values()] == [4, 4, 4]
     assert sorted(seed for name, seed in trained if name == "a") == [5000, 5010, 5020, 5030]
 
 
@@ -146,4 +148,6 @@ def test_a_benchmark_that_was_killed_goes_on(trained, tmp_path):
 def test_a_replicate_that_is_not_judged_yet_is_left_out(trained, tmp_path):
     same_budget.same_budget(tmp_path, replicates=2, seeds=1)
     rows = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
-    assert [len(each) for each in scores_of(rows[:-1], "sac_zy").values()] == [1, 1, 1]
+    replicates, scores = scores_of(rows[:-1], "sac_zy")
+    assert replicates == [0]
+    assert [len(each) for each in scores.values()] == [1, 1, 1]

@@ -8,7 +8,8 @@ import pytest
 from mlflow import MlflowClient
 from optuna.trial import TrialState, create_trial
 
-from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.scheduling.state import BEAT_S, StudyState
+from armscan.sweeps.storage.attribute_names import LEASE
 from tests.support.clock import WallClock
 from tests.support.waiting import HANG_S, wait_until
 from tests.sweeps.test_command import COMMAND, TINY, trials_of
@@ -56,3 +57,15 @@ def test_time_of_a_trial_during_which_the_clock_was_turned_back_is_not_counted()
         study.add_trial(trial)
     assert StudyState.of(study.trials).busy_hours == 2.0
     assert StudyState.of(study.trials[1:]).busy_hours == 0.0
+
+
+@pytest.mark.parametrize("state", [TrialState.WAITING, TrialState.FAIL])
+def test_time_is_not_counted_after_a_worker_was_last_heard_of(state):
+    study, start = optuna.create_study(), datetime(2026, 11, 22, 12)
+    last_beat = start + timedelta(hours=2)
+    trial = create_trial(state=state, user_attrs={LEASE: {BEAT_S: last_beat.timestamp()}})
+    # Requeued, or its worker was found dead, days later.
+    trial.datetime_start = start
+    trial.datetime_complete = start + timedelta(days=3) if state == TrialState.FAIL else None
+    study.add_trial(trial)
+    assert StudyState.of(study.trials).busy_hours == pytest.approx(2.0)

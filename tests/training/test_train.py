@@ -320,3 +320,15 @@ def test_training_that_ends_early_goes_on_in_another_folder_as_its_own(tmp_path)
     assert {file.name: file.read_bytes() for file in first.iterdir()} == kept
     with pytest.raises(CheckpointError, match="is a checkpoint of run 'a', but this is 'b'"):
         take_over_checkpoints(ScriptedLearner(), first, second, theirs=own, own=own)
+
+
+def test_callbacks_that_have_started_end_although_a_later_one_cannot_start(tmp_path):
+    class Broken(Recorder):
+        def on_start(self, total_env_steps, earlier):
+            raise RuntimeError("no start")
+
+    recorder = Recorder()
+    budget = Budget(env_steps=100, eval_every_env_steps=40, validation_episodes=1)
+    with pytest.raises(RuntimeError, match="no start"):
+        train(ScriptedLearner(), budget, lambda: evaluation_of(9), tmp_path, [recorder, Broken()])
+    assert recorder.calls == [("start", 100, 0), ("end",)]

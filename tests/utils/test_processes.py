@@ -6,7 +6,7 @@ import subprocess
 import threading
 from pathlib import Path
 
-from armscan.utils.processes import child_command, no_garbage_collection, on_parent_exit
+from armscan.utils.processes import child_command, n_usable_cores, no_garbage_collection, on_parent_exit
 
 ROOT = Path(__file__).parents[2]
 
@@ -43,3 +43,9 @@ def test_objects_made_without_garbage_collection_are_never_looked_through_again(
         assert gc.get_freeze_count() > 0
     finally:
         gc.unfreeze()
+
+
+def test_cores_are_counted_where_there_is_no_affinity(monkeypatch):
+    assert n_usable_cores() == len(os.sched_getaffinity(0))
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert n_usable_cores() == os.cpu_count()

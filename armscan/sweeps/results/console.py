@@ -77,6 +77,9 @@ def _print_replay(opened: OpenedStudy) -> None:
     if search.population is not None and (best := best_trials(search.scheduler.study, 1)):
         for seed in opened.settings.seeds:
             file = trial_folder(search.folder, best[0].number) / f"seed_{seed}" / RUN_FILE
+            # Its folder may have been pruned since.
+            if not file.exists():
+                continue
             run_id = json.loads(file.read_text())["run_id"]
             print(f"replay    {armscan_command('runs', 'reproduce', run_id, tracking=opened.config.tracking.uri)}")
 

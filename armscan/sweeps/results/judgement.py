@@ -158,6 +158,9 @@ class Judgement:
         first = self.differences[0]
         if math.isnan(first.paired.low):
             return f"{name} was chosen; one seed does not show whether it is better than the control."
+        if first.is_alike:
+            value = value_text(first.metric, first.paired.value)
+            return f"{name} was chosen; its difference to the control is {value} in all ({title_of(first.metric)})."
         if first.verdict:
             return f"{name} is {first.verdict} than the control ({title_of(first.metric)})."
         return (
@@ -168,12 +171,12 @@ class Judgement:
 
 def judge(final: FinalEvaluation) -> Judgement | None:
     """Return the judgement on the test volumes; None before a configuration is chosen."""
-    chosen = final.race().chosen
-    if chosen is None:
+    race = final.race()
+    if (chosen := race.chosen) is None:
         return None
     complete = final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     judged = {training_of(trial): trial for trial in complete}
-    both = to_judge(chosen)
+    both = to_judge(race)
     now = [judged[number, seed] for number in both for seed in final.judge_seeds if (number, seed) in judged]
     seeds = [seed for seed in final.judge_seeds if all((number, seed) in judged for number in both)]
     pairs = [[judged[number, seed] for seed in seeds] for number in both]

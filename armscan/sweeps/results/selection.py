@@ -67,10 +67,11 @@ def objective_of(final: FinalEvaluation) -> str:
 
 def candidates_of(final: FinalEvaluation) -> list[Candidate]:
     """Return the candidates, the chosen one first, then the others, most seeds first."""
-    race, sign = final.race(), final.sign
+    scores_of, sign = final.scores(), final.sign
+    race = final.race(scores_of)
     searched = final.search.get_trials(deepcopy=False)
     found = []
-    for number, scores in final.scores().items():
+    for number, scores in scores_of.items():
         standing = race.standings[number]
         value, *ends = (sign * each for each in standing.estimate)
         estimate = Estimate(value, *sorted(ends))

@@ -177,6 +177,16 @@ def moderated_variances(own: FloatArray, pooled: Any, n_seeds: Any) -> FloatArra
     return np.asarray((PRIOR_DF * pooled + (n_seeds - 1) * own) / (PRIOR_DF + n_seeds - 1))
 
 
+def half_widths(variances: FloatArray, n_seeds: Any) -> FloatArray:
+    """Return half the widths of the 95 % intervals of means, Student's with shrunk variances.
+
+    Args:
+        variances: Variance of the scores of each configuration.
+        n_seeds: Number of seeds of each.
+    """
+    return np.asarray(stdtrit(PRIOR_DF + n_seeds - 1, (1 + LEVEL) / 2) * np.sqrt(variances / n_seeds))
+
+
 def is_decided(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> NDArray[np.bool_]:
     """Return whether the leader has enough seeds and is ahead of all others by more than chance explains, shape (...).
 
@@ -218,7 +228,7 @@ def allocate(means: FloatArray, variances: FloatArray, n_seeds: Counts, n_more: 
 
 def _standings(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> Iterator[Standing]:
     """Yield the standings after a round."""
-    half = stdtrit(PRIOR_DF + n_seeds - 1, (1 + LEVEL) / 2) * np.sqrt(variances / n_seeds)
+    half = half_widths(variances, n_seeds)
     # With one seed each, nothing is known of chance.
     half = half if n_seeds.max() > 1 else np.full_like(half, math.nan)
     for mean, width, n in zip(means.tolist(), half.tolist(), n_seeds.tolist(), strict=True):

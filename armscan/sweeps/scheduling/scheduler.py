@@ -6,6 +6,7 @@ It decides from what is in the storage, one process at a time, and keeps nothing
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.config.legacy import renamed
 from armscan.sweeps.scheduling.state import (
+    BEAT_S,
     ClaimStatus,
     Limits,
     PendingWrites,
@@ -194,7 +196,7 @@ class TrialScheduler:
             if now.state == TrialState.RUNNING and is_own:
                 (writes or PendingWrites()).write()
                 # No process: a worker that claims it and dies before writing its lease must not be taken for this one.
-                storage.set_trial_user_attr(trial_id, LEASE, {**lease, "started": ""})
+                storage.set_trial_user_attr(trial_id, LEASE, {**lease, "started": "", BEAT_S: time.time()})
                 storage.set_trial_state_values(trial_id, TrialState.WAITING)
 
         self.storage.exclusive(requeue)

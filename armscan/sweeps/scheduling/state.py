@@ -23,6 +23,8 @@ CONTROL = -1
 # How the names of metrics on the test volumes begin.
 TEST_PREFIX = "test/"
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+# In a lease: when its worker renewed it last, on the wall clock of its machine, in seconds since 1970.
+BEAT_S = "beat_s"
 # If this many trials fail before any reports, the configuration is at fault.
 FAILURES_AT_ONCE = 3
 
@@ -81,14 +83,22 @@ class StudyState:
     @property
     def busy_hours(self) -> float:
         """Wall time in which at least one trial ran."""
-        now, busy_s, until = datetime.now(), 0.0, datetime.min
-        spans = [(trial.datetime_start, trial.datetime_complete or now) for trial in self.all if trial.datetime_start]
+        busy_s, until = 0.0, datetime.min
+        spans = [(trial.datetime_start, _last_seen(trial)) for trial in self.all if trial.datetime_start]
         for start, end in sorted(spans):
             # Not so where the clock was turned back meanwhile.
             if end > max(start, until):
                 busy_s += (end - max(start, until)).total_seconds()
                 until = end
         return busy_s / 3600
+
+
+def _last_seen(trial: FrozenTrial) -> datetime:
+    """Return when a trial ended, or when its worker was last heard of if that died or has requeued the trial."""
+    beat_s = trial.user_attrs.get(LEASE, {}).get(BEAT_S)
+    if trial.state not in FINISHED and beat_s is not None:
+        return datetime.fromtimestamp(beat_s)
+    return trial.datetime_complete or datetime.now()
 
 
 def metrics_of_test(metrics: Mapping[str, float]) -> dict[str, float]:
@@ -145,7 +155,8 @@ class Limits(Section):
         failed = [trial for trial in state.failed if trial.number not in reset]
         if len(failed) > self.max_failures:
             return f"{len(failed)} trials have failed, and at most {self.max_failures} may: {_reason(failed[-1])}"
-        got_nowhere = not state.finished and not any(reports_of(trial) for trial in state.all)
+        # A final training never reports.
+        got_nowhere = not state.finished and not any(reports_of(each) or env_steps_of(each) for each in state.all)
         if len(failed) >= FAILURES_AT_ONCE and got_nowhere:
             return f"the first {len(failed)} trials failed before they reported anything: {_reason(failed[0])}"
         return None

@@ -64,6 +64,7 @@ class _Lease(_Attributes):
     pid_namespace: Text = ""
     pid: Number = 0
     beat: Number = 0
+    beat_s: float = Field(default=0.0, description="a number")
     seed: Number = 0
     env_steps: Number = 0
     mean_return: float = Field(default=0.0, alias="return", description="a number")

@@ -27,6 +27,7 @@ from armscan.sweeps.study.samplers import CmaEsSampler
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.terminators import Terminator
 from armscan.sweeps.tasks.attempt import Task
+from armscan.utils.files import nearest_existing
 
 TERMINATOR_MEMBERS = ("check", "reason")
 TASK_MEMBERS = ("metrics", "final_metric", "check", "run", "validate", "evaluate")
@@ -62,9 +63,7 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
     if settings.terminator is not None:
         make_terminator(settings).check(len(settings.objectives), len(settings.seeds))
     for name, folder in (("folder", settings.folder), ("artifacts", settings.artifacts)):
-        path = Path(folder).absolute()
-        there = next(each for each in (path, *path.parents) if each.exists())
-        if not there.is_dir():
+        if not (there := nearest_existing(Path(folder))).is_dir():
             raise StudyError(f"study.{name} is {folder!r}, but {str(there)!r} is not a folder")
     task: Any = make("task", settings.task, object)
     if missing := [name for name in TASK_MEMBERS if not hasattr(task, name)]:

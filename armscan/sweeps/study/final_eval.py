@@ -19,7 +19,7 @@ from pydantic import Field
 from armscan.config.legacy import renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.race import MOST_FACTOR, Race, budget, race
+from armscan.sweeps.scheduling.race import MOST_FACTOR, Race, Scores, budget, race
 from armscan.sweeps.scheduling.state import CONTROL, PlannedTrial
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, RETRIED, SCHEDULE
@@ -162,10 +162,14 @@ class FinalEvaluation:
                 scores[number].setdefault(seed, math.nan)
         return scores
 
-    def race(self) -> Race:
-        """Return the state of the selection's race."""
-        settings = self.settings
-        return race(self.scores(), self.selection_seeds, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
+    def race(self, scores: Scores | None = None) -> Race:
+        """Return the state of the selection's race.
+
+        Args:
+            scores: What `scores` has returned. Default: None, the scores of now.
+        """
+        scores, settings = self.scores() if scores is None else scores, self.settings
+        return race(scores, self.selection_seeds, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
 
     def missing_of_selection(self) -> list[PlannedTrial]:
         """Return the trainings that the selection needs next and no worker has begun."""
@@ -181,8 +185,7 @@ class FinalEvaluation:
 
         The control is always judged, so idle workers train it before the race ends.
         """
-        race = self.race()
-        judged = to_judge(race.chosen) if race.is_over else [CONTROL]
+        judged = to_judge(self.race())
         return self._planned([(number, seed) for seed in self.judge_seeds for number in judged], self.judgement)
 
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
@@ -195,9 +198,14 @@ class FinalEvaluation:
         ]
 
 
-def to_judge(chosen: int | None) -> list[int]:
-    """Return the configurations that the test volumes are opened for: the chosen one, if any, and the control."""
-    return [] if chosen is None else list(dict.fromkeys((chosen, CONTROL)))
+def to_judge(race: Race) -> list[int]:
+    """Return the configurations that the test volumes are opened for: the chosen one and the control.
+
+    The control alone while the race continues; none if nothing was chosen.
+    """
+    if race.chosen is None:
+        return [] if race.is_over else [CONTROL]
+    return list(dict.fromkeys((race.chosen, CONTROL)))
 
 
 def training_of(trial: FrozenTrial | Trial) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from stat import S_ISDIR
 from statistics import fmean
 from typing import Any
 
@@ -17,7 +18,7 @@ from rich.text import Text
 
 from armscan.errors import printable
 from armscan.sweeps.scheduling.race import budget, round_size
-from armscan.sweeps.scheduling.state import CONTROL, StudyState
+from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, to_judge, training_of
@@ -80,8 +81,7 @@ def _print_cost(
     timed = [(trial, trial.duration.total_seconds()) for trial in state.finished if trial.duration is not None]
     seconds = [spent_s for _, spent_s in timed]
     mean_s = fmean(seconds)
-    files = [file for file in Path(settings.folder).rglob("*") if file.is_file()]
-    spent_mib = sum(file.stat().st_size for file in files) / BYTES_A_MIB
+    spent_mib = sum(map(_size_bytes, Path(settings.folder).rglob("*"))) / BYTES_A_MIB
     # Final trainings are never pruned.
     whole_s = [spent_s for trial, spent_s in timed if trial.state == TrialState.COMPLETE]
     training_s = fmean(whole_s or seconds) / len(settings.seeds)
@@ -94,6 +94,15 @@ def _print_cost(
         f"the rest   {n_left} trials and the final evaluation, about {least:.2f} to {most:.2f} hours and "
         f"{spent_mib / len(state.finished) * n_left:.0f} MiB ({mean_s:.0f} s a trial so far)"
     )
+
+
+def _size_bytes(path: Path) -> int:
+    """Return the size of a file; 0 of a folder, and of a file that a worker has just replaced or deleted."""
+    try:
+        stat = path.lstat()
+    except OSError:
+        return 0
+    return 0 if S_ISDIR(stat.st_mode) else stat.st_size
 
 
 def hours_left(
@@ -131,7 +140,7 @@ def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None,
         return fewest, most
     final = replace(final, settings=settings.final_eval)
     race, complete = final.race(), final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    wanted = {(number, seed) for number in to_judge(race.chosen) or [CONTROL] for seed in final.judge_seeds}
+    wanted = {(number, seed) for number in to_judge(race) for seed in final.judge_seeds}
     n_judged = len(wanted & set(map(training_of, complete)))
     if race.is_over:
         return len(wanted) - n_judged, len(wanted) - n_judged

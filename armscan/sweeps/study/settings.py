@@ -198,7 +198,11 @@ class StudySettings(Limits):
 
     def check_workers(self, n_cores: int) -> None:
         """Raise `InvalidValueError` if the workers' compute threads are more than the cores of one machine."""
-        n_threads = int(os.environ.get("OMP_NUM_THREADS", "1"))
+        # OpenMP allows a number for each level of nesting.
+        given = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip() or "1"
+        if not given.isdecimal() or int(given) < 1:
+            raise InvalidValueError(f"OMP_NUM_THREADS is {given!r}, but it must be a number of threads, 1 or more")
+        n_threads = int(given)
         if self.workers * n_threads > n_cores:
             each = "" if n_threads == 1 else f" of {n_threads} compute threads each (OMP_NUM_THREADS)"
             cores = "1 core" if n_cores == 1 else f"{n_cores} cores"

@@ -56,7 +56,8 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
         return study
 
     study = storage.exclusive(made)
-    _check_same(settings, study, wanted)
+    if _check_same(settings, study, wanted):
+        study.set_user_attr(FIXED, wanted[FIXED])
     name_objectives(study, list(settings.objectives))
     return study
 
@@ -82,7 +83,7 @@ def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapp
         StudyError: If the study searches another space, has other objectives, or has trials with another configuration.
     """
     study = storage.study(settings.name) if storage is not None else None
-    if study is not None and not settings.allow_config_changes:
+    if study is not None:
         _check_same(settings, study, comparable_settings(settings, fixed))
     return study
 
@@ -115,7 +116,8 @@ def is_ours(study: optuna.Study) -> bool:
     return [direction.name.lower() for direction in study.directions] == [*there[OBJECTIVES].values()]
 
 
-def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[str, Any]) -> None:
+def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[str, Any]) -> bool:
+    """Return whether its trials have another configuration, which the settings allow; raise if they do not."""
     there = study.user_attrs
     if not is_ours(study):
         raise StudyError(f"study.name is {settings.name!r}, but that study in its storage was not made by armscan")
@@ -126,13 +128,12 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
         if differences := _differences(renamed(there.get(key, {})), wanted[key]):
             raise StudyError(f"{whose} {what}: {differences}{other}")
     differences = _differences(migrate(there.get(FIXED, {})), wanted[FIXED])
-    if differences and settings.allow_config_changes:
-        study.set_user_attr(FIXED, wanted[FIXED])
-    elif differences:
+    if differences and not settings.allow_config_changes:
         raise StudyError(
             f"{whose} has trials with another configuration: {differences}; study.allow_config_changes=true accepts "
             f"that{other}"
         )
+    return bool(differences)
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:

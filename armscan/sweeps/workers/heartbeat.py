@@ -13,7 +13,7 @@ import optuna
 from optuna.trial import FrozenTrial, Trial
 
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.state import BEAT_S, PendingWrites, TrialOutcome
 from armscan.sweeps.storage.attribute_names import HOLDER, LEASE, STOP
 from armscan.utils.log import log
 from armscan.utils.processes import ProcessInfo
@@ -119,7 +119,7 @@ class Heartbeat:
         """Claim a trial as `TrialScheduler.claim` does, and hold it; `cleanup` is that of the trial before."""
         with self._changing:
             # The progress of the trial before is not this one's.
-            self._lease = {key: self._lease[key] for key in (*HOLDER, "beat")}
+            self._lease = {key: self._lease[key] for key in (*HOLDER, "beat")} | {BEAT_S: time.time()}
             self._trial = self._scheduler.claim(self._lease, outcome)
             self.cleanup, self.writes = cleanup, PendingWrites()
             self._is_trial_stopped = False
@@ -189,13 +189,12 @@ class Heartbeat:
 
     def _renew(self) -> None:
         with self._changing:
-            self._lease = self._lease | {"beat": self._lease["beat"] + 1}
+            self._lease = self._lease | {"beat": self._lease["beat"] + 1, BEAT_S: time.time()}
             is_checking = time.monotonic() >= self._next_check_s
             state = self._scheduler.renew(self._trial, self._lease, is_checking=is_checking)
-            own = [trial for trial in state.running if self._is_own(trial)] if state else []
-            self._is_trial_stopped = any(trial.user_attrs.get(STOP) for trial in own)
-        if state is None:
-            return
+            if state is None:
+                return
+            self._is_trial_stopped = any(trial.user_attrs.get(STOP) for trial in state.running if self._is_own(trial))
         self._liveness.interval_s = HEARTBEAT_S * max(1.0, len(state.running) / MAX_CHECKERS)
         # An interval is never quite as long as it should be.
         self._next_check_s = time.monotonic() + self._liveness.interval_s - HEARTBEAT_S / 2

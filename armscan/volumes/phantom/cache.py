@@ -12,6 +12,7 @@ from weakref import WeakValueDictionary
 
 from armscan.errors import InvalidValueError
 from armscan.utils.files import cache_folder
+from armscan.volumes import plane, volume
 from armscan.volumes.mapped import SUFFIX, mapped_volume, open_mapped
 from armscan.volumes.phantom import generate, tube, varied, wrist
 from armscan.volumes.volume import LabelVolume
@@ -78,6 +79,6 @@ def _path(seed: int, cache_dir: Path | None, version: int) -> Path:
 def _generator_version() -> str:
     """Fingerprint of the generator's sources, so that a changed generator never meets its old phantoms."""
     digest = hashlib.sha256()
-    for module in (generate, tube, varied, wrist):
+    for module in (generate, tube, varied, wrist, plane, volume):
         digest.update(Path(str(module.__file__)).read_bytes())
     return digest.hexdigest()[:12]

@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 from scipy.special import chdtri, stdtrit
 from scipy.stats import rankdata
 
-from armscan.stats.bootstrap import LEVEL
-from armscan.sweeps.scheduling.race import PRIOR_DF, allocate, is_decided, moderated_variances, moments, round_size
+from armscan.sweeps.scheduling.race import (
+    PRIOR_DF,
+    allocate,
+    half_widths,
+    is_decided,
+    moderated_variances,
+    moments,
+    round_size,
+)
 from armscan.utils.arrays import FloatArray
 
 # Seeds that are simulated for each configuration: no rule takes more.
@@ -93,7 +100,7 @@ def allocation(min_seeds: int, mean_seeds: int, *, n_at_once: int | None = None,
             more = allocate(means, variances, n_seeds, n_more, most=n_most)
             n_seeds, left = np.where(is_over[:, np.newaxis], n_seeds, more), left - n_more
         means, variances = moments(scores, n_seeds)
-        lower = means - stdtrit(PRIOR_DF + n_seeds - 1, (1 + LEVEL) / 2) * np.sqrt(variances / n_seeds)
+        lower = means - half_widths(variances, n_seeds)
         return Chosen(lower.argmax(axis=1), n_seeds.sum(axis=1))
 
     return choose
@@ -110,21 +117,20 @@ def _raced(scores: FloatArray, *, rounds: Sequence[int], drop: Drop) -> Chosen:
         n_seeds[runs] = n_now
         seen = scores[..., :n_now]
         means, variances = _standing(seen, is_in)
-        low = means - stdtrit(PRIOR_DF + n_now - 1, (1 + LEVEL) / 2) * np.sqrt(variances)
-        lower = np.where(runs, low, lower)
+        lower = np.where(runs, means - half_widths(variances, n_now), lower)
         is_in = np.where(runs.any(axis=1, keepdims=True), drop(seen, is_in), is_in)
     return Chosen(np.where(is_in, lower, -np.inf).argmax(axis=1), n_seeds.sum(axis=1))
 
 
 def _standing(seen: FloatArray, is_in: Mask) -> tuple[FloatArray, FloatArray]:
-    """Return the means of configurations with equally many seeds, and the shrunk variances of these means."""
+    """Return the means of configurations with equally many seeds, and their shrunk variances."""
     n_seeds = seen.shape[-1]
     means = seen.mean(axis=-1)
     if n_seeds == 1:
         return means, np.zeros_like(means)
     own = seen.var(axis=-1, ddof=1)
     pooled = np.where(is_in, own, 0.0).sum(axis=1, keepdims=True) / is_in.sum(axis=1, keepdims=True)
-    return means, moderated_variances(own, pooled, n_seeds) / n_seeds
+    return means, moderated_variances(own, pooled, n_seeds)
 
 
 def _behind_by_t(seen: FloatArray, is_in: Mask, *, level: float) -> Mask:
@@ -132,7 +138,7 @@ def _behind_by_t(seen: FloatArray, is_in: Mask, *, level: float) -> Mask:
     means, variances = _standing(seen, is_in)
     leader = np.where(is_in, means, -np.inf).argmax(axis=1)[:, np.newaxis]
     behind = np.take_along_axis(means, leader, axis=1) - means
-    spread = np.sqrt(variances + np.take_along_axis(variances, leader, axis=1))
+    spread = np.sqrt((variances + np.take_along_axis(variances, leader, axis=1)) / n_seeds)
     return is_in & ((behind <= stdtrit(PRIOR_DF + n_seeds - 1, level) * spread) | (n_seeds == 1))
 
 

@@ -12,7 +12,16 @@ import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps.scheduling.state import PlannedTrial, StudyState
-from armscan.sweeps.storage.attribute_names import ATTEMPT, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, RETRY_OF
+from armscan.sweeps.storage.attribute_names import (
+    ATTEMPT,
+    FAILURE,
+    FINAL_SEED,
+    FINALIST,
+    LEASE,
+    RETRIED,
+    RETRY_OF,
+    STOP,
+)
 from armscan.sweeps.workers import heartbeat as lease_module
 from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
 from armscan.utils.processes import ProcessInfo, process_start
@@ -327,3 +336,42 @@ def test_lease_of_a_trial_says_who_runs_it(make_scheduler):
     scheduler = make_scheduler()
     scheduler.claim({"worker": "a", "beat": 0})
     assert scheduler.state().running[0].user_attrs[LEASE] == {"worker": "a", "beat": 0}
+
+
+def test_requeued_trial_keeps_the_time_of_its_end_and_the_limit_stays_reached(make_scheduler):
+    scheduler = make_scheduler(timeout_hours=1e-5)
+    trial = scheduler.claim({"worker": "a"})
+    time.sleep(0.05)
+    scheduler.requeue(trial, {})
+    reason = scheduler.limits.limit_reason(scheduler.state())
+    assert reason == "the 1e-05 hours of study.timeout_hours are over"
+    spent_h = scheduler.state().busy_hours
+    time.sleep(0.05)
+    assert scheduler.state().busy_hours == spent_h
+
+
+def test_failures_of_final_trainings_that_had_begun_to_train_do_not_end_them(make_scheduler):
+    scheduler = make_scheduler(n_trials=100, max_failures=50)
+    for number in range(4):
+        trial = scheduler.claim({"worker": str(number)})
+        # Nothing is reported there.
+        scheduler.renew(trial, {"worker": str(number), "env_steps": 500})
+        fail(scheduler, trial, "diverged")
+    assert scheduler.failure_reason(scheduler.state()) is None
+
+
+def test_request_to_stop_a_trial_is_not_forgotten_between_two_checks(make_scheduler, monkeypatch):
+    scheduler, now_s = make_scheduler(), [100.0]
+    monkeypatch.setattr(lease_module.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(lease_module, "MAX_CHECKERS", 1)
+    heartbeat = Heartbeat(scheduler, "a", is_told_to_leave=lambda: False, leave=lambda: None, on_death=pytest.fail)
+    trial = heartbeat.claim()
+    for _ in range(2):
+        scheduler.claim(asdict(ProcessInfo.current()) | {"worker": "b"})
+    trial.set_user_attr(STOP, "at 20:00 by x")
+    for _ in range(2):
+        # The first beat checks, the second does not.
+        heartbeat._renew()
+        now_s[0] += lease_module.HEARTBEAT_S
+    with pytest.raises(optuna.TrialPruned):
+        heartbeat.report_progress({})

@@ -9,18 +9,22 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.results.judgement import best_metrics, judge, result_note
+from armscan.errors import StudyError
+from armscan.stats.bootstrap import Estimate
+from armscan.sweeps.results.judgement import Difference, Judgement, best_metrics, judge, result_note
 from armscan.sweeps.results.progress import final_line
 from armscan.sweeps.results.selection import candidates_of
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import CONTROL, Limits
+from armscan.sweeps.stop import stop_trial
 from armscan.sweeps.storage.attribute_names import FINALIST, GENERATION, MEMBER, METRICS, RETRIED, SCHEDULE
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, training_of
 from armscan.sweeps.study.plan import final_trainings_left, hours_left
 from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import make_study
+from tests.sweeps.conftest import fail
 from tests.sweeps.study.test_study import settings
 
 FINAL_EVAL = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, "judge_seeds": 3}
@@ -320,3 +324,33 @@ def test_member_of_the_latest_generation_is_trained_with_its_whole_schedule(stor
 
 def test_settings_of_an_earlier_version_are_read():
     assert FinalEvalSettings.read("a", FINAL_EVAL | {"n_seeds": 7}).judge_seeds == 7
+
+
+def test_nothing_is_left_of_a_final_evaluation_whose_trainings_all_failed(storage_uri):
+    final, (selection, _) = opened(storage_uri)
+    while trial := selection.claim({}):
+        selection.renew(trial, {"env_steps": 100})
+        fail(selection, trial, "diverged")
+    assert final.race().is_over
+    assert final.race().chosen is None
+    assert final_trainings_left(searched(storage_uri)[1], final, n_left=0) == (0, 0)
+    assert final.missing_of_judgement() == []
+
+
+def test_training_of_the_final_evaluation_cannot_be_stopped_alone(storage_uri):
+    final, (selection, _) = opened(storage_uri)
+    running = selection.claim({"worker": "a"})
+    with pytest.raises(StudyError, match="cannot be stopped alone"):
+        stop_trial(storage_uri, final.selection.study_name, running.number)
+
+
+def test_difference_that_is_the_same_everywhere_has_no_interval_to_speak_of():
+    same = Estimate(1.0, 1.0, 1.0)
+    difference = Difference("success_rate", True, same, Estimate(1.0, 1.0, 1.0))
+    judgement = Judgement(
+        chosen=3, results=(), differences=(difference,), n_seeds=2, n_planned=2, others=(), settings={}
+    )
+    assert (
+        judgement.statement
+        == "Trial 3 was chosen; its difference to the control is 100.0% in all (success, by reward)."
+    )

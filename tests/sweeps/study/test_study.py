@@ -10,7 +10,7 @@ from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
-from armscan.sweeps.study.study import make_study
+from armscan.sweeps.study.study import existing_study, make_study
 
 FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
 
@@ -132,3 +132,30 @@ def test_objective_may_be_an_on_plane_rate_as_it_is_configured():
     assert settings.objectives == {"on_plane_3mm_5deg": "maximize"}
     with pytest.raises(InvalidValueError, match="names 'on_plane_5mm_10deg', but a trial returns"):
         read_settings([*words, "study.objectives=[maximize on_plane_5mm_10deg]"])
+
+
+@pytest.mark.parametrize(("given", "n_threads"), [("", 1), ("1,4", 1), ("2", 2), (" 3 , 1", 3)])
+def test_threads_of_workers_are_read_as_openmp_reads_them(monkeypatch, given, n_threads):
+    monkeypatch.setenv("OMP_NUM_THREADS", given)
+    asked = settings(workers=2)
+    asked.check_workers(2 * n_threads)
+    with pytest.raises(InvalidValueError, match=r"study\.workers is 2"):
+        asked.check_workers(2 * n_threads - 1)
+
+
+@pytest.mark.parametrize("given", ["many", "0", "-1"])
+def test_impossible_number_of_threads_is_named_in_one_line(monkeypatch, given):
+    monkeypatch.setenv("OMP_NUM_THREADS", given)
+    with pytest.raises(InvalidValueError, match=f"OMP_NUM_THREADS is '{given}'"):
+        settings().check_workers(8)
+
+
+def test_study_with_another_space_is_refused_before_it_is_opened_although_changes_are_allowed(storage_uri):
+    storage = open_storage(storage_uri)
+    make_study(storage, settings(), FIXED)
+    other = settings(space=Space.read({"agent.tau": {"low": 0.1, "high": 0.2}}), allow_config_changes=True)
+    with pytest.raises(StudyError, match="searches another space"):
+        existing_study(storage, other, FIXED)
+    study = existing_study(storage, settings(allow_config_changes=True), FIXED | {"stack": 4})
+    # Only to look at: the change is kept when the study is opened.
+    assert "stack" not in study.user_attrs["fixed_config"]
