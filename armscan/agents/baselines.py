@@ -16,8 +16,8 @@ from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_float
 
 ROTATIONS = ("rz", "rx")
-MOST_SWEPT = 2
-MOST_PLANES = 1_000_000
+MAX_SWEPT = 2
+MAX_PLANES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Exhaustive:
             return
         is_list = isinstance(self.swept, list | tuple) and all(isinstance(name, str) for name in self.swept)
         names = list(self.swept) if is_list else []
-        if not 1 <= len(names) <= MOST_SWEPT or len(set(names)) < len(names) or not set(names) <= set(COMPONENTS):
+        if not 1 <= len(names) <= MAX_SWEPT or len(set(names)) < len(names) or not set(names) <= set(COMPONENTS):
             raise InvalidValueError(
                 f"agent.swept is {self.swept!r}, but it must be a list of one or two different ones of "
                 f"{listed(COMPONENTS)}, or null for all free components"
@@ -100,7 +100,7 @@ class Exhaustive:
                 f"agent.swept is {list(swept)}, but {listed(fixed)} is not free; projection leaves only "
                 f"{', '.join(free)} free"
             )
-        if len(swept) > MOST_SWEPT:
+        if len(swept) > MAX_SWEPT:
             raise InvalidValueError(
                 f"agent.swept is null, for all free components: {', '.join(free)}; but it must be one or two, because "
                 "a grid over more takes thousands of planes: name them, as in agent.swept=[rz,ty]"
@@ -141,10 +141,10 @@ class ExhaustiveAgent:
         halves = [self._half_range_steps(name, bounds) for name in self._swept]
         # A step that ends on the range's end is within it, however the quotient was rounded.
         n_each_side = [math.floor(half + 1e-9) for half in halves]
-        if (n_planes := math.prod(2 * n + 1 for n in n_each_side)) > MOST_PLANES:
+        if (n_planes := math.prod(2 * n + 1 for n in n_each_side)) > MAX_PLANES:
             raise InvalidValueError(
                 f"agent.step_mm is {self._step_mm:g} and agent.step_deg is {self._step_deg:g}, which give {n_planes} "
-                f"planes of {' and '.join(self._swept)}, but there must be at most {MOST_PLANES}"
+                f"planes of {' and '.join(self._swept)}, but there must be at most {MAX_PLANES}"
             )
         counts = np.meshgrid(*(np.arange(-n, n + 1) for n in n_each_side), indexing="ij")
         steps = np.stack(counts, axis=-1).reshape(-1, len(self._swept))

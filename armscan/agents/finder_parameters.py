@@ -11,7 +11,7 @@ from armscan.agents.hyperparameters import number
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_bool, check_float, check_int, check_ints, check_numbers
 
-MOST_LOOKS, MOST_OFFSET_MM, MOST_UNITS = 20, 100.0, 4096
+MAX_LOOKS, MAX_OFFSET_MM, MAX_UNITS = 20, 100.0, 4096
 N_CONVOLUTIONS = 3
 
 
@@ -99,13 +99,13 @@ class FinderParameters:
             check_int(f"agent.{name}", getattr(self, name), at_least=1)
         check_bool("agent.average_tilts", self.average_tilts)
         for name, n_sizes in (("filters", N_CONVOLUTIONS), ("hidden_sizes", None)):
-            check_ints(f"agent.{name}", getattr(self, name), n_sizes, "", at_least=1, at_most=MOST_UNITS)
+            check_ints(f"agent.{name}", getattr(self, name), n_sizes, "", at_least=1, at_most=MAX_UNITS)
         n_offsets = len(self.offsets_mm) if isinstance(self.offsets_mm, list | tuple) else 0
         offsets = check_numbers("agent.offsets_mm", self.offsets_mm, max(n_offsets, 1), "in mm, one for each look")
-        if not 2 <= n_offsets <= MOST_LOOKS or offsets[-1] != 0.0 or max(map(abs, offsets)) > MOST_OFFSET_MM:
+        if not 2 <= n_offsets <= MAX_LOOKS or offsets[-1] != 0.0 or max(map(abs, offsets)) > MAX_OFFSET_MM:
             raise InvalidValueError(
-                f"agent.offsets_mm is {list(offsets)}, but it must be 2 to {MOST_LOOKS} numbers within "
-                f"+-{MOST_OFFSET_MM:g} mm, the last of them 0"
+                f"agent.offsets_mm is {list(offsets)}, but it must be 2 to {MAX_LOOKS} numbers within "
+                f"+-{MAX_OFFSET_MM:g} mm, the last of them 0"
             )
         if self.phantom_share is not None:
             check_float("agent.phantom_share", self.phantom_share, at_least=0.0, at_most=1.0)

@@ -14,7 +14,7 @@ from armscan.utils.compilation import cached_njit
 Pixels = NDArray[np.uint8]
 NO_FRAME = 0
 """The id that stands for none, where a replay buffer has never been written to."""
-MOST_IN_A_BYTE, MOST_IN_TWO = np.uint64(255), np.uint64(65535)
+MAX_IN_A_BYTE, MAX_IN_TWO = np.uint64(255), np.uint64(65535)
 
 
 def encode(pixels: Pixels) -> bytes:
@@ -55,16 +55,16 @@ def _encode(pixels: Pixels, buffer: Pixels) -> int:
         if n_bytes + three >= n_pixels:
             return int(n_pixels)
         gap = start - i
-        if gap > MOST_IN_A_BYTE:
-            gap = min(gap, MOST_IN_TWO)
+        if gap > MAX_IN_A_BYTE:
+            gap = min(gap, MAX_IN_TWO)
             i += gap
             length, value = np.uint64(0), np.uint8(gap >> np.uint64(8))
         else:
             i, value = start, pixels[start]
-            while i < n_pixels and i - start < MOST_IN_A_BYTE and pixels[i] == value:
+            while i < n_pixels and i - start < MAX_IN_A_BYTE and pixels[i] == value:
                 i += one
             length = i - start
-        buffer[n_bytes], buffer[n_bytes + one], buffer[n_bytes + two] = gap & MOST_IN_A_BYTE, length, value
+        buffer[n_bytes], buffer[n_bytes + one], buffer[n_bytes + two] = gap & MAX_IN_A_BYTE, length, value
         n_bytes += three
 
 

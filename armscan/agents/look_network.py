@@ -16,9 +16,9 @@ IMAGE, ACTION = "shares", "action"
 # What the outputs are measured in: components of the normal, mm along it, mm across.
 UNITS = (0.1, 0.05, 3.0, 8.0)
 # What the places of earlier looks are divided by, and how large they may become.
-PLACES, MOST_PLACE = (0.2, 0.2, 10.0, 20.0), 6.0
+PLACES, MAX_PLACE = (0.2, 0.2, 10.0, 20.0), 6.0
 # No error is expected to be less, in mm and degrees: far below what is reached, and its logarithm is a number.
-LEAST_EXPECTED = 0.01
+MIN_EXPECTED = 0.01
 # Kernel of each convolution; all have stride 2.
 KERNELS = (5, 3, 3)
 
@@ -133,9 +133,9 @@ class LookNetwork(nn.Module):
         if (n_earlier := self._n_seen - 1) > 0:
             earlier, latest = planes[:, -n_earlier - 1 : -1].flip(1), planes[:, -1:].expand(-1, n_earlier, -1)
             places = geometry.seen_from(latest.flatten(0, 1), earlier.flatten(0, 1)) / self.places
-            features.append(places.clamp(-MOST_PLACE, MOST_PLACE).reshape(-1, 4 * n_earlier))
+            features.append(places.clamp(-MAX_PLACE, MAX_PLACE).reshape(-1, 4 * n_earlier))
         hidden = self.linear(torch.cat(features, dim=1))
-        expected = nn.functional.softplus(self.doubt(hidden.detach())) + LEAST_EXPECTED
+        expected = nn.functional.softplus(self.doubt(hidden.detach())) + MIN_EXPECTED
         return self.place(hidden) * self.units, expected, hidden
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from armscan.agents.convolutions import CONVOLUTIONS, count_features, images_of, smallest_side_px
-from armscan.agents.networks import MOST_UNITS, check_weights, linear_weights
+from armscan.agents.networks import MAX_UNITS, check_weights, linear_weights
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_ints
 
@@ -46,7 +46,7 @@ class Multimodal:
     ) -> None:
         self.filters = list(check_ints("network.filters", filters, 3, "for the convolutions", at_least=1, at_most=4096))
         self.vector_sizes, self.head_sizes = (
-            list(check_ints(f"network.{name}", sizes, None, "", at_least=1, at_most=MOST_UNITS))
+            list(check_ints(f"network.{name}", sizes, None, "", at_least=1, at_most=MAX_UNITS))
             for name, sizes in (("vector_sizes", vector_sizes), ("head_sizes", head_sizes))
         )
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # An actor and two critics, their lagging copies and the moments of their optimisers take 14 times a network's weights,
 # which is then 4 GB.
-MOST_UNITS, MOST_WEIGHTS = 16_384, 2**26
+MAX_UNITS, MAX_WEIGHTS = 16_384, 2**26
 # By the name of each, the layer of torch.nn.
 ACTIVATIONS = {"relu": "ReLU", "tanh": "Tanh", "elu": "ELU", "gelu": "GELU"}
 
@@ -63,7 +63,7 @@ class MLP:
 
     def __init__(self, hidden_sizes: Sequence[int] = (64, 64), activation: str = "relu") -> None:
         self.hidden_sizes = list(
-            check_ints("network.hidden_sizes", hidden_sizes, None, "", at_least=1, at_most=MOST_UNITS)
+            check_ints("network.hidden_sizes", hidden_sizes, None, "", at_least=1, at_most=MAX_UNITS)
         )
         self.activation = ACTIVATIONS[check_choice("network.activation", activation, list(ACTIVATIONS))]
 
@@ -139,8 +139,8 @@ def linear_weights(sizes: Sequence[int]) -> int:
 
 def check_weights(network: Network, n_weights: int) -> None:
     """Raise `InvalidValueError` if a network has too many weights."""
-    if n_weights > MOST_WEIGHTS:
+    if n_weights > MAX_WEIGHTS:
         raise InvalidValueError(
             f"network is {type(network).__name__.lower()} with {n_weights} weights, but there must be at most "
-            f"{MOST_WEIGHTS}: take smaller layers, or smaller images (obs.shape)"
+            f"{MAX_WEIGHTS}: take smaller layers, or smaller images (obs.shape)"
         )

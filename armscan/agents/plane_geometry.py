@@ -13,7 +13,7 @@ from armscan.envs.rules import ON_REWARD, Rules
 from armscan.errors import InvalidValueError, listed
 
 # No plane is tilted further out of the frame of another than this sine, nor lies further across.
-MOST_TILT, MOST_ACROSS_MM = 0.98, 60.0
+MAX_TILT, MAX_ACROSS_MM = 0.98, 60.0
 TINY = 1e-6
 
 
@@ -75,14 +75,14 @@ class PlaneGeometry(nn.Module):
             beside_mm: Offset along the normals, in mm, shape (n,).
         """
         tilt = seen[:, :2]
-        tilt = tilt * (MOST_TILT / tilt.norm(dim=1, keepdim=True).clamp(min=MOST_TILT))
+        tilt = tilt * (MAX_TILT / tilt.norm(dim=1, keepdim=True).clamp(min=MAX_TILT))
         upright = (1.0 - (tilt**2).sum(1, keepdim=True)).clamp(min=TINY).sqrt()
         local = torch.cat([tilt[:, :1], upright, tilt[:, 1:]], dim=1)
         # From the nearest point of the plane on, along the axis across as it lies in the plane.
         step = torch.eye(3, dtype=seen.dtype, device=seen.device)[0] - local * local[:, :1]
         way = seen[:, 2:3] + beside_mm[:, None]
-        across = seen[:, 3:4].clamp(-MOST_ACROSS_MM, MOST_ACROSS_MM) - way * local[:, :1]
-        points = self.middle + way * local + step * (across / step[:, :1].clamp(min=1.0 - MOST_TILT**2))
+        across = seen[:, 3:4].clamp(-MAX_ACROSS_MM, MAX_ACROSS_MM) - way * local[:, :1]
+        points = self.middle + way * local + step * (across / step[:, :1].clamp(min=1.0 - MAX_TILT**2))
         matrices = _matrices(planes)
         return self.through(_turned(matrices, local), _turned(matrices, points) + _origins(planes))
 

@@ -15,9 +15,9 @@ USUAL_PIXEL_MM = (0.27, 0.55)
 N_TISSUES = 3
 # A pixel at exactly eps is a neighbour, also where its spacing was kept as a 32-bit float.
 ROUNDING = 1.0 + 1e-6
-LARGEST_EPS_PX = 1000.0
+MAX_EPS_PX = 1000.0
 # More than a disc of the largest radius has pixels.
-MOST_SAMPLES = 10_000_000
+MAX_SAMPLES = 10_000_000
 
 
 class Neighbourhood(NamedTuple):
@@ -54,8 +54,8 @@ class PixelTissue:
 
     def __post_init__(self) -> None:
         check_int("label", self.label, at_least=0, at_most=255)
-        check_float(f"eps_px of label {self.label}", self.eps_px, above=0.0, at_most=LARGEST_EPS_PX)
-        check_int(f"min_samples of label {self.label}", self.min_samples, at_least=1, at_most=MOST_SAMPLES)
+        check_float(f"eps_px of label {self.label}", self.eps_px, above=0.0, at_most=MAX_EPS_PX)
+        check_int(f"min_samples of label {self.label}", self.min_samples, at_least=1, at_most=MAX_SAMPLES)
 
     def neighbourhood(self, pixel_mm: tuple[float, float]) -> Neighbourhood:
         """See `Tissue.neighbourhood`."""
@@ -87,10 +87,10 @@ class MetricTissue:
         across_mm, depth_mm = check_numbers("pixel_mm", pixel_mm, 2, "(across, depth) in mm")
         if min(across_mm, depth_mm) <= 0:
             raise InvalidValueError(f"pixel_mm is {pixel_mm!r}, but both must be above 0")
-        if self.eps_mm > LARGEST_EPS_PX * min(across_mm, depth_mm):
+        if self.eps_mm > MAX_EPS_PX * min(across_mm, depth_mm):
             raise InvalidValueError(
                 f"eps_mm of label {self.label} is {self.eps_mm:g}, but with pixels of {across_mm:g} x {depth_mm:g} mm "
-                f"it must be at most {LARGEST_EPS_PX * min(across_mm, depth_mm):g}, {LARGEST_EPS_PX:g} pixels"
+                f"it must be at most {MAX_EPS_PX * min(across_mm, depth_mm):g}, {MAX_EPS_PX:g} pixels"
             )
         half_widths = disc_half_widths(ROUNDING * self.eps_mm, across_mm, depth_mm)
         return Neighbourhood(half_widths, math.ceil(self.density * count_disc_pixels(half_widths)))

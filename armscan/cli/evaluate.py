@@ -18,7 +18,7 @@ from armscan.cli.options import (
     trust_option,
 )
 from armscan.errors import InvalidValueError
-from armscan.utils.validation import LARGEST_SEED, check_int
+from armscan.utils.validation import MAX_SEED, check_int
 
 if TYPE_CHECKING:
     from armscan.evaluation.runner import PreparedAgent
@@ -58,7 +58,7 @@ OPTIONS = {
 )
 @click.option(
     "--seed",
-    type=click.IntRange(0, LARGEST_SEED),
+    type=click.IntRange(0, MAX_SEED),
     default=0,
     help="Seed of the episodes; all agents play the same ones.",
 )

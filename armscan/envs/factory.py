@@ -10,7 +10,7 @@ from gymnasium.vector import VectorEnv
 
 from armscan.anatomy import PUBLISHED_TARGETS, check_reward, check_tissues
 from armscan.envs.env import ArmscanEnv
-from armscan.envs.history import MOST_KEPT, boxes_of, check_exclusions
+from armscan.envs.history import MAX_KEPT, boxes_of, check_exclusions
 from armscan.envs.rules import Rules, Volumes
 from armscan.envs.scene import RandomTransform
 from armscan.envs.vector_env import ArmscanVectorEnv
@@ -125,8 +125,8 @@ def _wrapped(
     """Return an environment, or many, with the wrappers that are asked for."""
     env: Any = bare
     is_vector = isinstance(env, VectorEnv)
-    is_stacked = check_int("stack", stack, at_least=1, at_most=MOST_KEPT) > 1
-    has_memory = check_int("memory", memory, at_least=0, at_most=MOST_KEPT) > 0
+    is_stacked = check_int("stack", stack, at_least=1, at_most=MAX_KEPT) > 1
+    has_memory = check_int("memory", memory, at_least=0, at_most=MAX_KEPT) > 0
     keep_best = VectorBestActionMemory if is_vector else BestActionMemory
     check_bool("stack_memory", stack_memory)
     if has_memory and stack_memory:

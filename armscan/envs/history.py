@@ -18,7 +18,7 @@ FLAT = ""
 
 MEMORY = "memory"
 # Observations of a stack, and pairs of a memory.
-MOST_KEPT = 1000
+MAX_KEPT = 1000
 Mask = NDArray[np.bool_]
 EnvIds = NDArray[np.int64]
 
@@ -104,7 +104,7 @@ class FrameHistory:
     """
 
     def __init__(self, boxes: Mapping[str, spaces.Box], size: int, excluded: Collection[str], n_envs: int) -> None:
-        self._size = size = check_int("stack", size, at_least=1, at_most=MOST_KEPT)
+        self._size = size = check_int("stack", size, at_least=1, at_most=MAX_KEPT)
         excluded = check_exclusions(excluded, boxes)
         stacked = {name: box for name, box in boxes.items() if name not in excluded}
         # A ring for each environment, because not all of them take every step.
@@ -157,7 +157,7 @@ class BestPairs:
     """
 
     def __init__(self, boxes: dict[str, spaces.Box], size: int, action_space: spaces.Space[Any], n_envs: int) -> None:
-        check_int("memory", size, at_least=1, at_most=MOST_KEPT)
+        check_int("memory", size, at_least=1, at_most=MAX_KEPT)
         if MEMORY in boxes:
             raise InvalidValueError(f"the observation already has a part {MEMORY!r}, which BestActionMemory adds")
         n_free = int(np.prod(action_space.shape or ()))

@@ -33,7 +33,7 @@ UNCLUSTERED = 0.45
 OUTLINE_INK = (255, 255, 255)
 NUMBER_INK = (12, 14, 18)
 # In pixels of the picture: a smaller cluster would be hidden under its number.
-LEAST_NUMBERED = 300
+MIN_NUMBERED = 300
 
 Inks = NDArray[np.uint8]
 Pixel = TypeVar("Pixel", bound=np.generic)
@@ -72,7 +72,7 @@ def slice_panel(view: View, room: Size) -> Image.Image:
     scale = np.divide(size, (n_across, n_depth))
     for tissue in view.clusters.each():
         for number, ((across, depth), n_pixels) in enumerate(zip(tissue.centres, tissue.sizes, strict=True), 1):
-            if n_pixels * scale.prod() >= LEAST_NUMBERED:
+            if n_pixels * scale.prod() >= MIN_NUMBERED:
                 middle = (across + 0.5) * scale[0], (n_depth - depth - 0.5) * scale[1]
                 draw.text(middle, str(number), fill=NUMBER_INK, font=font(13), anchor="mm")
     return picture

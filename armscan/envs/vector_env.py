@@ -17,7 +17,7 @@ from armscan.errors import InvalidValueError, ResetNeededError
 from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_int
 
-MOST_ENVS = 65536
+MAX_ENVS = 65536
 VectorStep = tuple[Observed, FloatArray, Mask, Mask, dict[str, Any]]
 
 
@@ -67,7 +67,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _set_up(self, num_envs: int, autoreset_mode: AutoresetMode, make_rules: Callable[[], Rules]) -> None:
         self.info_keys: Collection[str] = tuple(INFO)
-        self.num_envs = check_int("num_envs", num_envs, at_least=1, at_most=MOST_ENVS)
+        self.num_envs = check_int("num_envs", num_envs, at_least=1, at_most=MAX_ENVS)
         self._autoreset_mode = autoreset_mode
         self.metadata = {"autoreset_mode": autoreset_mode}
         self.rules = make_rules()

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from armscan.config.defaults import to_plain
 from armscan.errors import InvalidValueError
+from armscan.evaluation.agent_source import TrainedAgent
 from armscan.evaluation.report import EvaluationReport
 from armscan.evaluation.runner import PreparedAgent
 from armscan.evaluation.volumes import check_out, data_name, file_name
 from armscan.reports.html import page
-from armscan.tracking import TrackedRun, check_artifacts, deliver_pending, open_store
+from armscan.tracking import TrackedRun, TrackingStore, check_artifacts, deliver_pending, open_store
 from armscan.tracking.tags import EVALUATED_TAG
 from armscan.utils.files import atomic_write
 
@@ -51,11 +52,7 @@ def evaluate_and_track(
     """
     source = applied.source
     _check_out(out)
-    if source.run is not None:
-        client, experiment_id = source.run.client, source.run.experiment_id
-        check_artifacts(client, experiment_id)
-    else:
-        client, experiment_id = open_store(**store)
+    client, experiment_id = _store_of(source, store)
     deliver_pending(client)
     of, data = source.run.run_id if source.run else source.name, data_name(applied.data)
     facts = {
@@ -91,13 +88,26 @@ def evaluate_and_track(
         file = out or own
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, lambda opened: opened.write(text.encode()), follow_link=True)
-        tracked.log_files(file)
-        notes = "".join(f"<p>{html.escape(note)}</p>" for note in applied.notes)
-        tables = "".join(f"<h2>{html.escape(label)}</h2>{table.html()}" for label, table in report.tables().items())
         shown = own.with_suffix(".html")
-        atomic_write(shown, lambda opened: opened.write(page(tracked.name, notes + tables).encode()))
-        tracked.log_files(shown)
+        contents = _html(tracked.name, report, applied.notes)
+        atomic_write(shown, lambda opened: opened.write(contents.encode()))
+        tracked.log_files(file, shown)
     return report, file
+
+
+def _store_of(source: TrainedAgent, store: Mapping[str, Any]) -> tuple[TrackingStore, str]:
+    """Return the tracking store of an evaluation, and the ID of its MLflow experiment: those of the agent's run."""
+    if source.run is None:
+        return open_store(**store)
+    check_artifacts(source.run.client, source.run.experiment_id)
+    return source.run.client, source.run.experiment_id
+
+
+def _html(title: str, report: EvaluationReport, notes: Sequence[str]) -> str:
+    """Return the page of an evaluation: its notes, and a table for each split."""
+    shown = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
+    tables = "".join(f"<h2>{html.escape(label)}</h2>{table.html()}" for label, table in report.tables().items())
+    return page(title, shown + tables)
 
 
 def _check_out(out: Path | None) -> None:

@@ -45,7 +45,7 @@ NAMES = {name.replace(" ", "_"): name for name in (TEST, TRAINING)} | {"validati
 # Metrics of a model of MLflow, beside the on-plane rates.
 OF_MODEL = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
 # With fewer volumes intervals are clearly too narrow: docs/metrics.md.
-FEWEST_VOLUMES = 8
+MIN_VOLUMES = 8
 WHAT_HELPS = "more wrists, data=mixed, or cross-validation (data.folds=leave_one_out) would help"
 
 
@@ -178,9 +178,9 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
                 f"between or outside; {WHAT_HELPS}"
             ]
     numbers = {TEST: test.n_volumes} | ({VALIDATION: validation.n_volumes} if validation is not None else {})
-    few = [f"{n} {name.split()[0]} volume{'s' if n > 1 else ''}" for name, n in numbers.items() if n < FEWEST_VOLUMES]
+    few = [f"{n} {name.split()[0]} volume{'s' if n > 1 else ''}" for name, n in numbers.items() if n < MIN_VOLUMES]
     if not few:
         return []
     return [
-        f"{' and '.join(few)}, fewer than {FEWEST_VOLUMES}: the intervals are too narrow for other wrists; {WHAT_HELPS}"
+        f"{' and '.join(few)}, fewer than {MIN_VOLUMES}: the intervals are too narrow for other wrists; {WHAT_HELPS}"
     ]

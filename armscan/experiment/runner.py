@@ -21,6 +21,7 @@ from armscan.tracking import TrackedRun, draw_learning_curve
 from armscan.tracking.view import artifact_address
 from armscan.training import (
     VALIDATION,
+    Budget,
     Callback,
     EpochReport,
     TrainingResult,
@@ -98,16 +99,11 @@ def run_tracked(
     again = resume_command(tracked.run_id, tracking_uri, trust=trust)
     hint = _resume_hint_on_error(again, folder, is_told=job_label is None)
     with hint, tracked, named_if_full(folder):
-        result, how = None, getattr(setup.agent, "validation_note", None)
+        how = getattr(setup.agent, "validation_note", None)
+        result = None
         if isinstance(setup.agent, Learner):
-            at_once, every = setup.agent.env_steps_at_once, setup.budget.eval_every_env_steps
-            if at_once > every:
-                tell(
-                    f"validating every {at_once} environment steps, which the agent takes at once "
-                    f"(training.eval_every_env_steps = {every} is less)"
-                )
-            n_validation = setup.budget.validation_episodes
-            measured = ", ".join(filter(None, ["validation", f"{n_validation} episodes", how]))
+            _tell_validation_interval(setup.agent, setup.budget, tell)
+            measured = ", ".join(filter(None, ["validation", f"{setup.budget.validation_episodes} episodes", how]))
             callbacks = [progress_reporter(job_label, measured), tracked]
             result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, tell=tell, earlier=earlier)
             if result.is_solved:
@@ -134,6 +130,16 @@ def run_tracked(
         words = ("evaluate", tracked.run_id, "--data", "FOLDER")
         print(f"evaluate  {armscan_command(*words, tracking=tracking_uri, trust=trust)}")
     return reached.metrics()
+
+
+def _tell_validation_interval(learner: Learner, budget: Budget, tell: Callable[[str], None]) -> None:
+    """Tell if validations are farther apart than the configuration says."""
+    at_once, every = learner.env_steps_at_once, budget.eval_every_env_steps
+    if at_once > every:
+        tell(
+            f"validating every {at_once} environment steps, which the agent takes at once "
+            f"(training.eval_every_env_steps = {every} is less)"
+        )
 
 
 def train_agent(

@@ -13,7 +13,7 @@ BLUE, ORANGE, RED, GREY = "#1f77b4", "#ff7f0e", "#d62728", "#9a9a9a"
 # No rate is below 0 % or above 100 %.
 RATE_AXIS = {"tickformat": ".0%", "autorangeoptions": {"minallowed": -0.03, "maxallowed": 1.03}}
 # Curves of more points are lines without markers.
-MOST_MARKERS = 60
+MAX_MARKERS = 60
 
 
 @functools.cache
@@ -33,4 +33,4 @@ def look() -> Template:
 
 def mode(n_points: int) -> str:
     """Return how a curve of so many points is drawn: with its points, unless they would hide it."""
-    return "lines+markers" if n_points <= MOST_MARKERS else "lines"
+    return "lines+markers" if n_points <= MAX_MARKERS else "lines"

@@ -15,7 +15,7 @@ from plotly.subplots import make_subplots
 from armscan.reports.chart_style import GREY, RATE_AXIS, mode
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
-from armscan.stats.aggregation import FEWEST_SEEDS
+from armscan.stats.aggregation import MIN_SEEDS
 from armscan.training import MetricEstimates
 from armscan.training.metric_display import is_rate, title_of
 
@@ -156,7 +156,7 @@ def _traces(of_axes: Sequence[Curve], colour: str, *, is_detailed: bool) -> Iter
     """Yield the band, the lines of the seeds, and the line of all of them together."""
     curve = of_axes[0]
     if curve.n_seeds > 1 and is_detailed:
-        if curve.n_seeds >= FEWEST_SEEDS:
+        if curve.n_seeds >= MIN_SEEDS:
             unseen = {"mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
             faint = "rgba({}, {}, {}, 0.2)".format(*hex_to_rgb(colour))
             yield Trace(BANDS, unseen, [_points(each.places, each.band.lows) for each in of_axes])
@@ -182,7 +182,7 @@ def _points(places: Iterable[float], values: Iterable[float]) -> Points:
 
 def _said(curve: Curve) -> list[str]:
     """Return the hover text of each point of a curve."""
-    if curve.n_seeds < FEWEST_SEEDS:
+    if curve.n_seeds < MIN_SEEDS:
         n_seeds = f"{curve.n_seeds} seed{'s' if curve.n_seeds > 1 else ''}"
         return [f"{value:.3g} ({n_seeds})" for value in curve.band.values]
     return [f"{value:.3g} ({low:.3g} to {high:.3g})" for value, low, high in zip(*curve.band, strict=True)]

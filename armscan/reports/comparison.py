@@ -55,7 +55,7 @@ HOW_BETTER = (
 # More groups are compared in a table that is folded.
 MANY_PAIRS = 12
 # Of more groups, nobody can tell the bands apart.
-MOST_DETAILED = 24
+MAX_DETAILED = 24
 LEADING = "on-plane rate"
 
 
@@ -136,7 +136,7 @@ def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
     yield "<h2>Learning curves</h2>"
     titles = validation_titles(figure for figure, *_ in curves)
     if titles:
-        is_detailed = len(groups) <= MOST_DETAILED
+        is_detailed = len(groups) <= MAX_DETAILED
         how = HOW_CURVES if is_detailed else f"{HOW_CURVES} {MEANS_ALONE}"
         yield f"<p>{how}</p>{chart(learning_curves(groups, curves, titles, is_detailed=is_detailed))}"
     else:

@@ -82,9 +82,9 @@ MARK, N_MARK_CHARS = '<meta name="generator" content="armscan">', 200
 CHART_CONFIG = {"displaylogo": False, "showSendToCloud": False, "plotlyServerURL": "", "responsive": True}
 FITTED = "this.querySelectorAll('.js-plotly-plot').forEach((chart) => Plotly.Plots.resize(chart))"
 # A longer table is folded.
-MOST_ROWS = 25
+MAX_ROWS = 25
 # A short text is not broken, such as the ID of a run or how it ended.
-MOST_WORD_CHARS = 12
+MAX_WORD_CHARS = 12
 Row = Mapping[str, Any]
 
 
@@ -172,7 +172,7 @@ def table(rows: Sequence[Row], *, what: str = "rows", kind: str = "rows") -> str
     drawn = (
         f'<div class="table"><table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
     )
-    return drawn if len(rows) <= MOST_ROWS else folded(f"All {len(rows)} {what}", drawn)
+    return drawn if len(rows) <= MAX_ROWS else folded(f"All {len(rows)} {what}", drawn)
 
 
 def folded(summary: str, contents: str) -> str:
@@ -206,7 +206,7 @@ def _cell(key: str, value: Any) -> str:
     contents = value if isinstance(value, Markup) else html.escape(shown)
     label = f' data-label="{html.escape(key)}"'
     # A cell of nothing is not shown on a phone.
-    is_word = len(shown) <= MOST_WORD_CHARS and not isinstance(value, Markup)
+    is_word = len(shown) <= MAX_WORD_CHARS and not isinstance(value, Markup)
     kind = " class=number" if is_number else " class=word" if is_word else ""
     return f"<td{kind}{label}>{f'<div>{contents}</div>' if contents else ''}</td>"
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 from armscan.reports.groups import Group, differing_rules
 from armscan.reports.load import TrackedTraining
-from armscan.stats.aggregation import FEWEST_SEEDS
+from armscan.stats.aggregation import MIN_SEEDS
 
 # With as many seeds or more, the intervals of final figures are nearly as wide as they should be.
 MANY_SEEDS = 5
@@ -47,7 +47,7 @@ def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
     if few := [group.number for group in groups if 1 < group.n_seeds < MANY_SEEDS]:
         yield (
             f"{_numbered(few, groups)}: of few seeds the intervals of the final figures are too narrow; those of "
-            f"curves (from {FEWEST_SEEDS} seeds on) and of the probabilities below are not."
+            f"curves (from {MIN_SEEDS} seeds on) and of the probabilities below are not."
         )
 
 

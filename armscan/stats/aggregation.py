@@ -17,7 +17,7 @@ from armscan.stats.paired import crossed_mean
 from armscan.utils.arrays import FloatArray
 
 # With fewer seeds a band would be wider than a chart.
-FEWEST_SEEDS = 3
+MIN_SEEDS = 3
 # Steps of a bisection from 0 to 1, to the last digit of a number.
 N_HALVINGS = 53
 # Quantile at the upper end of an interval.
@@ -39,10 +39,10 @@ def band_over_seeds(scores: FloatArray) -> Band:
         scores: Scores, shape (seeds, points), all finite.
 
     Returns:
-        The band, without an interval if there are fewer than `FEWEST_SEEDS` seeds.
+        The band, without an interval if there are fewer than `MIN_SEEDS` seeds.
     """
     means, halves = crossed_mean(scores.T[..., np.newaxis])
-    if len(scores) < FEWEST_SEEDS:
+    if len(scores) < MIN_SEEDS:
         halves = np.full_like(means, np.nan)
     return Band(means, means - halves, means + halves)
 

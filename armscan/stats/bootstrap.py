@@ -27,7 +27,7 @@ from armscan.utils.arrays import FloatArray
 LEVEL = 0.95
 N_RESAMPLES = 2000
 # Resampled values that are in memory at once.
-MOST_VALUES = 2_000_000
+MAX_VALUES = 2_000_000
 
 Statistic = Callable[[FloatArray], FloatArray]
 
@@ -167,7 +167,7 @@ def _resamples(
     for place, cell in enumerate(zip(of_training, of_volume, strict=True)):
         members[(*cell, filled[cell])] = place
         filled[cell] += 1
-    at_once = max(1, MOST_VALUES // members.size)
+    at_once = max(1, MAX_VALUES // members.size)
     for first in range(0, N_RESAMPLES, at_once):
         n_resamples = min(at_once, N_RESAMPLES - first)
         drawn_trainings = rng.integers(shape[0], size=(n_resamples, shape[0], 1, 1))

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 # What an MLflow server answers at once; a database is asked for no more.
-MOST_RUNS, MOST_POINTS = 100, 25_000
+MAX_RUNS, MAX_POINTS = 100, 25_000
 # Of MLflow's own UI: `MlflowClient` has no such request.
 ROUTE = "/ajax-api/2.0/mlflow/metrics/get-history-bulk"
 
@@ -38,8 +38,8 @@ def metric_histories(store: TrackingStore, names: Mapping[str, Collection[str]])
         for name in wanted:
             runs_of[name].append(run_id)
     for name, run_ids in runs_of.items():
-        for first in range(0, len(run_ids), MOST_RUNS):
-            for run_id, step, value in _points(store.mlflow, run_ids[first : first + MOST_RUNS], name):
+        for first in range(0, len(run_ids), MAX_RUNS):
+            for run_id, step, value in _points(store.mlflow, run_ids[first : first + MAX_RUNS], name):
                 histories[run_id][name][step] = value
     return histories
 
@@ -47,7 +47,7 @@ def metric_histories(store: TrackingStore, names: Mapping[str, Collection[str]])
 def _points(client: MlflowClient, run_ids: Sequence[str], name: str) -> Iterator[Point]:
     """Yield all points of a metric, those of a run in the order in which they were logged."""
     found = _bulk(client, run_ids, name)
-    if found is not None and len(found) < MOST_POINTS:
+    if found is not None and len(found) < MAX_POINTS:
         yield from found
     elif found is not None and len(run_ids) > 1:
         # Cut off.
@@ -60,16 +60,16 @@ def _points(client: MlflowClient, run_ids: Sequence[str], name: str) -> Iterator
 
 
 def _bulk(client: MlflowClient, run_ids: Sequence[str], name: str) -> list[Point] | None:
-    """Return at most `MOST_POINTS` points of a metric; None if the store does not answer such a request."""
+    """Return at most `MAX_POINTS` points of a metric; None if the store does not answer such a request."""
     store: Any = client._tracking_client.store
     if hasattr(store, "get_metric_history_bulk"):
-        points = store.get_metric_history_bulk(run_ids, name, MOST_POINTS)
+        points = store.get_metric_history_bulk(run_ids, name, MAX_POINTS)
         return [(each.run_id, each.step, each.value) for each in points]
     if not hasattr(store, "get_host_creds"):
         return None
     from mlflow.utils.rest_utils import http_request, verify_rest_response
 
-    asked = {"run_id": run_ids, "metric_key": name, "max_results": MOST_POINTS}
+    asked = {"run_id": run_ids, "metric_key": name, "max_results": MAX_POINTS}
     request: Any = http_request
     response = request(store.get_host_creds(), ROUTE, "GET", params=asked)
     if response.status_code == HTTPStatus.NOT_FOUND:

@@ -23,7 +23,7 @@ from armscan.training.episode_results import Env, EpisodeResult, Evaluation
 from armscan.utils.validation import check_int
 
 # Episodes that are played side by side; more would hardly be faster, and each holds what it observes.
-MOST_SIDE_BY_SIDE = 64
+MAX_SIDE_BY_SIDE = 64
 
 
 def evaluate(
@@ -44,7 +44,7 @@ def evaluate(
     names = list(env.get_wrapper_attr("volumes"))
     count = check_int("episodes", n_episodes, at_least=1)
     planned = [(names[i % len(names)], seed + i) for i in range(count)]
-    envs, player = vectorise(env, min(count, MOST_SIDE_BY_SIDE)), batch_agent(agent)
+    envs, player = vectorise(env, min(count, MAX_SIDE_BY_SIDE)), batch_agent(agent)
     batches = (planned[i : i + envs.num_envs] for i in range(0, count, envs.num_envs))
     return Evaluation(tuple(chain.from_iterable(_play_all(player, envs, batch) for batch in batches)), on_plane)
 

@@ -22,7 +22,7 @@ from armscan.utils.markdown import markdown_table
 from armscan.utils.rate_text import formatted
 
 # The most results that stand side by side; more of them are lines of their own.
-MOST_ABREAST = 6
+MAX_ABREAST = 6
 # Between two cells.
 PADDING_CHARS = 2
 MISSING = "–"
@@ -71,13 +71,13 @@ class ResultTable:
         Args:
             width: Width of the terminal, in characters; columns that do not fit are left out, and named.
         """
-        if not self.facts and len(self.results) <= MOST_ABREAST:
+        if not self.facts and len(self.results) <= MAX_ABREAST:
             return [*self._abreast(width)]
         return self.lines(width)
 
     def html(self) -> str:
         """Return the table as HTML: a column for each of a few results, a line for each of many."""
-        results, is_few = self.results.values(), len(self.results) <= MOST_ABREAST
+        results, is_few = self.results.values(), len(self.results) <= MAX_ABREAST
         names = [*map(html.escape, self.results)]
         facts = [[html.escape(heading), *map(html.escape, values)] for heading, values in self.facts.items()]
         if facts and not is_few:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from armscan.errors import InvalidValueError
 from armscan.training.fingerprints import Fingerprints, fingerprint
 from armscan.training.subject_splits import PHANTOMS, parts_by_subject
-from armscan.utils.validation import LARGEST_SEED, check_choice, check_int, check_path
+from armscan.utils.validation import MAX_SEED, check_choice, check_int, check_path
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 from armscan.volumes.phantom import VERSIONS
@@ -88,7 +88,7 @@ def phantom_data(
     """
     check_int("data.n_training", n_training, at_least=1)
     check_int("data.n_validation", n_validation, at_least=1, at_most=TEST_FIRST_SEED - VALIDATION_FIRST_SEED)
-    check_int("data.n_test", n_test, at_least=1, at_most=LARGEST_SEED + 1 - TEST_FIRST_SEED)
+    check_int("data.n_test", n_test, at_least=1, at_most=MAX_SEED + 1 - TEST_FIRST_SEED)
     check_int("data.first_seed", first_seed, at_least=0)
     if first_seed + n_training > VALIDATION_FIRST_SEED:
         raise InvalidValueError(

@@ -12,7 +12,7 @@ from urllib.parse import quote
 from armscan.tracking.view import VIEW_KEY, VIEW_TAG
 
 API, TIMEOUT_S = "/api/2.0/mlflow", 20.0
-MOST_EXPERIMENTS = 200
+MAX_EXPERIMENTS = 200
 
 
 def runs_page(address: str) -> str:
@@ -25,7 +25,7 @@ def runs_page(address: str) -> str:
         The page; that of all experiments if there is no run, or the server does not say.
     """
     try:
-        experiments = _asked(address, "experiments", {"max_results": MOST_EXPERIMENTS}).get("experiments", [])
+        experiments = _asked(address, "experiments", {"max_results": MAX_EXPERIMENTS}).get("experiments", [])
         by_id = {str(each["experiment_id"]): each for each in experiments}
         latest = {"experiment_ids": [*by_id], "max_results": 1, "order_by": ["attributes.start_time DESC"]}
         runs = _asked(address, "runs", latest).get("runs", []) if by_id else []

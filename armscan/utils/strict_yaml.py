@@ -10,7 +10,7 @@ import yaml
 # Collections within each other; a manifest has five at the most, a configuration ten.
 DEEPEST = 50
 # A manifest of 10,000 volumes has 140,000.
-MOST_NODES = 1_000_000
+MAX_NODES = 1_000_000
 
 
 def load_yaml(text: str | bytes) -> Any:
@@ -37,11 +37,11 @@ def load_yaml(text: str | bytes) -> Any:
             sizes[-1] += sizes_by_anchor.get(event.anchor, 1) if isinstance(event, yaml.AliasEvent) else 1
             if isinstance(event, yaml.CollectionStartEvent):
                 # Until it ends: a collection that contains itself has no end.
-                sizes_by_anchor[event.anchor] = MOST_NODES + 1
+                sizes_by_anchor[event.anchor] = MAX_NODES + 1
                 open_nodes.append([])
                 sizes.append(0)
-        if len(open_nodes) > DEEPEST or sizes[-1] > MOST_NODES:
-            raise ValueError(f"it is nested more than {DEEPEST} deep, or repeats more than {MOST_NODES} nodes")
+        if len(open_nodes) > DEEPEST or sizes[-1] > MAX_NODES:
+            raise ValueError(f"it is nested more than {DEEPEST} deep, or repeats more than {MAX_NODES} nodes")
     return yaml.load(text, yaml.CSafeLoader)
 
 

@@ -14,7 +14,7 @@ from armscan.errors import InvalidValueError, listed
 
 T = TypeVar("T")
 # Seeds of every random generator in use fit.
-LARGEST_SEED = 2**31 - 1
+MAX_SEED = 2**31 - 1
 
 
 def check_int(name: str, value: Any, *, at_least: int, at_most: int | None = None) -> int:
@@ -28,7 +28,7 @@ def check_int(name: str, value: Any, *, at_least: int, at_most: int | None = Non
 
 def check_seed(name: str, value: Any) -> int:
     """Return `value` if it can seed every random generator in use."""
-    return check_int(name, value, at_least=0, at_most=LARGEST_SEED)
+    return check_int(name, value, at_least=0, at_most=MAX_SEED)
 
 
 def check_float(

@@ -22,10 +22,10 @@ BACKGROUND = TISSUE_LABELS["background"]
 # Tissues that every labelmap must have.
 LANDMARKS = ("bones", "tendons", "artery")
 # Values this close together are looked up in one table; others are searched for.
-LARGEST_TABLE = 65536
+MAX_TABLE = 65536
 LARGEST_INT64 = 2**63 - 1
 # The whole numbers up to here are exact as 64-bit floats.
-LARGEST_FLOAT_LABEL = 2**53
+MAX_FLOAT_LABEL = 2**53
 MAX_SHOWN = 8
 
 # What a file calls a tissue: a voxel's value, or the name of a segment.
@@ -147,7 +147,7 @@ def map_values(
 def count_values(values: NDArray[np.integer[Any]]) -> dict[int, int]:
     """Return how many voxels have each value that occurs, in ascending order."""
     low, high = int(values.min()), int(values.max())
-    if high - low >= LARGEST_TABLE or high > LARGEST_INT64:
+    if high - low >= MAX_TABLE or high > LARGEST_INT64:
         present, n_voxels = np.unique(values, return_counts=True)
         return dict(zip(map(int, present), map(int, n_voxels), strict=True))
     counts = np.zeros(high - low + 1, dtype=np.int64)
@@ -162,7 +162,7 @@ def replaced(values: NDArray[np.integer[Any]], table: Mapping[int, int]) -> NDAr
     known = sorted(table)
     low, high = known[0], known[-1]
     labels = np.array([table[value] for value in known], dtype=np.uint8)
-    if high - low >= LARGEST_TABLE or high > LARGEST_INT64:
+    if high - low >= MAX_TABLE or high > LARGEST_INT64:
         return np.asarray(labels[np.searchsorted(np.array(known, dtype=values.dtype), values)])
     dense = np.zeros(high - low + 1, dtype=np.uint8)
     dense[np.array(known) - low] = labels
@@ -195,9 +195,7 @@ def check_whole(values: NDArray[np.generic], where: str) -> NDArray[np.integer[A
         raise VolumeError(f"{where}: holds values of type {values.dtype}, but a labelmap holds whole numbers")
     low, high = values.min(), values.max()
     # Written so that a NaN fails it, too.
-    if not (
-        abs(low) <= LARGEST_FLOAT_LABEL and abs(high) <= LARGEST_FLOAT_LABEL and (values == np.floor(values)).all()
-    ):
+    if not (abs(low) <= MAX_FLOAT_LABEL and abs(high) <= MAX_FLOAT_LABEL and (values == np.floor(values)).all()):
         raise VolumeError(
             f"{where}: holds {values.dtype} values between {low:g} and {high:g} that are not whole numbers: grey "
             "values? A labelmap holds whole numbers only"

@@ -35,7 +35,7 @@ SHA256_CHARACTERS = 64
 DEFAULT_GIB = 16.0
 LIMIT_VARIABLE = "ARMSCAN_CACHE_GIB"
 # Rather than make what another process is making; one that was stopped meanwhile must not stop all others.
-MOST_WAITED_S = 60.0
+MAX_WAITED_S = 60.0
 UNFINISHED_FOR_S = 3600.0
 
 Made = tuple[LabelVolume, Any]
@@ -57,7 +57,7 @@ def mapped_volume(path: Path, make: Callable[[], Made]) -> Made:
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(Timeout):
-            stack.enter_context(FileLock(path.parent / ".volumes.lock", timeout=MOST_WAITED_S))
+            stack.enter_context(FileLock(path.parent / ".volumes.lock", timeout=MAX_WAITED_S))
         if (found := open_mapped(path)) is not None:
             return found
         volume, about = make()

@@ -27,7 +27,7 @@ SCHEMA = (
     "markups-schema-v1.0.3.json#"
 )
 # Nearer to the volume's floor than this, in depth per mm, a plane meets it too far away to begin there.
-LEAST_SLOPE = 1e-3
+MIN_SLOPE = 1e-3
 # A rectangle is a slice of the volume where their sizes agree to this.
 SAME_SIZE_MM = 0.01
 ROUNDING_MM = 1e-3
@@ -94,7 +94,7 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     turned = ManipulatorAction((float(np.rad2deg(rz)), float(np.rad2deg(rx))), (0.0, 0.0))
     across, in_depth = turned.matrix[:, 0], turned.matrix[:, 2]
     where = f"{path}: the plane by center and normal, or controlPoints and baseToNode, lies"
-    if in_depth[2] < LEAST_SLOPE:
+    if in_depth[2] < MIN_SLOPE:
         raise MarkupError(f"{where} along the palm of {volume.name}, but it must cross the arm")
     slice_origin_mm = point_mm - turned.matrix @ _slice_centre(volume)
     # Whether the rectangle is as large as the volume's slices are.

@@ -39,7 +39,7 @@ LAYOUTS = {
 MAGIC = (b"n+1\0", b"n+2\0\r\n\032\n")
 LONGEST_HEADER = 544
 # No header is longer, extensions included.
-LARGEST_OFFSET = 1 << 24
+MAX_OFFSET = 1 << 24
 
 
 def check_nifti(path: Path) -> None:
@@ -63,7 +63,7 @@ def check_nifti(path: Path) -> None:
     if magic not in MAGIC:
         raise VolumeError(f"{path}: the header is damaged, or of a pair of files (.hdr and .img), which is not read")
     # The four bytes behind a header say whether extensions follow.
-    if not size + 4 <= begin < LARGEST_OFFSET or begin != int(begin):
+    if not size + 4 <= begin < MAX_OFFSET or begin != int(begin):
         raise VolumeError(f"{path}: the header ends at byte {size + 4}, but its voxels begin at byte {begin:g}")
     if not 1 <= n_dimensions <= 7 or code not in TYPES:
         raise VolumeError(

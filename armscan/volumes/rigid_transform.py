@@ -14,7 +14,7 @@ from armscan.utils.compilation import cached_njit
 from armscan.utils.validation import check_numbers
 from armscan.volumes.plane import ManipulatorAction, rotation_matrix, wrap_deg
 
-LARGEST_SHIFT_MM = 1e6
+MAX_SHIFT_MM = 1e6
 # The maps of a volume as it was read; see `RigidTransform.maps`.
 NO_MAPS = np.empty((0, 3, 4))
 
@@ -68,10 +68,9 @@ class RigidTransform:
         shift_mm = check_numbers("translation", self.translation, 2, "(tx, ty) in mm")
         centre_mm = check_numbers("centre_mm", self.centre_mm, 3, "(x, y, z) in mm")
         # The differences of numbers much larger are no numbers any more.
-        if max(map(abs, shift_mm + centre_mm)) > LARGEST_SHIFT_MM:
+        if max(map(abs, shift_mm + centre_mm)) > MAX_SHIFT_MM:
             raise InvalidValueError(
-                f"translation is {shift_mm} and centre_mm is {centre_mm}, but each must be within "
-                f"+-{LARGEST_SHIFT_MM:g} mm"
+                f"translation is {shift_mm} and centre_mm is {centre_mm}, but each must be within +-{MAX_SHIFT_MM:g} mm"
             )
 
     @cached_property

@@ -28,7 +28,7 @@ PLANE_TYPES = {
     "3points": "threePoints",
     "planefit": "planeFit",
 }
-LARGEST_MM = 1e6
+MAX_MM = 1e6
 # Two statements of one plane differ by no more than rounding in the file explains.
 SAME_MM, SAME_DEG = 0.1, 0.1
 
@@ -161,8 +161,8 @@ def _numbers(markup: dict[str, Any], key: str, length: int, path: Path) -> Float
         numbers = np.array(check_numbers(key, markup.get(key), length, ""))
     except InvalidValueError as error:
         raise _error(path, key, markup.get(key), f"{length} finite numbers") from error
-    if np.abs(numbers).max() > LARGEST_MM:
-        raise _error(path, key, markup.get(key), f"{length} numbers within +-{LARGEST_MM:g}")
+    if np.abs(numbers).max() > MAX_MM:
+        raise _error(path, key, markup.get(key), f"{length} numbers within +-{MAX_MM:g}")
     return numbers
 
 

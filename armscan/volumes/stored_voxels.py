@@ -20,7 +20,7 @@ from armscan.errors import VolumeError
 
 PIECE_BYTES = 1 << 20
 # No stream of deflate is inflated to more of its size.
-LARGEST_RATIO = 1032
+MAX_RATIO = 1032
 # What zlib calls its formats; MetaImages are read from either; their header does not say which.
 GZIP, GZIP_OR_ZLIB = 31, 47
 
@@ -53,7 +53,7 @@ def check_stored(path: Path, stored: StoredVoxels) -> None:
         _check_length(path, n_stored, stored.n_bytes)
         if stored.finite is None:
             return
-    elif n_stored * LARGEST_RATIO < stored.n_bytes:
+    elif n_stored * MAX_RATIO < stored.n_bytes:
         raise VolumeError(
             f"{path}: the file is truncated or damaged: it holds {max(0, n_stored)} compressed bytes of voxels, which "
             f"cannot be the {stored.n_bytes} that its header promises"

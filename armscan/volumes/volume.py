@@ -20,7 +20,7 @@ from armscan.volumes.slicing import clearance, occupied_depths, sample_plane
 
 LONGEST_SIDE_PX = 65536
 # Far beyond what any image has; the ratio of two spacings still is a number that a slice can be looked up with.
-SMALLEST_SPACING_MM, LARGEST_SPACING_MM = 1e-6, 1e6
+SMALLEST_SPACING_MM, MAX_SPACING_MM = 1e-6, 1e6
 # Of scalar products of unit vectors; files keep them with six digits or more.
 RIGHT_ANGLE_TOLERANCE = 1e-3
 
@@ -227,9 +227,9 @@ def _checked_mm(key: str, numbers: Any, name: str) -> tuple[float, float, float]
 
 def _checked_spacing(spacing: tuple[float, float, float], name: str) -> tuple[float, float, float]:
     checked = _checked_mm("spacing", spacing, name)
-    if min(checked) < SMALLEST_SPACING_MM or max(checked) > LARGEST_SPACING_MM:
+    if min(checked) < SMALLEST_SPACING_MM or max(checked) > MAX_SPACING_MM:
         raise VolumeError(
-            f"{name}: spacing is {checked}, but each must be from {SMALLEST_SPACING_MM:g} to {LARGEST_SPACING_MM:g} mm"
+            f"{name}: spacing is {checked}, but each must be from {SMALLEST_SPACING_MM:g} to {MAX_SPACING_MM:g} mm"
         )
     return checked
 

@@ -23,7 +23,7 @@ from armscan.volumes.phantom import VERSIONS
 PLACES_MM = np.arange(-40, 46)
 BONE, TENDON, ARTERY, NERVE = 1, 2, 3, 4
 # Fewer pixels of a vessel or nerve are strays.
-LEAST_PIXELS = 12
+MIN_PIXELS = 12
 
 
 def profile(volume: LabelVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -46,7 +46,7 @@ def profile(volume: LabelVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _mean_mm(pixels: np.ndarray, pixel_mm: tuple[float, float], aside_mm: float) -> np.ndarray:
-    if len(pixels) < LEAST_PIXELS:
+    if len(pixels) < MIN_PIXELS:
         return np.full(2, np.nan)
     return pixels.mean(axis=0) * pixel_mm + (aside_mm, 0.0)
 

@@ -17,12 +17,12 @@ from matplotlib.axes import Axes
 from armscan.reports.chart_style import BLUE, GREY, ORANGE
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.paired import paired_difference
-from armscan.sweeps.scheduling.race import MOST_FACTOR, Race, race
+from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, race
 
 PICTURE = Path(__file__).parents[2] / "docs" / "images" / "how_a_study_decides.svg"
 N_TRIALS, N_VALIDATION, N_TEST, N_JUDGING = 30, 8, 12, 5
 MIN_SEEDS, MEAN_SEEDS = 2, 6
-MOST_SEEDS = MOST_FACTOR * MEAN_SEEDS
+MAX_SEEDS = MAX_SEEDS_FACTOR * MEAN_SEEDS
 CONTROL, CONTROL_STEPS = -1, 2.6
 # Of trainings, of volumes, and of the luck of a single look, in steps.
 OF_SEEDS, OF_VOLUMES, LUCK = 0.35, 0.4, 0.5
@@ -42,8 +42,8 @@ def main() -> None:
         of_seeds = OF_SEEDS * rng.standard_normal((n_seeds, 1))
         return np.maximum(1.0, steps[number] + of_seeds + OF_VOLUMES * rng.standard_normal((n_seeds, n_volumes)))
 
-    scores = {number: dict(enumerate(-trained(number, MOST_SEEDS, N_VALIDATION).mean(axis=1))) for number in steps}
-    raced = race(scores, range(MOST_SEEDS), min_seeds=MIN_SEEDS, mean_seeds=MEAN_SEEDS)
+    scores = {number: dict(enumerate(-trained(number, MAX_SEEDS, N_VALIDATION).mean(axis=1))) for number in steps}
+    raced = race(scores, range(MAX_SEEDS), min_seeds=MIN_SEEDS, mean_seeds=MEAN_SEEDS)
     assert raced.chosen is not None
     ours, theirs = (trained(number, N_JUDGING, N_TEST) for number in (raced.chosen, CONTROL))
     mpl.rcParams |= {

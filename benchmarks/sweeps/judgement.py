@@ -24,10 +24,10 @@ from scipy.special import ndtr
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import LEVEL, N_RESAMPLES
 from armscan.stats.paired import crossed_mean
-from armscan.sweeps.scheduling.race import MOST_FACTOR, race
+from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, race
 
 N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MEAN_SEEDS = 4, 8, 2, 6
-MOST_SEEDS = MOST_FACTOR * MEAN_SEEDS
+MAX_SEEDS = MAX_SEEDS_FACTOR * MEAN_SEEDS
 # Standard deviations of the effects of trainings, of volumes for each configuration, and of the rest.
 OF_SEEDS, OF_VOLUMES, REST = 1.0, 0.4, 0.5
 # Of the difference of two trainings on a volume.
@@ -68,12 +68,12 @@ def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float, *, see
         rest = REST * rng.standard_normal((*trainings.shape, n))
         return true[..., None, None] + trainings[..., None] + of_volumes + rest
 
-    selecting, judging = trained(MOST_SEEDS), trained(n_seeds)
+    selecting, judging = trained(MAX_SEEDS), trained(n_seeds)
     scores, own = played(selecting, N_VALIDATION).mean(axis=-1), played(judging, n_volumes)
     held, n_trainings = [], 0
     for study, table in enumerate(scores):
         by_seed = {number: dict(enumerate(row)) for number, row in enumerate(table)}
-        raced = race(by_seed, range(MOST_SEEDS), min_seeds=MIN_SEEDS, mean_seeds=MEAN_SEEDS)
+        raced = race(by_seed, range(MAX_SEEDS), min_seeds=MIN_SEEDS, mean_seeds=MEAN_SEEDS)
         chosen = raced.chosen
         n_trainings += sum(standing.n_seeds for standing in raced.standings.values())
         if not chosen:

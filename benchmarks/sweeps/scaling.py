@@ -29,7 +29,7 @@ from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.open import Phase
+from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.tasks.attempt import Attempt
 from armscan.sweeps.workers import worker as worker_module
 from armscan.sweeps.workers.heartbeat import Heartbeat
@@ -41,7 +41,7 @@ from tests.support.postgres import PostgresServer, postgres_server
 
 WORKERS = (1, 2, 4, 8, 16, 32)
 N_REPORTS, STEPS_A_REPORT = 10, 100
-MAX_PROCESSES, TRIALS_A_WORKER, FEWEST_TRIALS = 4, 10, 120
+MAX_PROCESSES, TRIALS_A_WORKER, MIN_TRIALS = 4, 10, 120
 SPACE = {"agent.lr": {"low": 1e-4, "high": 1e-2, "log": True}, "agent.batch_size": {"choices": [64, 128, 256]}}
 SAMPLER = {"_target_": "optuna.samplers.RandomSampler"}
 SETTINGS = {"shared_preload_libraries": "pg_stat_statements", "max_connections": "400"}
@@ -173,7 +173,7 @@ def asked(server: PostgresServer, uri: str) -> Asked:
 
 def measured(server: PostgresServer, n_workers: int, tracking_uri: str | None, folder: Path) -> tuple[float, int, str]:
     """Run a study; return its seconds, its trials, and the address of its database."""
-    n_trials = max(FEWEST_TRIALS, TRIALS_A_WORKER * n_workers)
+    n_trials = max(MIN_TRIALS, TRIALS_A_WORKER * n_workers)
     uri = server.make_database()
     opened = partial(phase_of, uri, tracking_uri, folder, n_trials)
     opened()

@@ -28,7 +28,8 @@ from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval import settings_of
-from armscan.sweeps.study.open import OpenedStudy, Phase, open_for_work
+from armscan.sweeps.study.open import open_for_work
+from armscan.sweeps.study.phase import OpenedStudy, Phase
 from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.study.warm_start import initial_trials

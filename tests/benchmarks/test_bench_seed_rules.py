@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from benchmarks.sweeps.bench.replay import choose
-from benchmarks.sweeps.bench.seed_rules import MOST_SEEDS, allocation, fixed, friedman_race, halving, t_race
+from benchmarks.sweeps.bench.seed_rules import MAX_SEEDS, allocation, fixed, friedman_race, halving, t_race
 
 
 def scores_of(means, n_choices=50, spread=1.0):
     """Return scores of configurations with these means, shape (choices, configurations, seeds)."""
-    noise = np.random.default_rng(0).standard_normal((n_choices, len(means), MOST_SEEDS))
+    noise = np.random.default_rng(0).standard_normal((n_choices, len(means), MAX_SEEDS))
     return np.array(means)[:, np.newaxis] + spread * noise
 
 
@@ -51,7 +51,7 @@ def test_friedmans_test_drops_what_is_always_behind_and_nothing_without_a_differ
 
 
 def test_ranks_of_equal_scores_drop_nobody():
-    assert set(friedman_race(3, 5)(np.zeros((2, 3, MOST_SEEDS))).n_trainings) == {15}
+    assert set(friedman_race(3, 5)(np.zeros((2, 3, MAX_SEEDS))).n_trainings) == {15}
 
 
 def test_budget_is_allocated_to_those_close_to_the_best():

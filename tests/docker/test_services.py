@@ -34,7 +34,7 @@ TRAININGS = (
     "training.validation_episodes=2 data.n_training=1 data.n_validation=1 data.n_test=1 evaluation.episodes=2"
 )
 # A worker's database connections, beside which others have a place: see POSTGRES_CONNECTIONS.
-MOST_CONNECTIONS = 6
+MAX_CONNECTIONS = 6
 
 
 @pytest.fixture
@@ -137,7 +137,7 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     # Until the trial knows its tracked run, with which it is gone on.
     wait_until(lambda: "mlflow_run" in selected(postgres_there, "SELECT key FROM trial_user_attributes"))
     assert states(postgres_there) == ["RUNNING"]
-    assert n_connections(postgres_there) - n_before <= MOST_CONNECTIONS
+    assert n_connections(postgres_there) - n_before <= MAX_CONNECTIONS
     words = command_lines(f"ARMSCAN_STORAGE_PASSWORD_FILE={containers.here(SECRET)}")
     assert len(words) >= 5
     assert [each for each in words if PASSWORD.encode() in each] == []

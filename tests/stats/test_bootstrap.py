@@ -66,7 +66,7 @@ def test_the_same_episodes_give_the_same_interval():
 
 
 def test_intervals_of_many_episodes_are_drawn_in_parts(monkeypatch):
-    monkeypatch.setattr("armscan.stats.bootstrap.MOST_VALUES", 1000)
+    monkeypatch.setattr("armscan.stats.bootstrap.MAX_VALUES", 1000)
     ours = estimates({"m": (mean, list(range(100)))}, ["a", "b"] * 50)["m"]
     assert ours.low < 49.5 < ours.high
 

@@ -86,7 +86,7 @@ def test_more_episodes_than_side_by_side_are_played_in_turn(dataset, monkeypatch
     alone = one_by_one(agent, env, 8, 0)
     # Of different lengths, or no episode would be left out while others go on.
     assert len({episode.n_steps for episode in alone}) > 1
-    monkeypatch.setattr("armscan.training.episodes.MOST_SIDE_BY_SIDE", 3)
+    monkeypatch.setattr("armscan.training.episodes.MAX_SIDE_BY_SIDE", 3)
     assert evaluate(agent, env, n_episodes=8, seed=0).episodes == alone
 
 

@@ -16,7 +16,7 @@ from tests.conftest import make_tiny_volume
 
 HUGE = 1600
 # Of processor time, generously: what is refused late takes half a minute and more, or all memory.
-MOST_SECONDS, MOST_BYTES = 15.0, 16 << 20
+MAX_SECONDS, MAX_BYTES = 15.0, 16 << 20
 MHA = (
     "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = {compressed}\n"
     "{size}ElementSpacing = 1 1 1\nDimSize = {n} {n} {n}\nElementType = MET_UCHAR\nElementDataFile = {file}\n"
@@ -67,8 +67,8 @@ def refusal(tmp_path, capfd):
             read_volume(tmp_path / name)
         took, (_, most) = time.process_time() - began, tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        assert took < MOST_SECONDS
-        assert most < MOST_BYTES
+        assert took < MAX_SECONDS
+        assert most < MAX_BYTES
         assert capfd.readouterr() == ("", "")
         assert len(str(caught.value).splitlines()) == 1
         return str(caught.value)
@@ -169,7 +169,7 @@ def test_a_manifest_of_many_missing_files_names_four_of_them(write_labelmap, tmp
         entry["translation"] = [0, 1]
     message, took = damaged_manifest(tmp_path, name, json.dumps({"volumes": entries}, indent=1))
     assert "missing_00003.nii.gz and 9996 more" in message
-    assert took < MOST_SECONDS
+    assert took < MAX_SECONDS
 
 
 @pytest.mark.parametrize("depth", [900, 3000, 100_000])
@@ -186,16 +186,16 @@ def test_a_manifest_of_many_missing_files_names_four_of_them(write_labelmap, tmp
 def test_a_manifest_that_is_nested_deeply_is_refused_at_once(write_labelmap, tmp_path, name, opens, closes, depth):
     write_labelmap("a.nii.gz")
     _, took = damaged_manifest(tmp_path, name, opens * depth + "1" + closes * depth)
-    assert took < MOST_SECONDS
+    assert took < MAX_SECONDS
 
 
 def test_a_manifest_that_repeats_itself_without_end_is_refused_at_once(write_labelmap, tmp_path):
     write_labelmap("a.nii.gz")
     laughs = "\n".join(f"  l{n}: &l{n} [{', '.join([f'*l{n - 1}'] * 10)}]" for n in range(1, 12))
     text = f"labels:\n  l0: &l0 [1]\n{laughs}\n"
-    assert damaged_manifest(tmp_path, "manifest.yaml", text)[1] < MOST_SECONDS
+    assert damaged_manifest(tmp_path, "manifest.yaml", text)[1] < MAX_SECONDS
     text = f"volumes:\n  l0: &l0 [1]\n{laughs}\n  a.nii.gz: {{labels: {{bones: *l11, tendons: [1], artery: [2]}}}}"
-    assert damaged_manifest(tmp_path, "manifest.yaml", text)[1] < MOST_SECONDS
+    assert damaged_manifest(tmp_path, "manifest.yaml", text)[1] < MAX_SECONDS
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from armscan.sweeps.storage.reports import reports_of
 from armscan.training.metric_display import is_rate, title_of
 
 HEIGHT_PX, SMALL_PX, BAR_PX = 360, 260, 34
-MOST_TICKS = 20
+MAX_TICKS = 20
 # Room on either side of a range, as a share of it.
 MARGIN = 0.03
 LEGEND = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0}
@@ -100,7 +100,7 @@ def _history(trials: Sequence[FrozenTrial], number: int, objective: str, directi
         numbers, values = [trial.number for trial in drawn], list(map(_value(number), drawn))
         if drawn:
             figure.add_scatter(x=numbers, y=values, name=name, **points, **hover)
-    axis = {"title": "trial", "tick0": 0, "dtick": 1 + trials[-1].number // MOST_TICKS}
+    axis = {"title": "trial", "tick0": 0, "dtick": 1 + trials[-1].number // MAX_TICKS}
     feasible = list(filter(is_feasible, trials))
     numbers, values = [trial.number for trial in feasible], list(map(_value(number), feasible))
     best = list(accumulate(values, max if direction == StudyDirection.MAXIMIZE else min))

@@ -21,7 +21,7 @@ from armscan.sweeps.space.parameter import rounded_overrides
 from armscan.sweeps.storage.attribute_names import FAILURE
 from armscan.sweeps.storage.attributes import check_trials
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation
-from armscan.sweeps.study.open import OpenedStudy
+from armscan.sweeps.study.phase import OpenedStudy
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.training.metric_display import title_of, value_text

@@ -22,7 +22,7 @@ from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, STOP
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
 from armscan.sweeps.study.final_eval import FinalEvaluation, name_of
-from armscan.sweeps.study.open import OpenedStudy, Phase
+from armscan.sweeps.study.phase import OpenedStudy, Phase
 from armscan.sweeps.study.plan import final_trainings_left
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import best_trials

@@ -25,7 +25,7 @@ from armscan.utils.arrays import FloatArray
 # seeds that the leader must have then: with fewer, it may be lucky.
 END_LEVEL, LEADER_SEEDS = 0.95, 4
 # The most seeds of a configuration, as a multiple of the seeds on average.
-MOST_FACTOR = 4
+MAX_SEEDS_FACTOR = 4
 # Prior degrees of freedom: the weight of the pooled variance in that of each configuration, of which two or three seeds
 # say little.
 PRIOR_DF = 4.0

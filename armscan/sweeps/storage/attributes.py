@@ -15,7 +15,7 @@ from armscan.errors import ArmscanError, StudyError, few
 from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, METRICS, PARENT
 from armscan.sweeps.storage.reports import REPORT
 from armscan.utils.section import Section
-from armscan.utils.validation import LARGEST_SEED
+from armscan.utils.validation import MAX_SEED
 
 # The studies of the final trainings are called like the study, with these suffixes: those that choose a configuration,
 # and those that judge it.
@@ -94,7 +94,7 @@ class TrialAttributes(_Attributes):
     parent: Number = 0
     schedule: list[Segment] = Field(default=[], description="numbers and truth values by keys of agent")
     judged: int = Field(default=0, ge=-1, le=LARGEST, description="a whole number of at least 0, or -1 for the control")
-    judged_seed: int = Field(default=0, ge=0, le=LARGEST_SEED, description=f"a whole number from 0 to {LARGEST_SEED}")
+    judged_seed: int = Field(default=0, ge=0, le=MAX_SEED, description=f"a whole number from 0 to {MAX_SEED}")
     mlflow_run: Text = ""
     folder: Text = ""
     config_sha256: Text = ""

@@ -19,7 +19,7 @@ from pydantic import Field
 from armscan.config.legacy import renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.race import MOST_FACTOR, Race, Scores, budget, race
+from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, Scores, budget, race
 from armscan.sweeps.scheduling.state import CONTROL, PlannedTrial
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, RETRIED, SCHEDULE
@@ -27,7 +27,7 @@ from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, 
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.settings import (
     JUDGEMENT_SEEDS_ABOVE,
-    LARGEST_SEARCH_SEED,
+    MAX_SEARCH_SEED,
     SELECTION_SEEDS_ABOVE,
     FinalEvalSettings,
     StudySettings,
@@ -46,7 +46,7 @@ class _Stored(Section):
     """Settings of a final evaluation, as the study of the selection keeps them; see `FinalEvaluation`."""
 
     settings: FinalEvalSettings = Field(description="a section with top_k, min_seeds, mean_seeds and judge_seeds")
-    search_seed: int = Field(ge=0, le=LARGEST_SEARCH_SEED, description="the largest seed of the search")
+    search_seed: int = Field(ge=0, le=MAX_SEARCH_SEED, description="the largest seed of the search")
     control: dict[str, Value] | None = Field(default=None, description="the values of the control by their keys")
 
 
@@ -128,7 +128,7 @@ class FinalEvaluation:
     def selection_seeds(self) -> range:
         """The seeds of the selection, as many as one configuration may get; no search trial was run with one."""
         first = self.search_seed + SELECTION_SEEDS_ABOVE
-        return range(first, first + MOST_FACTOR * self.settings.mean_seeds)
+        return range(first, first + MAX_SEEDS_FACTOR * self.settings.mean_seeds)
 
     @property
     def judge_seeds(self) -> range:

@@ -11,18 +11,18 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.scheduling.race import MOST_FACTOR
+from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES
 from armscan.sweeps.study.constraints import Constraint
 from armscan.utils.section import Section
-from armscan.utils.validation import LARGEST_SEED
+from armscan.utils.validation import MAX_SEED
 
 NAME = re.compile(rf"(?!.*(?:{'|'.join(FINAL_SUFFIXES)})$)\w[\w\-.]{{0,99}}")
 # So much above the largest seed of the search are the first seed of the selection, and that of the judgement.
 SELECTION_SEEDS_ABOVE, JUDGEMENT_SEEDS_ABOVE, MAX_FINAL_SEEDS = 1000, 2000, 1000
-LARGEST_SEARCH_SEED = LARGEST_SEED - JUDGEMENT_SEEDS_ABOVE - MAX_FINAL_SEEDS
+MAX_SEARCH_SEED = MAX_SEED - JUDGEMENT_SEEDS_ABOVE - MAX_FINAL_SEEDS
 T = TypeVar("T")
 OPTUNA_PRUNERS = "optuna.pruners."
 NO_PRUNER = f"{OPTUNA_PRUNERS}NopPruner"
@@ -74,11 +74,11 @@ Preset = Annotated[str, Field(pattern=r"^\w[\w\-/]*$")]
 Metric = Annotated[str, Field(pattern=r"^\S+$")]
 Direction = Literal["minimize", "maximize"]
 Positive = Annotated[int, Field(ge=1, description="a whole number of at least 1")]
-Seed = Annotated[int, Field(strict=True, ge=0, le=LARGEST_SEARCH_SEED)]
+Seed = Annotated[int, Field(strict=True, ge=0, le=MAX_SEARCH_SEED)]
 
 
 SeedCount = Annotated[int, Field(ge=1, le=MAX_FINAL_SEEDS, description=f"a whole number from 1 to {MAX_FINAL_SEEDS}")]
-MAX_MEAN_SEEDS = MAX_FINAL_SEEDS // MOST_FACTOR
+MAX_MEAN_SEEDS = MAX_FINAL_SEEDS // MAX_SEEDS_FACTOR
 MeanSeeds = Annotated[int, Field(ge=1, le=MAX_MEAN_SEEDS, description=f"a whole number from 1 to {MAX_MEAN_SEEDS}")]
 
 
@@ -170,11 +170,11 @@ class StudySettings(Limits):
         default=(), strict=False, description="a list of names of presets, or 'default', none twice"
     )
     workers: Positive
-    seed: int = Field(ge=0, le=LARGEST_SEED, description=f"a whole number from 0 to {LARGEST_SEED}")
+    seed: int = Field(ge=0, le=MAX_SEED, description=f"a whole number from 0 to {MAX_SEED}")
     seeds: Annotated[tuple[Seed, ...], AfterValidator(_without_repetition)] = Field(
         strict=False,
         min_length=1,
-        description=f"a list of at least one seed, such as [0, 1], none twice and none above {LARGEST_SEARCH_SEED}",
+        description=f"a list of at least one seed, such as [0, 1], none twice and none above {MAX_SEARCH_SEED}",
     )
     final_eval: FinalEvalSettings = Field(description="a section with top_k, min_seeds, mean_seeds and judge_seeds")
     allow_config_changes: bool = Field(description="true or false")

@@ -23,7 +23,7 @@ from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.space.parameter import hydra_literal
 from armscan.sweeps.study.arguments import STORAGE, USUAL_LAUNCHER, WORKER_KEY, StudyCommand, fixed_by
 from armscan.sweeps.study.dashboard import note_run
-from armscan.sweeps.study.open import OpenedStudy
+from armscan.sweeps.study.phase import OpenedStudy
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.sweeps.workers.monitor import StudyMonitor
 from armscan.sweeps.workers.supervisor import LAUNCHER_FILE, STOP_FILE, WORKER_FILES, keep_gpus, local_workers

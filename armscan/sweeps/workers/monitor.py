@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 
 from armscan.errors import ArmscanError, StorageUnavailableError
-from armscan.sweeps.study.open import OpenedStudy
+from armscan.sweeps.study.phase import OpenedStudy
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.utils.retry import no_retry
 

@@ -12,7 +12,7 @@ from armscan.sweeps.scheduling.state import PendingWrites
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import RETRY_OF, RUN
 from armscan.sweeps.study.dashboard import note_run
-from armscan.sweeps.study.open import Phase
+from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.tracking import TrackedRun, run_of_study
 from armscan.tracking.run import SHORT_WAIT_S

@@ -24,7 +24,8 @@ from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import CONFIG_SHA256, ENV_STEPS, FAILURE, FOLDER, METRICS, RUN
 from armscan.sweeps.study.components import make, read_settings
 from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_picture, shown_metrics, table_of_seeds
-from armscan.sweeps.study.open import Phase, open_for_work
+from armscan.sweeps.study.open import open_for_work
+from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.tasks.attempt import Attempt, check_metrics, config_sha256, trial_folder
 from armscan.sweeps.workers.heartbeat import Heartbeat, LimitReachedError
 from armscan.sweeps.workers.trial_run import close_requeued, open_run

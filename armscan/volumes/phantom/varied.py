@@ -22,7 +22,7 @@ from armscan.volumes.phantom.wrist import draw_parts
 DISTAL_HALF, PROXIMAL_MIDDLE, PROXIMAL_HALF, HAND, FOREARM = 11.2, 18.3, 6.4, -14.3, 27.0
 TENDONS_PART, TENDONS_JOIN = -8.2, 6.6
 # The distal row ends no nearer to the labelled plane than this.
-LEAST_END_MM = 3.0
+MIN_END_MM = 3.0
 
 
 def draw_varied_wrist(rng: np.random.Generator) -> list[Tube]:
@@ -66,7 +66,7 @@ class _Place(NamedTuple):
 def _bones(rng: np.random.Generator, parts: dict[str, list[Tube]]) -> dict[str, list[Tube]]:
     """Return all bones by part: rows of their own middles and lengths, long bones nearer to or further from them."""
     half, middle = rng.uniform(7.5, 12.5), rng.uniform(-7.0, 1.5)
-    middle = max(middle, LEAST_END_MM - half)
+    middle = max(middle, MIN_END_MM - half)
     proximal_start, proximal_half = middle + half + rng.uniform(-2.5, 1.5), rng.uniform(5.5, 8.5)
     hand = middle - half - rng.uniform(0.0, 4.0) - HAND
     forearm = proximal_start + 2 * proximal_half + rng.uniform(-3.0, 4.0) - FOREARM

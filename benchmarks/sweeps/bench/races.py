@@ -10,7 +10,7 @@ import numpy as np
 from armscan.stats.bootstrap import Estimate
 from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.replay import Rule, scores_of, search
-from benchmarks.sweeps.bench.seed_rules import MOST_SEEDS, SeedRule, allocation, fixed, friedman_race, halving, t_race
+from benchmarks.sweeps.bench.seed_rules import MAX_SEEDS, SeedRule, allocation, fixed, friedman_race, halving, t_race
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 N_SEEDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24)
@@ -81,7 +81,7 @@ def choices_of(candidates: Sequence[Sequence[SimulatedConfig]], rules: Mapping[s
     regrets = np.repeat(truths - truths.min(axis=1, keepdims=True), N_REPEATS, axis=0)
     scores = np.array(
         [
-            scores_of(of_study, MOST_SEEDS, np.random.default_rng([number, repeat]))
+            scores_of(of_study, MAX_SEEDS, np.random.default_rng([number, repeat]))
             for number, of_study in enumerate(candidates)
             for repeat in range(N_REPEATS)
         ]

@@ -13,7 +13,7 @@ import pandas as pd
 from armscan.stats.aggregation import band_over_seeds, probability_of_improvement
 from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.replay import Rule, choose, scores_of, search, silence
-from benchmarks.sweeps.bench.seed_rules import MOST_SEEDS
+from benchmarks.sweeps.bench.seed_rules import MAX_SEEDS
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "halving")
@@ -73,7 +73,7 @@ def studies_of(
         tops = [candidate.config for candidate in found.candidates[:TOP_K]]
         row = {**vars(rule), "study": number, "n_trials": found.n_trials, "search": tops[0].truth - best}
         racing = [*tops, control]
-        scores = scores_of(racing, MOST_SEEDS, np.random.default_rng(number))
+        scores = scores_of(racing, MAX_SEEDS, np.random.default_rng(number))
         for name, (low, mean, has_control) in FINALS.items():
             chosen = choose(scores if has_control else scores[:-1], min_seeds=low, mean_seeds=mean)
             row |= {name: racing[chosen.place].truth - best, f"{name}_trainings": chosen.n_trainings}

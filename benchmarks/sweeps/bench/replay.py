@@ -22,7 +22,7 @@ from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 # Of one study, a sampler that proposes pruned points again and again must not go on for ever.
-MOST_TRIALS_A_TRAINING = 5
+MAX_TRIALS_A_TRAINING = 5
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def search(
         study.enqueue_trial(dict(values))
     total, spent = surrogate.env_steps[-1], 0.0
     rng, candidates, n_trials = np.random.default_rng(seed), [], 0
-    while spent < n_trainings * total and n_trials < MOST_TRIALS_A_TRAINING * n_trainings:
+    while spent < n_trainings * total and n_trials < MAX_TRIALS_A_TRAINING * n_trainings:
         trial, n_trials = study.ask(), n_trials + 1
         values = surrogate.space.suggest(trial)
         config = surrogate.config(values)

@@ -23,7 +23,7 @@ from armscan.sweeps.scheduling.race import (
 from armscan.utils.arrays import FloatArray
 
 # Seeds that are simulated for each configuration: no rule takes more.
-MOST_SEEDS = 24
+MAX_SEEDS = 24
 # Confidence of Friedman's test, as irace has it.
 FRIEDMAN_LEVEL = 0.95
 Mask = NDArray[np.bool_]
@@ -74,8 +74,8 @@ def halving(min_seeds: int) -> SeedRule:
     Args:
         min_seeds: Seeds of all configurations.
     """
-    rounds = [n for power in range(MOST_SEEDS) if (n := min_seeds * 2**power) < MOST_SEEDS]
-    return partial(_raced, rounds=[*rounds, MOST_SEEDS], drop=_worse_half)
+    rounds = [n for power in range(MAX_SEEDS) if (n := min_seeds * 2**power) < MAX_SEEDS]
+    return partial(_raced, rounds=[*rounds, MAX_SEEDS], drop=_worse_half)
 
 
 def allocation(min_seeds: int, mean_seeds: int, *, n_at_once: int | None = None, may_end: bool = True) -> SeedRule:

@@ -19,7 +19,7 @@ from benchmarks.sweeps.bench.design import Design, places_of
 
 FOLDER = Path(__file__).parent / "tables"
 # Fewer trainings of a configuration say little of the noise between seeds.
-FEWEST_SEEDS = 3
+MIN_SEEDS = 3
 VALIDATION, SELECTION, TEST = "validation", "selection", "test"
 METRICS = (
     *("mean_steps", "success_rate", "on_plane_5mm_10deg", "on_plane_2mm_5deg"),
@@ -99,9 +99,9 @@ class Curves:
         design = Design.of(sweep, int(rows.config.max()) + 1)
         check_rows(rows, design)
         n_seeds = rows[rows.volumes == SELECTION].groupby("config").seed.nunique()
-        numbers = n_seeds[n_seeds >= FEWEST_SEEDS].index
+        numbers = n_seeds[n_seeds >= MIN_SEEDS].index
         if numbers.empty:
-            raise ValueError(f"no configuration in the table of {sweep} has {FEWEST_SEEDS} seeds yet: {collecting}")
+            raise ValueError(f"no configuration in the table of {sweep} has {MIN_SEEDS} seeds yet: {collecting}")
         rows = rows[rows.config.isin(numbers)].sort_values(["config", "seed", "env_steps"])
         epochs, selections, tests = (rows[rows.volumes == volumes] for volumes in (VALIDATION, SELECTION, TEST))
         env_steps = epochs.env_steps.to_numpy(float).reshape(len(tests), -1)

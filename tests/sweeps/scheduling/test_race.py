@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from armscan.sweeps.scheduling.race import LEADER_SEEDS, MOST_FACTOR, allocate, budget, race
+from armscan.sweeps.scheduling.race import LEADER_SEEDS, MAX_SEEDS_FACTOR, allocate, budget, race
 
 SEEDS = tuple(range(1000, 1012))
 score = st.one_of(st.floats(-9, 9), st.sampled_from([0.0, 1.0, math.nan]))
@@ -129,7 +129,7 @@ def test_race_needs_fewer_trainings_than_the_same_seeds_for_all_at_no_more_regre
     rng = np.random.default_rng(0)
     n_trained, regret, regret_of_all = 0, 0.0, 0.0
     n_studies, n_fixed = 200, 8
-    seeds = tuple(range(MOST_FACTOR * 6))
+    seeds = tuple(range(MAX_SEEDS_FACTOR * 6))
     for _ in range(n_studies):
         true = 0.7 * rng.standard_normal(n_configurations)
         table = true[:, None] + 0.6 * rng.standard_normal((n_configurations, len(seeds)))

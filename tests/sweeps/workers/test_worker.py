@@ -21,7 +21,7 @@ from armscan.sweeps.stop import stop_study, stop_trial
 from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, LEASE, METRICS, STOP
 from armscan.sweeps.storage.reports import reports_of
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.open import Phase
+from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.study.pruners import ParetoPruner
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import trial_folder
