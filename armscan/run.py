@@ -24,17 +24,15 @@ from omegaconf import DictConfig
 from armscan.config.compose import application
 from armscan.config.credentials import check_words
 from armscan.config.defaults import MULTIRUN, PLAN, RESUME
-from armscan.config.error_messages import one_line_message
+from armscan.config.error_messages import TRACEBACKS, print_mistake
 from armscan.config.sources import SWEEP
-from armscan.errors import is_interruption, print_error
+from armscan.errors import is_interruption
 from armscan.experiment.job import INTERRUPTED, Invocation, remove_if_untracked
 from armscan.launch.folds_grid import with_folds
 from armscan.launch.grid_plan import check_grid, print_grid_plan
 from armscan.launch.job_process import start_job
 from armscan.launch.multirun import Multirun, end_multirun
 from armscan.utils.log import silence_libraries
-
-WANTS_TRACEBACKS = "ARMSCAN_TRACEBACKS"
 
 
 def run(config: DictConfig) -> None:
@@ -73,10 +71,8 @@ def run(config: DictConfig) -> None:
 
 def raise_or_exit(error: BaseException) -> NoReturn:
     """Answer a user's mistake in one line and leave; raise any other error, or all where tracebacks are wanted."""
-    line = one_line_message(error)
-    if line is None or os.environ.get(WANTS_TRACEBACKS):
+    if not print_mistake(error):
         raise error
-    print_error(line)
     raise SystemExit(2)
 
 
@@ -95,7 +91,7 @@ def repeat_grid(words: Sequence[str]) -> None:
 def main() -> int:
     """Run the command line; return the exit code."""
     if os.environ.get("HYDRA_FULL_ERROR") == "1":
-        os.environ[WANTS_TRACEBACKS] = "1"
+        os.environ[TRACEBACKS] = "1"
     # Hydra raises, so that its errors are answered here and not by Hydra.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # A run that is ended by Ctrl-C or kill is closed as killed in the tracking store.

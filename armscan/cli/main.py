@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 
@@ -20,7 +19,6 @@ from armscan.utils.log import silence_libraries
 from armscan.utils.processes import collect_garbage_rarely
 
 PROGRAM = "armscan"
-TRACEBACKS = "ARMSCAN_TRACEBACKS"
 INTERRUPTED = 130
 
 
@@ -36,7 +34,7 @@ class PassedOn(click.Command):
 @click.command(cls=PassedOn, add_help_option=False)
 @click.pass_context
 def run(ctx: click.Context) -> int:
-    """Train an agent, run a sweep or a study (Hydra).
+    """Train an agent, or run a grid or a study (Hydra).
 
     Same as python -m armscan.run.
     """
@@ -68,11 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 2 for a mistake, 130 for an interrupt, else the command's own.
     """
-    words = sys.argv[1:] if arguments is None else list(arguments)
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
     collect_garbage_rarely()
     silence_libraries()
     try:
-        return armscan.main(words, prog_name=PROGRAM, standalone_mode=False, obj=words) or 0
+        return armscan.main(arguments, prog_name=PROGRAM, standalone_mode=False, obj=arguments) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
         return error.exit_code
@@ -84,10 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("interrupted", file=sys.stderr)
             return INTERRUPTED
         # Deferred: it loads Hydra.
-        from armscan.config.error_messages import one_line_message
+        from armscan.config.error_messages import print_mistake
 
-        line = one_line_message(error)
-        if line is None or os.environ.get(TRACEBACKS):
+        if not print_mistake(error):
             raise
-        print_error(line)
         return 2

@@ -24,7 +24,7 @@ PLACES = {"study": "storage", "runs": "tracking"}
 @click.option(
     "--runs",
     metavar="ID,ID,...",
-    help="Compare these runs: MLflow run IDs or their beginnings. A multirun or a trial stands for all trainings below "
+    help="Compare these runs: MLflow run IDs or their beginnings. A grid or a trial stands for all trainings below "
     "it, experiment:NAME for an MLflow experiment.",
 )
 @click.option("--out", type=FILE_PATH, metavar="FOLDER", help="Folder of the report.  [default: a new one in reports]")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import traceback
 
 from hydra.errors import (
@@ -16,8 +17,19 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from yaml import YAMLError
 
 from armscan.config.legacy import rename_hint
-from armscan.errors import ArmscanError, listed
+from armscan.errors import ArmscanError, listed, print_error
 from armscan.utils.files import FULL_DISK
+
+TRACEBACKS = "ARMSCAN_TRACEBACKS"
+
+
+def print_mistake(error: BaseException) -> bool:
+    """Print a user's mistake in one line; return False for any other error, and if tracebacks are wanted."""
+    line = one_line_message(error)
+    if line is None or os.environ.get(TRACEBACKS):
+        return False
+    print_error(line)
+    return True
 
 
 def one_line_message(error: BaseException) -> str | None:
