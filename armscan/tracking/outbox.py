@@ -104,6 +104,9 @@ class OutboxFile:
                 entry = self._read(line)
                 if ("file" in entry) == (channel == "files"):
                     entries.append(entry)
+        if not entries:
+            # Entries of the other channel are not read again each time.
+            self._delivered[channel] = end
         return entries, end
 
     @property

@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import time
+from unittest.mock import Mock
 
 import pytest
 
@@ -51,6 +52,16 @@ def test_outbox_gives_no_more_entries_than_asked_for(outbox):
     outbox.mark("figures", end)
     rest, _ = outbox.next_entries("figures", 10)
     assert (len(first), len(rest)) == (3, 3)
+
+
+def test_outbox_reads_entries_of_the_other_channel_once(outbox, monkeypatch):
+    outbox.add(metrics=[("x", 1.0, 5, 100)])
+    assert outbox.next_entries("files", 1)[0] == []
+    parse = Mock(wraps=json.loads)
+    monkeypatch.setattr(json, "loads", parse)
+    outbox.add(file="best.pt")
+    assert outbox.next_entries("files", 1)[0] == [{"file": "best.pt"}]
+    parse.assert_called_once()
 
 
 def test_outbox_cuts_off_a_line_whose_writer_died(outbox, tmp_path):
