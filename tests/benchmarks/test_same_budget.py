@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,8 +13,10 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution
 
 from armscan.sweeps.study.settings import FinalEvalSettings
 from benchmarks.sweeps import same_budget, searches
-from benchmarks.sweeps.same_budget import scores_of, table
+from benchmarks.sweeps.same_budget import Results, scores_of, table
 from benchmarks.sweeps.searches import Meter, SearchResult, chosen_of, swept
+
+ROOT = Path(__file__).parents[2]
 
 
 def attempt(number):
@@ -151,3 +154,8 @@ def test_a_replicate_that_is_not_judged_yet_is_left_out(trained, tmp_path):
     replicates, scores = scores_of(rows[:-1], "sac_zy")
     assert replicates == [0]
     assert [len(each) for each in scores.values()] == [1, 1, 1]
+
+
+def test_page_has_the_table_of_the_results_that_are_kept():
+    rows = Results(ROOT / "benchmarks/sweeps/hydra_optuna/results.jsonl").rows
+    assert table(rows) in (ROOT / "docs/benchmarks.md").read_text()
