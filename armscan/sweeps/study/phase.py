@@ -100,15 +100,14 @@ class Phase:
         )
         state = self.scheduler.state()
         failed = [*state.failed, *state.retried]
+        resumed = [*state.waiting, *state.finished]
         for run in running:
             run_id, tags = run.info.run_id, run.data.tags.items()
             # A study in another storage may have the same name.
             if any(self.tags_of(trial).items() <= tags for trial in failed):
                 self.client.set_tag(run_id, FAILURE_TAG, WORKER_DIED)
                 self.client.set_terminated(run_id, "FAILED")
-            elif any(
-                self.tags_of(trial).items() <= tags and trial.user_attrs.get(RUN) != run_id for trial in state.waiting
-            ):
+            elif any(self.tags_of(trial).items() <= tags and trial.user_attrs.get(RUN) != run_id for trial in resumed):
                 self.client.set_terminated(run_id, "KILLED")
 
 

@@ -143,8 +143,9 @@ class Worker:
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)
         config_sum = config_sha256(to_plain(config))
-        self._tracked = open_run(phase, trial, chosen, config_sum, writes)
-        self._opened(None)
+        with self._heartbeat.opening:
+            self._tracked = open_run(phase, trial, chosen, config_sum, writes)
+            self._opened(None)
         for name, value in ((FOLDER, str(folder)), (CONFIG_SHA256, config_sum)):
             if trial.user_attrs.get(name) != value:
                 writes.append(partial(trial.set_user_attr, name, value))

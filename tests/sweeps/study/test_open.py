@@ -109,7 +109,8 @@ def test_runs_of_a_study_of_the_same_name_in_another_storage_are_not_ended(opene
     assert [client.get_run(run_id).info.status for run_id in runs] == ["FAILED", "RUNNING"]
 
 
-def test_run_that_a_requeued_trial_does_not_know_is_ended(opened):
+@pytest.mark.parametrize("is_finished", [False, True])
+def test_run_that_a_requeued_trial_does_not_know_is_ended_also_if_the_trial_has_finished_since(opened, is_finished):
     phase = opened().search
     client, experiment_id = opened.store
     study = phase.scheduler.study
@@ -119,6 +120,8 @@ def test_run_that_a_requeued_trial_does_not_know_is_ended(opened):
         client.create_run(experiment_id, name="n", tags=phase.tags_of(requeued)).info.run_id for _ in range(2)
     )
     study._storage.set_trial_user_attr(requeued._trial_id, "mlflow_run", known)
+    if is_finished:
+        study.tell(study.ask(), 0.5)
     phase.close_orphaned_runs()
     assert [client.get_run(run_id).info.status for run_id in (unknown, known)] == ["KILLED", "RUNNING"]
 

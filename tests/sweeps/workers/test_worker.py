@@ -18,7 +18,7 @@ from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import CONTROL, Limits, PlannedTrial
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.stop import stop_study, stop_trial
-from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, LEASE, METRICS, STOP
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, LEASE, METRICS, RUN, STOP
 from armscan.sweeps.storage.reports import reports_of
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.phase import Phase
@@ -28,7 +28,7 @@ from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.sweeps.workers import heartbeat, worker
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
-from armscan.tracking import open_store
+from armscan.tracking import TrackedRun, open_store
 from armscan.utils.files import LAST_CHECKPOINT
 from armscan.utils.processes import ProcessInfo
 from tests.support.waiting import HANG_S
@@ -206,6 +206,42 @@ def test_worker_that_cannot_read_whether_it_is_told_to_leave_asks_again(monkeypa
     beating = Heartbeat(scheduler, "0", is_told_to_leave=is_told_to_leave, leave=left.set, on_death=lambda _: None)
     with beating.running():
         assert left.wait(HANG_S)
+
+
+def test_worker_that_is_told_to_leave_while_it_opens_a_tracked_run_leaves_a_trial_that_goes_on_with_it(
+    monkeypatch, make_phase
+):
+    told, left, start = threading.Event(), threading.Event(), TrackedRun.start
+
+    def start_slowly(*arguments, **options):
+        tracked = start(*arguments, **options)
+        told.set()
+        # Far longer than it takes to be told, and to requeue the trial.
+        time.sleep(1.0)
+        return tracked
+
+    def leave():
+        told.clear()
+        left.set()
+        # As of a process that has left.
+        beating.opening.release()
+
+    def run(attempt):
+        assert left.wait(HANG_S)
+        return far_from_a_thousandth(attempt)
+
+    monkeypatch.setattr(heartbeat, "POLL_S", 0.01)
+    monkeypatch.setattr(TrackedRun, "start", start_slowly)
+    phase = make_phase("a", run, n_trials=1)
+    beating = Heartbeat(phase.scheduler, "0", is_told_to_leave=told.is_set, leave=leave, on_death=lambda _: None)
+    with beating.running():
+        Worker(phase, ["data.n_training=1"], beating).work()
+    (trial,) = phase.scheduler.study.trials
+    (run,) = phase.client.runs([phase.experiment_id], "tags.trial = '0'")
+    assert trial.state.name == "COMPLETE"
+    assert run.info.run_id == trial.user_attrs[RUN]
+    assert run.info.status == "FINISHED"
+    assert run.data.tags["resumed"] == "1"
 
 
 def test_worker_ends_a_study_whose_configuration_fails_at_once_and_one_with_too_many_failures(work):
