@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,8 @@ from tests.support.requirements import unavailable
 
 # As a run does: tests run on all cores already.
 limit_threads()
+# A shell that starts tests in the background has them ignore a Ctrl-C, and all that they start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A first compile, or a wait for a busy machine, takes longer than any deadline.
 settings.register_profile("armscan", deadline=None)

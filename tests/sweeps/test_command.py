@@ -51,14 +51,8 @@ def run(*words, cwd):
 
 def started(*words, cwd):
     printed = (cwd / "printed").open("ab")
-    # A Ctrl-C reaches the study even if this process ignores it.
     return subprocess.Popen(
-        [*COMMAND, *words],
-        cwd=cwd,
-        stdout=printed,
-        stderr=subprocess.STDOUT,
-        start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        [*COMMAND, *words], cwd=cwd, stdout=printed, stderr=subprocess.STDOUT, start_new_session=True
     )
 
 

@@ -93,8 +93,6 @@ class Look:
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                # A Ctrl-C reaches it even if this process ignores it.
-                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
             )
         wait_for(lambda: "Ctrl-C ends" in self.printed or self.process.poll() is not None, START_S)
 
