@@ -42,7 +42,7 @@ Launch = Callable[[Sequence[str]], object]
 
 
 def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch: Launch) -> None:
-    """Launch the workers of a study, and wait for their end.
+    """Launch the workers of a study, unless nothing is left to do, and wait for their end.
 
     Args:
         opened: The study.
@@ -62,9 +62,12 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     tracked = TrackedRun.joined(opened.search.client, opened.search.run_id, name=opened.settings.name, folder=folder)
     tracked.resume()
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
+    monitor = StudyMonitor(opened)
     with _leaving(opened, folder, tracked, leave_s), progress_display(opened, folder):
+        if monitor.is_over():
+            return
         if launcher not in ON_THIS_MACHINE:
-            _launch_elsewhere(opened, folder, launcher, lambda: launch(arguments))
+            _launch_elsewhere(monitor, folder, launcher, lambda: launch(arguments))
         elif launcher == USUAL_LAUNCHER:
             keep_gpus()
             with _block_sigint():
@@ -92,9 +95,8 @@ def _arguments(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: 
     return arguments
 
 
-def _launch_elsewhere(opened: OpenedStudy, folder: Path, launcher: str, launch: Callable[[], object]) -> None:
+def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch: Callable[[], object]) -> None:
     """Launch workers on other machines, and wait for the end of the study, with the launcher or without."""
-    monitor = StudyMonitor(opened)
     silence_launcher(launcher)
     try:
         with monitor.interrupting():
