@@ -18,7 +18,7 @@ from tests.support.requirements import unavailable
 
 # As a run does: tests run on all cores already.
 limit_threads()
-# A shell that starts tests in the background has them ignore a Ctrl-C, and all that they start.
+# A background job of a script ignores SIGINT, and so would all commands that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A first compile, or a wait for a busy machine, takes longer than any deadline.

@@ -255,7 +255,7 @@ def test_notebooks_run(notebook, is_small, tmp_path):
         if "armscan run" in cell.source:
             (command,) = re.findall(r"armscan (run.*?) \| cat", cell.source, re.DOTALL)
             words = small(shlex.split(command.replace("\\\n", " ")))
-            # Which is played afterwards.
+            # A later cell plays the policy.
             words.remove("tracking.policy=false")
             cell.source = f"!armscan {shlex.join(words)} | cat"
     NotebookClient(cells, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()

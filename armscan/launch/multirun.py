@@ -109,43 +109,54 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     """
     if Multirun.folder is None:
         return 0
-    files = sorted((Multirun.folder / OUTCOME_FOLDER).glob("*.json"), key=lambda file: int(file.stem))
-    outcomes = {file.stem: JobOutcome(**json.loads(file.read_text())) for file in files}
+    folder, outcomes = Multirun.folder, _read_outcomes(Multirun.folder)
     failed = {number: outcome for number, outcome in outcomes.items() if outcome.failure is not None}
     if is_interrupted:
         # A job that had no outcome by then was interrupted, too, and that is no failure.
         unended = {number for number, outcome in failed.items() if outcome.failure in (NO_OUTCOME, INTERRUPTED)}
         outcomes |= {number: replace(failed.pop(number), failure=INTERRUPTED) for number in unended}
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
-    word = json.loads((Multirun.folder / PARENT_FILE).read_text())
+    word = json.loads((folder / PARENT_FILE).read_text())
     try:
-        store, runs = _close_parent(Multirun.folder, word, status, failed)
+        store, runs = _close_parent(folder, word, status, failed)
     except TrackingError as error:
-        print(f"{error}; {armscan_command('runs', 'sync', str(Multirun.folder))} delivers the rest", file=sys.stderr)
+        print(f"{error}; {armscan_command('runs', 'sync', str(folder))} delivers the rest", file=sys.stderr)
         store, runs = None, []
     if outcomes:
         from armscan.experiment.console import print_jobs, print_where_to_look
 
         table = print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
         if store is not None and runs:
-            _keep_tables(table, Multirun.folder, word, outcomes, runs, store)
-            print_where_to_look(Multirun.folder, word["tracking"]["uri"], files=(RESULTS_PAGE, ""))
+            _keep_tables(table, folder, word, outcomes, runs, store)
+            print_where_to_look(folder, word["tracking"]["uri"], files=(RESULTS_PAGE, ""))
             compare = armscan_command("report", "--runs", word["run_id"], tracking=word["tracking"]["uri"])
             print(f"compare   {compare}")
     for number, outcome in failed.items():
         print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
         print(f"  again alone: {run_command([])} {outcome.overrides}", file=sys.stderr)
+    if status != "FINISHED":
+        _print_resume_commands(word, runs)
+    if store is not None and not runs:
+        remove_run_folder(folder)
+    return 1 if failed or not outcomes else 0
+
+
+def _read_outcomes(folder: Path) -> dict[str, JobOutcome]:
+    """Return the outcomes of the jobs by their numbers."""
+    files = sorted((folder / OUTCOME_FOLDER).glob("*.json"), key=lambda file: int(file.stem))
+    return {file.stem: JobOutcome(**json.loads(file.read_text())) for file in files}
+
+
+def _print_resume_commands(word: Mapping[str, Any], runs: Sequence[Run]) -> None:
+    """Print the commands that resume the jobs that have not finished."""
+    uri = word["tracking"]["uri"]
     for run in runs:
         if run.info.status != "FINISHED" and (Path(run.data.tags[FOLDER_TAG]) / LAST_CHECKPOINT).exists():
-            uri = word["tracking"]["uri"]
             again = resume_command(run.info.run_id, uri, trust=needs_trust(run.data.params))
             print(f"resume job {run.data.tags[JOB_TAG]} with: {again}", file=sys.stderr)
-    if runs and status != "FINISHED":
-        again = resume_command(word["run_id"], word["tracking"]["uri"], trust=word["trust"])
+    if runs:
+        again = resume_command(word["run_id"], uri, trust=word["trust"])
         print(f"resume all with: {again}", file=sys.stderr)
-    if store is not None and not runs:
-        remove_run_folder(Multirun.folder)
-    return 1 if failed or not outcomes else 0
 
 
 def _keep_tables(

@@ -151,8 +151,8 @@ class StartedStudy:
         assert {trial.state for trial in trials} <= {TrialState.COMPLETE, TrialState.FAIL}
         retried = Counter(trial.user_attrs.get(RETRY_OF) for trial in trials)
         assert all(retried[trial.number] == 1 for trial in trials if trial.state == TrialState.FAIL)
-        statuses = {run.info.run_name: run.info.status for run in runs}
-        assert set(statuses.values()) <= {"FINISHED", "FAILED"}, f"{statuses}\n{self.told()}"
+        statuses = Counter((run.info.run_name, run.info.status) for run in runs)
+        assert {status for _, status in statuses} <= {"FINISHED", "FAILED"}, f"{statuses}\n{self.told()}"
         (of_study,) = [run for run in runs if run.info.run_name == "study sac_y"]
         children = [run for run in runs if run.data.tags.get("mlflow.parentRunId") == of_study.info.run_id]
         children = [run for run in children if run.data.tags["study"] == "sac_y"]

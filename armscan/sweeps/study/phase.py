@@ -94,20 +94,22 @@ class Phase:
         abandon(trial_folder(self.folder, trial.number), self.client, WORKER_DIED)
 
     def close_orphaned_runs(self) -> None:
-        """Close runs whose workers ended before the trial, or the run's folder, knew the run's ID."""
+        """Close runs whose workers ended before the trial, or the folder of a seed, knew the run's ID."""
+        # Read first: the runs of a trial that finishes meanwhile are closed by its worker.
+        finished = self.scheduler.state().finished
         running = self.client.runs(
             [self.experiment_id], f"tags.{STUDY_TAG} = '{self.name}' AND attributes.status = 'RUNNING'"
         )
         state = self.scheduler.state()
         failed = [*state.failed, *state.retried]
-        resumed = [*state.waiting, *state.finished]
+        others = [*state.waiting, *finished]
         for run in running:
             run_id, tags = run.info.run_id, run.data.tags.items()
             # A study in another storage may have the same name.
             if any(self.tags_of(trial).items() <= tags for trial in failed):
                 self.client.set_tag(run_id, FAILURE_TAG, WORKER_DIED)
                 self.client.set_terminated(run_id, "FAILED")
-            elif any(self.tags_of(trial).items() <= tags and trial.user_attrs.get(RUN) != run_id for trial in resumed):
+            elif any(self.tags_of(trial).items() <= tags and trial.user_attrs.get(RUN) != run_id for trial in others):
                 self.client.set_terminated(run_id, "KILLED")
 
 

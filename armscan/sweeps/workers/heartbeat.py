@@ -29,8 +29,8 @@ MAX_CHECKERS = 64
 MAX_UNSEEN = 1.5
 # If the storage is unavailable, the trial cannot be requeued: it is reclaimed later, because its process is gone.
 REQUEUE_TIMEOUT_S = 5.0
-# Of these, the longest wait for a tracked run that is being made: requeued before its ID is stored, a trial would get a
-# second one.
+# Part of it: the longest wait for a tracked run that is being created. Requeued before the run's ID is stored, a trial
+# would get a second run.
 OPENING_TIMEOUT_S = 2.0
 
 
@@ -102,7 +102,7 @@ class Heartbeat:
         self._next_check_s = 0.0
         # Held while a trial is claimed or requeued, so that leaving in between forgets none.
         self._changing, self._cleaning = threading.Lock(), threading.Lock()
-        # To hold while the tracked run of the current trial is opened.
+        # Held while the tracked run of the current trial is being opened.
         self.opening = threading.Lock()
         self._stopped = threading.Event()
         # Two: heartbeats wait for a storage that is unavailable, and leaving does not.
@@ -176,7 +176,7 @@ class Heartbeat:
                 late = threading.Timer(REQUEUE_TIMEOUT_S, self._leave)
                 late.daemon = True
                 late.start()
-                # Kept: afterwards this process opens none.
+                # Never released: this process is to open no further run.
                 self.opening.acquire(timeout=OPENING_TIMEOUT_S)
                 try:
                     self.requeue()

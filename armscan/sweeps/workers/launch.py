@@ -29,6 +29,7 @@ from armscan.sweeps.workers.monitor import StudyMonitor
 from armscan.sweeps.workers.supervisor import LAUNCHER_FILE, STOP_FILE, WORKER_FILES, keep_gpus, local_workers
 from armscan.tracking import TrackedRun, sync
 from armscan.tracking.run import SHORT_WAIT_S
+from armscan.utils.console import print_sentence
 from armscan.utils.processes import ProcessInfo
 from armscan.utils.retry import no_retry
 
@@ -63,17 +64,19 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     tracked.resume()
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
     monitor = StudyMonitor(opened)
-    with _leaving(opened, folder, tracked, leave_s), progress_display(opened, folder):
+    with _leaving(opened, folder, tracked, leave_s):
         if monitor.is_over():
+            print_sentence(f"study {opened.settings.name} in {opened.settings.storage}: nothing is left to do")
             return
-        if launcher not in ON_THIS_MACHINE:
-            _launch_elsewhere(monitor, folder, launcher, lambda: launch(arguments))
-        elif launcher == USUAL_LAUNCHER:
-            keep_gpus()
-            with _block_sigint():
+        with progress_display(opened, folder):
+            if launcher not in ON_THIS_MACHINE:
+                _launch_elsewhere(monitor, folder, launcher, lambda: launch(arguments))
+            elif launcher == USUAL_LAUNCHER:
+                keep_gpus()
+                with _block_sigint():
+                    launch(arguments)
+            else:
                 launch(arguments)
-        else:
-            launch(arguments)
 
 
 def _arguments(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Monitor of a study whose workers run on other machines, from its storage."""
+"""Monitor of a study from its storage: whether it is over, and whether workers on other machines are alive."""
 
 from __future__ import annotations
 

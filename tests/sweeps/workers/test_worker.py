@@ -231,6 +231,8 @@ def test_worker_that_is_told_to_leave_while_it_opens_a_tracked_run_leaves_a_tria
         return far_from_a_thousandth(attempt)
 
     monkeypatch.setattr(heartbeat, "POLL_S", 0.01)
+    for timeout in ("OPENING_TIMEOUT_S", "REQUEUE_TIMEOUT_S"):
+        monkeypatch.setattr(heartbeat, timeout, HANG_S)
     monkeypatch.setattr(TrackedRun, "start", start_slowly)
     phase = make_phase("a", run, n_trials=1)
     beating = Heartbeat(phase.scheduler, "0", is_told_to_leave=told.is_set, leave=leave, on_death=lambda _: None)
