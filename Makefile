@@ -13,7 +13,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup
 run: $(INSTALLED)
 	$(BIN)/python -m armscan.run $(ARGS)
 
-# Six to ten minutes on two cores: without servers, clusters, browsers and runs in processes of their own.
+# Six to twelve minutes on two cores: without servers, clusters, browsers and runs in processes of their own.
 test: $(INSTALLED)
 	$(PYTEST) -m "not full and not slow" $(ARGS)
 
