@@ -66,7 +66,8 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     monitor = StudyMonitor(opened)
     with _leaving(opened, folder, tracked, leave_s):
         if monitor.is_over():
-            print_sentence(f"study {opened.settings.name} in {opened.settings.storage}: nothing is left to do")
+            search = opened.search
+            print_sentence(f"study {search.name} in {search.scheduler.storage.uri}: nothing is left to do")
             return
         with progress_display(opened, folder):
             if launcher not in ON_THIS_MACHINE:
