@@ -33,5 +33,8 @@ def test_a_warm_start_from_the_same_space_saves_trials(surrogate):
     assert share.value < 1.0
     assert studies["trials"].cold.between(1, 40).all()
     assert share.value == pytest.approx(studies["trials"].warm.median() / studies["trials"].cold.median())
+    # A cold study finds its own best, but another one may never find as good settings.
+    assert studies["trials"]["another cold"].between(1, 41).all()
+    assert (studies["trials"]["another cold"] == 41).any()
     # Without pruning, each trial is a training.
     assert (studies["trainings"] == studies["trials"]).all(axis=None)
