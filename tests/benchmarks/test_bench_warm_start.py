@@ -28,7 +28,7 @@ def test_values_outside_of_the_space_are_left_out(surrogate):
 def test_a_warm_start_from_the_same_space_saves_trials(surrogate):
     target = SimulatedSweep("sac_y", surrogate, RULE, 40)
     studies = replays(target, target, 8)
-    share = share_of(studies["trials"])
+    share = share_of(studies["trials"].warm, studies["trials"].cold)
     assert share.low <= share.value <= share.high
     assert share.value < 1.0
     assert studies["trials"].cold.between(1, 40).all()

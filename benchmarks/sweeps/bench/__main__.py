@@ -13,14 +13,13 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
-import itertools
 from pathlib import Path
 
 from benchmarks.sweeps.bench.collect import collect
 from benchmarks.sweeps.bench.ranking import SAMPLERS
 from benchmarks.sweeps.bench.replay import DEFAULT, silence
 from benchmarks.sweeps.bench.report import report, with_interval
-from benchmarks.sweeps.bench.warm_start import ANOTHER, SimulatedSweep, replays, share_of
+from benchmarks.sweeps.bench.warm_start import SimulatedSweep, replays, share_of
 
 
 def main() -> None:
@@ -61,8 +60,9 @@ def main() -> None:
         target = SimulatedSweep.of(given.target, given.pruner)
         studies = replays(SimulatedSweep.of(given.source), target, given.studies)
         print(studies.to_string())
-        for unit, without in itertools.product(studies.columns.levels[0], ("cold", ANOTHER)):
-            print(f"{unit}, median of warm over {without}: {with_interval(share_of(studies[unit], without), '.2f')}")
+        for unit, without in studies.columns.drop("warm", level=1):
+            share = share_of(studies[unit, "warm"], studies[unit, without])
+            print(f"{unit}, median of warm over {without}: {with_interval(share, '.2f')}")
     else:
         report(
             given.sweep,

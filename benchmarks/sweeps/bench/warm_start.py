@@ -20,8 +20,6 @@ from benchmarks.sweeps.bench.replay import DEFAULT, Rule, Search, search
 from benchmarks.sweeps.bench.surrogate import Surrogate
 from benchmarks.sweeps.bench.table import Curves
 
-ANOTHER = "another cold"
-
 
 class SimulatedSweep(NamedTuple):
     """A sweep, and how its studies are simulated.
@@ -74,7 +72,7 @@ def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> p
         warm = _search(target, seed, best_that_fit(known, target.surrogate.space))
         goal = min(each.config.truth for each in cold.candidates)
         another = _search(target, n_studies + seed)
-        found = {"cold": _until(cold, goal), "warm": _until(warm, goal), ANOTHER: _until(another, goal)}
+        found = {"cold": _until(cold, goal), "warm": _until(warm, goal), "another cold": _until(another, goal)}
         rows.append(pd.DataFrame(found).stack())
     return pd.DataFrame(rows)
 
@@ -85,18 +83,18 @@ def best_that_fit(found: Search, space: Space) -> tuple[dict[str, Value], ...]:
     return first_different(chosen for chosen, misfit in fits if chosen and misfit is None)
 
 
-def share_of(studies: pd.DataFrame, without: str = "cold") -> Estimate:
+def share_of(warm: pd.Series, cold: pd.Series) -> Estimate:
     """Return the median with a warm start over the median without; its 95 % interval draws studies.
 
     Args:
-        studies: Trials or trainings of each study, with the columns of `replays`.
-        without: Column of the studies without a warm start, `cold` or `another cold`. Default: `cold`.
+        warm: Trials or trainings of each study with a warm start.
+        cold: Those of the study without, in the same order.
     """
 
     def share(warm: FloatArray, cold: FloatArray, axis: int = -1) -> FloatArray:
         return np.asarray(np.median(warm, axis=axis) / np.median(cold, axis=axis))
 
-    samples = studies.warm.to_numpy(), studies[without].to_numpy()
+    samples = warm.to_numpy(), cold.to_numpy()
     drawn = bootstrap(samples, share, paired=True, method="percentile", rng=np.random.default_rng(0))
     return Estimate(float(share(*samples)), *map(float, drawn.confidence_interval))
 
